@@ -1,0 +1,3 @@
+"""daqsvc: acquisition and model-based fault diagnosis for rotating machines."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,70 @@
+"""What flows from a driver into the ring: blocks of samples that know their place, time and loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Samples: TypeAlias = NDArray[np.float32]
+
+INT64_MIN = -(2**63)
+INT64_MAX = 2**63 - 1
+
+
+class Quality(IntFlag):
+    """What is known against a block; 0 means nothing."""
+
+    GOOD = 0
+    TIME_UNSETTLED = 1
+    """The time base has not seen enough arrivals yet: times may move by up to the arrival jitter."""
+    AFTER_LOSS = 2
+    """Samples just before this block are missing (`SampleBlock.lost_before`)."""
+    LOSS_ESTIMATED = 4
+    """The number of missing samples comes from the host clock (the device restarted its counter)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBlock:
+    """A run of consecutive samples of one stream.
+
+    Attributes:
+        stream: name of the stream in the machine file.
+        first_index: position of ``samples[0]`` on the device's own sample count, unwrapped to int64.
+        samples: float32 ``[n, channels]`` in the sensors' physical units, C-contiguous.
+        t_first_ns: host monotonic time at which ``samples[0]`` was taken, as the time base estimates it.
+        period_ns: estimated time between samples.
+        lost_before: samples known to be missing between the previous block and this one.
+        quality: what is known against this block.
+    """
+
+    stream: str
+    first_index: int
+    samples: Samples
+    t_first_ns: int
+    period_ns: float
+    lost_before: int = 0
+    quality: Quality = Quality.GOOD
+
+    def __post_init__(self) -> None:
+        if self.samples.ndim != 2 or self.samples.dtype != np.float32:
+            raise ValueError(
+                f"samples of {self.stream!r} must be float32 [n, channels], "
+                f"not {self.samples.dtype} {list(self.samples.shape)}"
+            )
+        if not INT64_MIN <= self.first_index <= INT64_MAX - len(self.samples):
+            raise OverflowError(
+                f"sample index {self.first_index} + {len(self.samples)} of {self.stream!r} leaves int64"
+            )
+        if self.lost_before < 0:
+            raise ValueError(f"lost_before of {self.stream!r} is {self.lost_before}; it cannot be negative")
+
+    @property
+    def end_index(self) -> int:
+        """One past the index of the last sample."""
+        return self.first_index + len(self.samples)

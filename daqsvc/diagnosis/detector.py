@@ -1,0 +1,58 @@
+"""The contract between the pipeline and a detector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daqsvc.acquisition.samples import Samples
+    from daqsvc.diagnosis.record import Diagnosis
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Consecutive samples handed to a detector.
+
+    Attributes:
+        first_index: absolute index of ``samples[0]``.
+        samples: float32 ``[n, channels]``, a private copy; missing samples are NaN rows.
+        t_end_ns: monotonic time of the last sample.
+        period_ns: time between samples.
+        skipped: samples between the previous window and this one that the detector was too slow
+            for (they were overwritten); 0 in normal operation.
+    """
+
+    first_index: int
+    samples: Samples
+    t_end_ns: int
+    period_ns: float
+    skipped: int = 0
+
+
+class Detector(Protocol):
+    """Turns windows of one stream into diagnoses.
+
+    The pipeline calls `warm` once and then `process` window after window, in order, from one
+    worker thread at a time; the numerical work inside must release the GIL (a numba kernel with
+    ``nogil=True`` or NumPy on whole arrays), so that the event loop keeps running beside it.
+    """
+
+    name: str
+    stream: str
+    block: int
+    """Samples per step: windows have a multiple of this many samples."""
+
+    def warm(self) -> None:
+        """Compile and run every kernel once, so that the first window is as fast as the rest."""
+        ...
+
+    def process(self, window: Window) -> Sequence[Diagnosis]:
+        """Take in a window and say what is worth saying (often nothing).
+
+        Must not raise on bad data (NaN, infinities, dead or clipped sensors): it says so in a
+        `Diagnosis` with ``ok=False`` and holds its decision.
+        """
+        ...

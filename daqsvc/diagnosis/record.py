@@ -1,0 +1,61 @@
+"""What a detector says: an immutable record with its evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Severity = Literal["normal", "alert", "danger"]
+
+_NOTHING: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """One statement of one detector about one machine at one time.
+
+    Attributes:
+        machine: name of the machine.
+        detector: name of the detector in the machine file.
+        t_ns: monotonic time of the last sample that went in (`SampleRing.time_of`).
+        stream: the stream the samples came from.
+        first_index: first sample of the window of evidence (absolute index).
+        end_index: one past its last sample.
+        decision: the mode or level that the detector stands by now, e.g. ``"F1L2"`` or ``"alert"``;
+            ``"undetermined"`` while it cannot say.
+        changed: whether ``decision`` differs from the one before.
+        severity: how bad the decision is.
+        probabilities: conditional probability per mode, summing to one; empty if the detector has none.
+        group: modes that the evidence cannot tell apart, the decision among them.
+        statistics: what was measured, by name with its unit, e.g. ``{"rms_g": 0.07}``.
+        thresholds: limits that the statistics were held against, by the same names plus a suffix.
+        evidence: log-likelihood ratios in nats, by name.
+        revolutions: shaft revolutions since the detector started, where it follows the shaft.
+        ok: False if the sensors or the window cannot carry a decision; then ``decision`` is held
+            from before and ``reason`` says why.
+        reason: why ``ok`` is False, in words for a person.
+        model: name and version of the model behind the decision.
+    """
+
+    machine: str
+    detector: str
+    t_ns: int
+    stream: str
+    first_index: int
+    end_index: int
+    decision: str
+    changed: bool = False
+    severity: Severity = "normal"
+    probabilities: Mapping[str, float] = field(default=_NOTHING)
+    group: tuple[str, ...] = ()
+    statistics: Mapping[str, float] = field(default=_NOTHING)
+    thresholds: Mapping[str, float] = field(default=_NOTHING)
+    evidence: Mapping[str, float] = field(default=_NOTHING)
+    revolutions: float | None = None
+    ok: bool = True
+    reason: str = ""
+    model: str = ""

@@ -1,0 +1,1 @@
+"""Bus drivers: bytes on a wire to sample blocks."""

@@ -1,0 +1,1 @@
+"""Simulated hardware: plants and recordings turned into bytes on a wire."""
