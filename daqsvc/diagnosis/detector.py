@@ -53,6 +53,6 @@ class Detector(Protocol):
         """Take in a window and say what is worth saying (often nothing).
 
         Must not raise on bad data (NaN, infinities, dead or clipped sensors): it says so in a
-        `Diagnosis` with ``ok=False`` and holds its decision.
+        `Diagnosis` whose ``quality`` is not good, and holds its decision.
         """
         ...

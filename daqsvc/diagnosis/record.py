@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 Severity = Literal["normal", "alert", "danger"]
+DataQuality = Literal["good", "missing", "not_ok"]
 
 _NOTHING: Mapping[str, float] = MappingProxyType({})
 
@@ -35,9 +36,11 @@ class Diagnosis:
         thresholds: limits that the statistics were held against, by the same names plus a suffix.
         evidence: log-likelihood ratios in nats, by name.
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
-        ok: False if the sensors or the window cannot carry a decision; then ``decision`` is held
-            from before and ``reason`` says why.
-        reason: why ``ok`` is False, in words for a person.
+        quality: ``"good"``; ``"missing"`` if too many samples of the window are missing;
+            ``"not_ok"`` if a sensor is outside its OK limits, dead or clipped. Unless it is good,
+            ``decision`` is held from before: missing data never clears anything.
+        reason: why the quality is not good, in words for a person.
+        sensors: names of the sensors that the statement rests on.
         model: name and version of the model behind the decision.
     """
 
@@ -56,6 +59,7 @@ class Diagnosis:
     thresholds: Mapping[str, float] = field(default=_NOTHING)
     evidence: Mapping[str, float] = field(default=_NOTHING)
     revolutions: float | None = None
-    ok: bool = True
+    quality: DataQuality = "good"
     reason: str = ""
+    sensors: tuple[str, ...] = ()
     model: str = ""
