@@ -4,3 +4,442 @@ A `FrameLayout` is compiled once into NumPy gather indices; a batch of frames is
 encoded by a handful of array operations, however many samples it holds. The virtual bus encodes with
 the same object that the driver decodes with.
 """
+
+from __future__ import annotations
+
+import binascii
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Payloads: TypeAlias = NDArray[np.uint8]
+
+Kind = Literal["signed", "unsigned", "float"]
+ByteOrder = Literal["little", "big"]
+Counts = Literal["samples", "frames"]
+
+CRC_BYTES = 2
+
+
+class LayoutError(ValueError):
+    """A layout contradicts itself, its DBC file, or the values it should carry."""
+
+
+class Decoded(NamedTuple):
+    """A batch of decoded frames.
+
+    Attributes:
+        counter: int64 ``[n]``, the device's counter as sent (wrapped).
+        samples: float32 ``[n, samples_per_frame, channels]`` in physical units.
+        intact: bool ``[n]``, False where the frame's CRC does not match (all True without a CRC).
+    """
+
+    counter: NDArray[np.int64]
+    samples: NDArray[np.float32]
+    intact: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One raw number inside a payload.
+
+    Attributes:
+        start: bit number as DBC files count: bit ``8 * byte + b`` with ``b = 0`` the least significant
+            bit of its byte; the field's least significant bit if ``order`` is little, its most
+            significant bit if it is big.
+        bits: width, 1 to 64 (32 or 64 for a float).
+        kind: how the bits are read.
+        order: byte order.
+    """
+
+    start: int
+    bits: int
+    kind: Kind = "unsigned"
+    order: ByteOrder = "little"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= 64 or (self.kind == "float" and self.bits not in {32, 64}):
+            raise LayoutError(
+                f"a {self.kind} field of {self.bits} bits cannot be; use 1 to 64 (float: 32, 64)"
+            )
+
+    @classmethod
+    def at_byte(cls, byte: int, bits: int, kind: Kind = "unsigned", order: ByteOrder = "little") -> Field:
+        """A field that begins on a byte boundary."""
+        return cls(8 * byte + (0 if order == "little" else 7), bits, kind, order)
+
+    @property
+    def positions(self) -> list[int]:
+        """The field's bits from most to least significant, counted from the payload's first bit.
+
+        In this count bit 0 is the *most* significant bit of byte 0, as `numpy.unpackbits` orders them.
+        """
+        if self.order == "little":
+            dbc_bits = range(self.start + self.bits - 1, self.start - 1, -1)
+            return [8 * (bit // 8) + 7 - bit % 8 for bit in dbc_bits]
+        first = 8 * (self.start // 8) + 7 - self.start % 8
+        return list(range(first, first + self.bits))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest value the field can carry."""
+        if self.kind == "float":
+            largest = float(np.finfo(np.float32 if self.bits == 32 else np.float64).max)
+            return -largest, largest
+        if self.kind == "signed":
+            return -float(2 ** (self.bits - 1)), float(2 ** (self.bits - 1) - 1)
+        return 0.0, float(2**self.bits - 1)
+
+
+class _FieldGroup:
+    """Fields of one width and kind, moved between payloads and numbers in one gather.
+
+    Each field is copied left-aligned into a container of 1, 2, 4 or 8 bytes; one shift to the right
+    then extends the sign of any width. Whole bytes are gathered as bytes, anything else as bits.
+    """
+
+    def __init__(self, fields: Sequence[Field], columns: Sequence[int], length: int) -> None:
+        bits, kind = fields[0].bits, fields[0].kind
+        self.columns = np.asarray(columns, np.intp)
+        width = next(w for w in (1, 2, 4, 8) if 8 * w >= bits)
+        self._shift = 8 * width - bits
+        code = "f" if kind == "float" else "i" if kind == "signed" else "u"
+        self._dtype = np.dtype(f">{code}{width}")
+        self._kind = kind
+        spare = 8 * length  # one position past the payload: a zero
+        rows = [[*field.positions, *[spare] * self._shift] for field in fields]
+        self._by_byte = bits % 8 == 0 and all(
+            row[i] % 8 == 0 and row[i : i + 8] == list(range(row[i], row[i] + 8))
+            for row in rows
+            for i in range(0, bits, 8)
+        )
+        picks = [row[::8] for row in rows] if self._by_byte else rows
+        self._index = np.asarray(picks, np.intp) // (8 if self._by_byte else 1)
+        self._used = self._index.shape[1] - self._shift // (8 if self._by_byte else 1)
+
+    def read(self, payloads: Payloads) -> NDArray[np.float64] | NDArray[np.int64]:
+        """Raw numbers ``[n, fields]`` of payloads ``[n, length]``."""
+        n = len(payloads)
+        cells = payloads if self._by_byte else np.unpackbits(payloads, axis=1)
+        padded = np.concatenate([cells, np.zeros((n, 1), np.uint8)], axis=1)
+        gathered = padded[:, self._index]
+        if not self._by_byte:
+            gathered = np.packbits(gathered, axis=2)
+        values = np.ascontiguousarray(gathered).view(self._dtype)[:, :, 0]
+        if self._kind == "float":
+            return values.astype(np.float64)
+        native = values.astype(self._dtype.newbyteorder("="))
+        raw: NDArray[np.int64] = (native >> native.dtype.type(self._shift)).astype(np.int64)
+        return raw
+
+    def write(self, payloads: Payloads, values: NDArray[np.float64] | NDArray[np.int64]) -> None:
+        """Put raw numbers ``[n, fields]`` into payloads ``[n, length]``."""
+        native = values.astype(self._dtype.newbyteorder("="))
+        if self._shift:
+            native <<= native.dtype.type(self._shift)
+        cells = np.ascontiguousarray(native.astype(self._dtype)[:, :, None]).view(np.uint8)
+        if self._by_byte:
+            payloads[:, self._index[:, : self._used]] = cells[:, :, : self._used]
+            return
+        spread = np.unpackbits(payloads, axis=1)
+        spread[:, self._index[:, : self._used]] = np.unpackbits(cells, axis=2)[:, :, : self._used]
+        payloads[:] = np.packbits(spread, axis=1)
+
+
+@dataclass(frozen=True)
+class FrameLayout:
+    """Several samples of several channels, with a sample counter, in every frame of one id.
+
+    Attributes:
+        frame_id: arbitration id.
+        extended: whether the id has 29 bits.
+        length: payload length in bytes; longer than 8 makes it a CAN FD frame.
+        channels: names, in the order of the columns.
+        fields: one field per sample and channel, ``[samples_per_frame][channels]``.
+        scale: physical value of one count, float64 ``[samples_per_frame, channels]``.
+        offset: physical value of count zero, same shape.
+        counter: where the counter lies.
+        counts: whether the counter counts samples or frames.
+        crc_byte: where a CRC-16/IBM-3740 (big endian) over all other bytes lies; None without one.
+    """
+
+    frame_id: int
+    extended: bool
+    length: int
+    channels: tuple[str, ...]
+    fields: tuple[tuple[Field, ...], ...]
+    scale: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    counter: Field
+    counts: Counts
+    crc_byte: int | None = None
+
+    def __post_init__(self) -> None:
+        taken: dict[int, str] = {}
+        named = [("counter", self.counter)]
+        for i, row in enumerate(self.fields):
+            named += [(f"sample {i} of {name}", cell) for name, cell in zip(self.channels, row, strict=True)]
+        if self.crc_byte is not None:
+            named.append(("crc", Field.at_byte(self.crc_byte, 8 * CRC_BYTES, order="big")))
+        for what, cell in named:
+            for position in cell.positions:
+                if not 0 <= position < 8 * self.length:
+                    raise LayoutError(
+                        f"{what} of frame {self.frame_id:#x} reaches past its {self.length} bytes; "
+                        "make the frame longer or the fields fewer"
+                    )
+                if position in taken:
+                    raise LayoutError(f"{what} of frame {self.frame_id:#x} overlaps {taken[position]}")
+                taken[position] = what
+
+    @classmethod
+    def plain(
+        cls,
+        *,
+        frame_id: int,
+        length: int,
+        channels: Sequence[tuple[str, int, Kind, float, float]],
+        samples_per_frame: int,
+        counter_byte: int,
+        counter_bits: int,
+        counts: Counts = "samples",
+        first_byte: int,
+        crc_byte: int | None = None,
+        byte_order: ByteOrder = "little",
+        extended: bool = False,
+    ) -> FrameLayout:
+        """Samples packed one after another: all channels of sample 0, all of sample 1, and so on.
+
+        Args:
+            frame_id: arbitration id.
+            length: payload length in bytes.
+            channels: name, bits (8, 16, 24, 32), kind, scale and offset of each channel.
+            samples_per_frame: samples of every channel in a frame.
+            counter_byte: first byte of the counter.
+            counter_bits: 8, 16 or 32.
+            counts: what the counter counts.
+            first_byte: first byte of the samples.
+            crc_byte: first byte of the CRC, or None.
+            byte_order: of the counter and of the samples.
+            extended: whether the id has 29 bits.
+
+        Raises:
+            LayoutError: something does not fit into ``length`` or overlaps.
+        """
+        fields: list[tuple[Field, ...]] = []
+        byte = first_byte
+        for _ in range(samples_per_frame):
+            row: list[Field] = []
+            for _, bits, kind, _, _ in channels:
+                row.append(Field.at_byte(byte, bits, kind, byte_order))
+                byte += bits // 8
+            fields.append(tuple(row))
+        return cls(
+            frame_id=frame_id,
+            extended=extended,
+            length=length,
+            channels=tuple(name for name, *_ in channels),
+            fields=tuple(fields),
+            scale=np.tile([scale for *_, scale, _ in channels], (samples_per_frame, 1)),
+            offset=np.tile([offset for *_, offset in channels], (samples_per_frame, 1)),
+            counter=Field.at_byte(counter_byte, counter_bits, "unsigned", byte_order),
+            counts=counts,
+            crc_byte=crc_byte,
+        )
+
+    @classmethod
+    def from_dbc(
+        cls,
+        path: Path,
+        message: str,
+        *,
+        counter: str,
+        counts: Counts,
+        channels: Mapping[str, Sequence[str]],
+    ) -> FrameLayout:
+        """The layout of one message of a DBC file.
+
+        Args:
+            path: the DBC file.
+            message: name of the message.
+            counter: name of the counter signal.
+            counts: what it counts.
+            channels: for each channel the signals of its consecutive samples.
+
+        Raises:
+            LayoutError: the file, the message or a signal is not there, a signal is multiplexed, or
+                cantools is not installed.
+        """
+        try:
+            # An extra, and slow to import.
+            from cantools.database import can, load_file  # noqa: PLC0415
+            from cantools.database.errors import Error  # noqa: PLC0415
+        except ImportError as error:
+            raise LayoutError(
+                f"reading {path} needs cantools; install it with: pip install 'daqsvc[dbc]'"
+            ) from error
+        try:
+            database = load_file(path)
+            if not isinstance(database, can.Database):
+                raise LayoutError(f"{path} describes no CAN messages; give a DBC file")
+            described = database.get_message_by_name(message)
+        except (OSError, KeyError, UnicodeError, Error) as error:
+            raise LayoutError(f"message {message!r} of {path} cannot be read: {error}") from error
+        signals = {signal.name: signal for signal in described.signals}
+
+        def field(name: str) -> Field:
+            if name not in signals:
+                raise LayoutError(
+                    f"message {message!r} of {path} has no signal {name!r}; it has {list(signals)}"
+                )
+            signal = signals[name]
+            if signal.multiplexer_ids is not None:
+                raise LayoutError(
+                    f"signal {name!r} of {path} is multiplexed; use a message without multiplexing"
+                )
+            kind: Kind = "float" if signal.is_float else "signed" if signal.is_signed else "unsigned"
+            order: ByteOrder = "little" if signal.byte_order == "little_endian" else "big"
+            return Field(signal.start, signal.length, kind, order)
+
+        rows = list(zip(*channels.values(), strict=True))
+        return cls(
+            frame_id=described.frame_id,
+            extended=described.is_extended_frame,
+            length=described.length,
+            channels=tuple(channels),
+            fields=tuple(tuple(field(name) for name in row) for row in rows),
+            scale=np.array([[float(signals[name].scale) for name in row] for row in rows]),
+            offset=np.array([[float(signals[name].offset) for name in row] for row in rows]),
+            counter=field(counter),
+            counts=counts,
+        )
+
+    @property
+    def samples_per_frame(self) -> int:
+        """Samples of every channel in one frame."""
+        return len(self.fields)
+
+    @property
+    def fd(self) -> bool:
+        """Whether only CAN FD can carry the payload."""
+        return self.length > 8
+
+    @property
+    def counter_bits(self) -> int:
+        """Width of the counter."""
+        return self.counter.bits
+
+    @property
+    def counts_per_frame(self) -> int:
+        """By how much the counter grows from one frame to the next."""
+        return self.samples_per_frame if self.counts == "samples" else 1
+
+    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> FrameLayout:
+        """The same layout with each channel's value ``v`` turned into ``gain * v + shift``.
+
+        Args:
+            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
+        """
+        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
+        gain = np.array([g for g, _ in pairs])
+        shift = np.array([s for _, s in pairs])
+        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
+
+    @cached_property
+    def _counter_group(self) -> _FieldGroup:
+        return _FieldGroup([self.counter], [0], self.length)
+
+    @cached_property
+    def _sample_groups(self) -> list[_FieldGroup]:
+        flat = [cell for row in self.fields for cell in row]
+        kinds = dict.fromkeys((cell.bits, cell.kind) for cell in flat)
+        return [
+            _FieldGroup(
+                [cell for cell in flat if (cell.bits, cell.kind) == kind],
+                [i for i, cell in enumerate(flat) if (cell.bits, cell.kind) == kind],
+                self.length,
+            )
+            for kind in kinds
+        ]
+
+    def _crc(self, payloads: Payloads) -> NDArray[np.uint16]:
+        assert self.crc_byte is not None  # noqa: S101 - callers ask only where there is one
+        covered = np.delete(payloads, [self.crc_byte, self.crc_byte + 1], axis=1).tobytes()
+        step = self.length - CRC_BYTES
+        crcs = (binascii.crc_hqx(covered[i : i + step], 0xFFFF) for i in range(0, len(covered), step))
+        return np.fromiter(crcs, np.uint16, len(payloads))
+
+    def decode(self, payloads: Payloads) -> Decoded:
+        """Decode a batch of frames.
+
+        Args:
+            payloads: uint8 ``[n, length]``.
+        """
+        n = len(payloads)
+        raw = np.empty((n, self.scale.size), np.float64)
+        for group in self._sample_groups:
+            raw[:, group.columns] = group.read(payloads)
+        samples = raw.reshape(n, *self.scale.shape) * self.scale + self.offset
+        counter = self._counter_group.read(payloads)[:, 0].astype(np.int64)
+        if self.crc_byte is None:
+            intact = np.ones(n, np.bool_)
+        else:
+            sent = payloads[:, self.crc_byte].astype(np.uint16) << 8 | payloads[:, self.crc_byte + 1]
+            intact = sent == self._crc(payloads)
+        with np.errstate(over="ignore"):  # a float64 on the wire may exceed float32: it becomes infinite
+            return Decoded(counter, samples.astype(np.float32), intact)
+
+    def encode(
+        self,
+        first_index: NDArray[np.int64],
+        samples: NDArray[np.float64] | NDArray[np.float32],
+        *,
+        clip: bool = False,
+    ) -> Payloads:
+        """Encode a batch of frames, as the device would send them.
+
+        Args:
+            first_index: int64 ``[n]``, absolute index of each frame's first sample; the counter wraps
+                it to its width.
+            samples: ``[n, samples_per_frame, channels]`` in physical units.
+            clip: saturate what does not fit, as an analogue input does, instead of raising.
+
+        Returns:
+            uint8 ``[n, length]``.
+
+        Raises:
+            LayoutError: a value does not fit its field (and ``clip`` is False), or is NaN.
+        """
+        n = len(first_index)
+        raw = ((np.asarray(samples, np.float64) - self.offset) / self.scale).reshape(n, -1)
+        payloads = np.zeros((n, self.length), np.uint8)
+        for group in self._sample_groups:
+            values = raw[:, group.columns]
+            cell = [c for row in self.fields for c in row][group.columns[0]]
+            low, high = cell.limits
+            rounded = values if cell.kind == "float" else np.rint(values)
+            outside = ~((rounded >= low) & (rounded <= high))
+            if np.isnan(rounded).any() or (outside.any() and not clip):
+                row, column = np.argwhere(outside)[0]
+                at, channel = divmod(int(group.columns[column]), len(self.channels))
+                value = float(np.asarray(samples)[row, at, channel])
+                raise LayoutError(
+                    f"channel {self.channels[channel]!r}: {value:g} does not fit a {cell.bits}-bit "
+                    f"{cell.kind} field of frame {self.frame_id:#x}; choose a larger scale"
+                )
+            group.write(payloads, np.clip(rounded, low, high))
+        counts = first_index if self.counts == "samples" else first_index // self.samples_per_frame
+        self._counter_group.write(payloads, (counts % 2**self.counter_bits).astype(np.int64)[:, None])
+        if self.crc_byte is not None:
+            crc = self._crc(payloads)
+            payloads[:, self.crc_byte] = crc >> 8
+            payloads[:, self.crc_byte + 1] = crc & 0xFF
+        return payloads
