@@ -1,0 +1,248 @@
+"""Buses, the streams of samples on them, and how the samples lie in a frame."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
+
+CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
+
+CRC_BYTES = 2
+
+RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
+Counts = Literal["samples", "frames"]
+StartPolicy = Literal["error", "retry", "ignore"]
+
+_RAW_BYTES: dict[RawType, int] = {
+    "int8": 1,
+    "int16": 2,
+    "int24": 3,
+    "int32": 4,
+    "uint8": 1,
+    "uint16": 2,
+    "uint24": 3,
+    "uint32": 4,
+    "float32": 4,
+}
+
+
+def _payload_length(length: int) -> int:
+    if length not in CAN_FD_LENGTHS:
+        raise PydanticCustomError(
+            "payload_length",
+            "is not a length that a CAN frame can have",
+            {"remedy": "take 0 to 8 (classic CAN), or 12, 16, 20, 24, 32, 48 or 64 (CAN FD)"},
+        )
+    return length
+
+
+def _not_zero(scale: float) -> float:
+    if scale == 0:
+        raise PydanticCustomError(
+            "zero_scale",
+            "would make every sample the same",
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
+        )
+    return scale
+
+
+class CanBus(Section):
+    """A CAN or CAN FD bus, opened through python-can."""
+
+    kind: ClassVar[str] = "a CAN bus"
+
+    driver: Annotated[Literal["can"], Field(description="which driver reads the bus", examples=["can"])]
+    interface: Annotated[
+        str, Field(min_length=1, description="the python-can interface", examples=["socketcan"])
+    ]
+    channel: Annotated[
+        str, Field(min_length=1, description="the channel of that interface", examples=["can0"])
+    ]
+    fd: Annotated[bool, Field(description="whether CAN FD frames are on the bus", examples=[True])] = False
+    bitrate: Annotated[int, Field(gt=0, le=1_000_000, description="bit/s")] | None = None
+    data_bitrate: Annotated[int, Field(gt=0, le=20_000_000, description="bit/s of FD data")] | None = None
+    options: dict[str, Any] = Field(default={}, description="handed to python-can as they are")
+    start: StartPolicy = Field(default="retry", description="what to do if the device is absent at start")
+
+
+class OtherBus(Section):
+    """A bus read by a third-party driver, which checks its own options."""
+
+    kind: ClassVar[str] = 'a bus with a driver other than "can"'
+
+    driver: Annotated[Name, Field(description="name of the driver's entry point")]
+    options: dict[str, Any] = Field(default={}, description="handed to the driver as they are")
+    start: StartPolicy = Field(default="retry", description="what to do if the device is absent at start")
+
+
+class Counter(Section):
+    """The running count in each frame that tells loss and gives a sample its place in time."""
+
+    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
+    bits: Annotated[Literal[8, 16, 32], Field(description="its width", examples=[16])]
+    counts: Annotated[
+        Counts,
+        Field(description="what it counts; of samples, the first one in the frame", examples=["samples"]),
+    ]
+
+    @property
+    def end_byte(self) -> int:
+        """One past its last byte."""
+        return self.byte + self.bits // 8
+
+
+class Channel(Section):
+    """One quantity in the frame: wire value = raw * scale + offset.
+
+    The wire value is in V if the channel's sensor has a sensitivity, else in the sensor's unit.
+    """
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
+    type: Annotated[RawType, Field(description="the raw type of a sample", examples=["int16"])]
+    scale: Annotated[
+        float, AfterValidator(_not_zero), Field(description="worth of one count", examples=[0.0005])
+    ]
+    offset: float = Field(default=0.0, description="wire value of the raw value 0")
+
+    @property
+    def raw_bytes(self) -> int:
+        """Bytes of one raw sample."""
+        return _RAW_BYTES[self.type]
+
+
+class PlainLayout(Section):
+    """Samples side by side in a frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
+
+    kind: ClassVar[str] = "a layout without a DBC file"
+
+    id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF, description="the frame's CAN id", examples=["0x101"])]
+    extended: bool = Field(default=False, description="whether the id has 29 bits rather than 11")
+    length: Annotated[
+        int, AfterValidator(_payload_length), Field(description="payload length in bytes", examples=[64])
+    ]
+    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
+    counter: Annotated[
+        Counter,
+        Field(description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']),
+    ]
+    crc_byte: Annotated[int, Field(ge=0, le=62, description="byte where a CRC-16 starts")] | None = None
+    first_byte: Annotated[int, Field(ge=0, le=63, description="where the samples start", examples=[2])]
+    samples_per_frame: Annotated[int, Field(ge=1, le=64, description="samples per channel", examples=[10])]
+    channels: Annotated[
+        tuple[Channel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
+        ),
+    ]
+
+    @property
+    def sample_bytes(self) -> int:
+        """Bytes of one sample of every channel."""
+        return sum(channel.raw_bytes for channel in self.channels)
+
+    @property
+    def samples_end_byte(self) -> int:
+        """One past the last byte of the samples."""
+        return self.first_byte + self.samples_per_frame * self.sample_bytes
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+
+class DbcCounter(Section):
+    """The running count, as a signal of the DBC message."""
+
+    signal: Annotated[str, Field(min_length=1, description="the counter's signal", examples=["Sequence"])]
+    counts: Annotated[
+        Counts,
+        Field(description="what it counts; of samples, the first one in the frame", examples=["frames"]),
+    ]
+
+
+class DbcChannel(Section):
+    """One quantity in a DBC message: its consecutive samples are signals of their own."""
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
+    signals: Annotated[
+        tuple[str, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="signals that hold its samples, oldest first",
+            examples=['["AccelX"]'],
+        ),
+    ]
+
+
+class DbcLayout(Section):
+    """Samples as signals of a message in a DBC file."""
+
+    kind: ClassVar[str] = "a layout from a DBC file"
+
+    dbc: Annotated[Path, Field(strict=False, description="the DBC file, relative to the machine file")]
+    message: Annotated[
+        str,
+        Field(min_length=1, description="the message that carries the samples", examples=["Acceleration"]),
+    ]
+    counter: Annotated[
+        DbcCounter,
+        Field(description="the frame's counter", examples=['{ signal = "Sequence", counts = "frames" }']),
+    ]
+    channels: Annotated[
+        tuple[DbcChannel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x", signals = ["AccelX"] }]'],
+        ),
+    ]
+
+    @property
+    def samples_per_frame(self) -> int:
+        """Samples of each channel in a frame."""
+        return len(self.channels[0].signals)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+
+Bus: TypeAlias = Annotated[
+    CanBus | OtherBus,
+    Kinds(
+        lambda table: (
+            CanBus if not isinstance(d := table.get("driver", "can"), str) or d == "can" else OtherBus
+        ),
+        (CanBus, OtherBus),
+    ),
+]
+Layout: TypeAlias = Annotated[
+    PlainLayout | DbcLayout,
+    Kinds(lambda table: DbcLayout if "dbc" in table else PlainLayout, (PlainLayout, DbcLayout)),
+]
+
+
+class Stream(Section):
+    """Samples that one device takes together and sends under one id."""
+
+    bus: Annotated[Name, Field(description="the bus it comes over", examples=["can0"])]
+    rate_hz: Annotated[
+        Positive, Field(le=10_000_000, description="samples per second and channel", examples=[640.0])
+    ]
+    reorder_window_ms: Annotated[NotNegative, Field(le=1000)] = Field(
+        default=10.0, description="how long a gap may wait for a late frame"
+    )
+    layout: Annotated[Layout, Field(description="where counter and samples lie in a frame")]

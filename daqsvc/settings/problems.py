@@ -1,0 +1,72 @@
+"""What is wrong with a machine file, said so that it can be put right at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+KeyPath: TypeAlias = tuple[str | int, ...]
+"""A place in the file: keys, and 0-based positions in arrays, e.g. ``("sensors", 0, "name")``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something wrong with values that are valid each for itself.
+
+    Attributes:
+        path: where to look first.
+        message: what is wrong, to be read after the value.
+        remedy: what to do about it.
+        fatal: False for a warning.
+    """
+
+    path: KeyPath
+    message: str
+    remedy: str
+    fatal: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing wrong with a machine file.
+
+    Attributes:
+        file: the machine file.
+        line: line of the key, from 1; None if it concerns the file as a whole.
+        key: dotted key, e.g. ``sensors[0].name``; empty if it concerns the file as a whole.
+        value: the value as the file has it; empty if there is none, secrets masked.
+        message: what is wrong with it.
+        remedy: what to do about it.
+    """
+
+    file: Path
+    line: int | None
+    key: str
+    value: str
+    message: str
+    remedy: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line is not None else f"{self.file}"
+        subject = f"{self.key} = {self.value}" if self.value else self.key
+        middle = f"{subject}: " if subject else ""
+        return f"{place}: {middle}{self.message}. Remedy: {self.remedy}"
+
+
+class MachineFileError(Exception):
+    """A machine file that cannot be used, with every problem found in it.
+
+    Attributes:
+        problems: all of them, in the order of the file; never empty.
+    """
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        super().__init__(problems)
+        self.problems = tuple(problems)
+
+    def __str__(self) -> str:
+        return "\n\n".join(str(problem) for problem in self.problems)

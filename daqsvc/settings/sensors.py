@@ -1,0 +1,137 @@
+"""Sensors: what a channel measures, in which unit, and when the sensor itself is to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping  # noqa: TC003 - keeps the signature of `_kind_of` resolvable
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import AngleDeg, Kinds, Name, NotNegative, Section
+
+
+def _not_zero(sensitivity_mv_per_unit: float) -> float:
+    if sensitivity_mv_per_unit == 0:
+        raise PydanticCustomError(
+            "zero_sensitivity",
+            "cannot be zero",
+            {
+                "remedy": "copy the figure from the sensor's calibration sheet, or leave it out if the "
+                "channel already carries the physical unit"
+            },
+        )
+    return sensitivity_mv_per_unit
+
+
+def _ordered_gap(limits_v: tuple[float, float]) -> tuple[float, float]:
+    if limits_v[0] >= limits_v[1]:
+        raise PydanticCustomError(
+            "gap_order",
+            "the lower limit of the gap voltage must come first",
+            {
+                "remedy": f"write [{min(limits_v)}, {max(limits_v)}]"
+                if limits_v[0] > limits_v[1]
+                else "write two different limits, e.g. [-18.0, -2.0]"
+            },
+        )
+    return limits_v
+
+
+class BaseSensor(Section):
+    """What all sensors have; physical = (V - zero_v) * 1000 / sensitivity_mv_per_unit."""
+
+    name: Annotated[Name, Field(description="name of the sensor", examples=["probe-x"])]
+    stream: Annotated[Name, Field(description="the stream it is in", examples=["shaft"])]
+    channel: Annotated[Name, Field(description="its channel in that stream", examples=["x"])]
+    sensitivity_mv_per_unit: Annotated[float, AfterValidator(_not_zero)] | None = Field(
+        default=None, description="mV per unit; absent if the channel already carries the physical unit"
+    )
+    zero_v: float = Field(default=0.0, description="voltage that stands for 0 in the physical unit")
+
+    @property
+    def gain(self) -> float:
+        """Physical units per unit on the wire: physical = wire * gain + bias."""
+        return 1.0 if self.sensitivity_mv_per_unit is None else 1000.0 / self.sensitivity_mv_per_unit
+
+    @property
+    def bias(self) -> float:
+        """Physical value of a zero on the wire: physical = wire * gain + bias."""
+        return 0.0 if self.sensitivity_mv_per_unit is None else -self.zero_v * self.gain
+
+
+class ProximityProbe(BaseSensor):
+    """An eddy-current probe: shaft position against the housing, with a gap voltage to watch."""
+
+    kind: ClassVar[str] = "a proximity probe"
+
+    type: Literal["proximity"]
+    unit: Annotated[Literal["um", "mm", "mil"], Field(description="unit of the position", examples=["um"])]
+    gap_ok_v: Annotated[
+        tuple[float, float],
+        AfterValidator(_ordered_gap),
+        Field(
+            strict=False,
+            description="OK limits of the mean gap voltage, in V",
+            examples=["[-18.0, -2.0]"],
+        ),
+    ]
+    angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
+
+
+class Accelerometer(BaseSensor):
+    """An accelerometer on the housing."""
+
+    kind: ClassVar[str] = "an accelerometer"
+
+    type: Literal["accelerometer"]
+    unit: Annotated[Literal["g", "m/s2"], Field(description="unit of the acceleration", examples=["g"])]
+    angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
+
+
+class VelocitySensor(BaseSensor):
+    """A velocity sensor on the housing."""
+
+    kind: ClassVar[str] = "a velocity sensor"
+
+    type: Literal["velocity"]
+    unit: Annotated[Literal["mm/s"], Field(description="unit of the velocity", examples=["mm/s"])]
+
+
+class Keyphasor(BaseSensor):
+    """A probe over a notch or a key: one pulse a revolution, whose edge marks angle zero."""
+
+    kind: ClassVar[str] = "a keyphasor"
+
+    type: Literal["keyphasor"]
+    unit: Annotated[Literal["V"], Field(description="unit of the pulse", examples=["V"])]
+    threshold_v: Annotated[float, Field(description="level that a pulse crosses, in V", examples=[-6.0])]
+    hysteresis_v: NotNegative = Field(default=0.5, description="how far back before the next crossing counts")
+    edge: Literal["rising", "falling"] = Field(default="rising", description="the edge that marks angle zero")
+
+
+class _UntypedSensor(BaseSensor, extra="ignore"):
+    """Stands for a sensor whose type is missing or unknown: the keys that depend on it go unchecked."""
+
+    type: Annotated[
+        Literal["proximity", "accelerometer", "velocity", "keyphasor"],
+        Field(description="what kind of sensor it is", examples=["proximity"]),
+    ]
+
+
+_KINDS: dict[str, type[BaseSensor]] = {
+    "proximity": ProximityProbe,
+    "accelerometer": Accelerometer,
+    "velocity": VelocitySensor,
+    "keyphasor": Keyphasor,
+}
+
+
+def _kind_of(table: Mapping[str, Any]) -> type[Section]:
+    kind = table.get("type")
+    return _KINDS.get(kind, _UntypedSensor) if isinstance(kind, str) else _UntypedSensor
+
+
+Sensor: TypeAlias = Annotated[
+    ProximityProbe | Accelerometer | VelocitySensor | Keyphasor, Kinds(_kind_of, tuple(_KINDS.values()))
+]
