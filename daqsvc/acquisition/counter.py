@@ -1,0 +1,145 @@
+"""Unwrapping a device's sample counter, and telling a wrap from a loss from a restart.
+
+The counter says where a frame belongs; the time of arrival only decides what the counter cannot: how
+often it wrapped during an outage, and whether it was restarted.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+JITTER_NS = 50_000_000
+"""How far a frame may seem ahead of the host clock; five times the jitter we promise to bear."""
+
+DRIFT = 0.01
+"""How far a device's rate may be off its nominal one, while the time base has not measured it."""
+
+
+class Placement(NamedTuple):
+    """Where the frames of a batch belong.
+
+    Attributes:
+        counts: int64 ``[n]``, the counter unwrapped; meaningless where ``kept`` is False.
+        kept: bool ``[n]``, False for frames whose counter fits neither the sequence nor a restart.
+        restarts: places in the batch at which the device was found to have restarted its counter;
+            the distance to the frame before is estimated from the host clock.
+    """
+
+    counts: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    restarts: list[int]
+
+
+class CounterUnwrapper:
+    """Follows one device's counter of 8, 16 or 32 bits.
+
+    A frame is taken by its sequence alone while that agrees with the host clock. Where it does not,
+    the number of missed wraps comes from the clock; a counter that no number of wraps can explain is
+    held back until the next frame continues from it, and only then believed to be a restart.
+
+    With ``M`` counts to a wrap, outages are resolved exactly while ``M`` lasts longer than twice the
+    arrival jitter. A restart inside the reorder window cannot be told from late frames.
+
+    Args:
+        bits: width of the counter.
+        step: counts from one frame to the next.
+        rate_hz: nominal counts per second.
+        reorder_counts: how far back a frame may belong that was overtaken on its way.
+    """
+
+    def __init__(self, bits: int, step: int, rate_hz: float, reorder_counts: int) -> None:
+        if bits not in {8, 16, 32}:
+            raise ValueError(f"a counter has 8, 16 or 32 bits, not {bits}")
+        if not 0 < step < 2 ** (bits - 2):
+            raise ValueError(f"a {bits}-bit counter cannot tell frames of {step} counts apart; make it wider")
+        self._modulus = 2**bits
+        self._step = step
+        self._rate = rate_hz / NS_PER_S
+        self._back = min(reorder_counts, self._modulus // 4)
+        self._ahead = min(JITTER_NS * self._rate, self._modulus / 4)
+        self._started = False
+        self._raw = 0
+        self._count = 0
+        self._seen_ns = 0
+        self._highest = 0
+        self._suspect: int | None = None
+
+    def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
+        """Unwrap a batch.
+
+        Args:
+            raw: int64 ``[n]``, counters as sent.
+            arrival_ns: int64 ``[n]``, host monotonic arrival times, not decreasing.
+        """
+        n = len(raw)
+        count = np.zeros(n, np.int64)
+        kept = np.ones(n, np.bool_)
+        restarts: list[int] = []
+        at = 0
+        if n and not self._started:
+            self._accept(int(raw[0]), int(raw[0]), int(arrival_ns[0]))
+            self._highest = count[0] = raw[0]
+            at = 1
+        while at < n:
+            at += self._follow(raw[at:], arrival_ns[at:], count[at:])
+            if at < n:
+                self._decide(at, int(raw[at]), int(arrival_ns[at]), count, kept, restarts)
+                at += 1
+        return Placement(count, kept, restarts)
+
+    def _follow(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64], count: NDArray[np.int64]) -> int:
+        """Place the longest beginning of a batch that continues the sequence; returns its length."""
+        steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
+        elapsed = (arrival_ns - np.concatenate(([self._seen_ns], arrival_ns[:-1]))) * self._rate
+        sane = (steps >= -self._back) & (steps <= elapsed + self._ahead)
+        # After half a wrap of silence a small step may hide whole wraps, unless it is the very next frame.
+        sane &= (elapsed < self._modulus / 2) | (steps == self._step)
+        good = len(raw) if sane.all() else int(np.argmin(sane))
+        if good:
+            count[:good] = self._count + np.cumsum(steps[:good])
+            self._highest = max(self._highest, int(count[:good].max()))
+            self._accept(int(raw[good - 1]), int(count[good - 1]), int(arrival_ns[good - 1]))
+        return good
+
+    def _decide(
+        self,
+        at: int,
+        raw: int,
+        arrival_ns: int,
+        count: NDArray[np.int64],
+        kept: NDArray[np.bool_],
+        restarts: list[int],
+    ) -> None:
+        """Place one frame that the sequence does not explain."""
+        step = int(self._signed(np.array([raw - self._raw]))[0])
+        elapsed = (arrival_ns - self._seen_ns) * self._rate
+        advance = step + round((elapsed - step) / self._modulus) * self._modulus
+        if advance > 0 and abs(advance - elapsed) <= self._ahead + elapsed * DRIFT:
+            count[at] = self._count + advance
+        elif self._suspect is not None and 0 < (raw - self._suspect) % self._modulus <= 4 * self._step:
+            # Never before anything placed already: two samples cannot share an index.
+            count[at] = max(self._count + round(elapsed), self._highest + self._step)
+            restarts.append(at)
+        else:
+            self._suspect = raw
+            kept[at] = False
+            return
+        self._highest = max(self._highest, int(count[at]))
+        self._accept(raw, int(count[at]), arrival_ns)
+
+    def _accept(self, raw: int, count: int, arrival_ns: int) -> None:
+        self._started = True
+        self._raw, self._count, self._seen_ns = raw, count, arrival_ns
+        self._suspect = None
+
+    def _signed(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
+        half = self._modulus // 2
+        signed: NDArray[np.int64] = (steps + half) % self._modulus - half
+        return signed

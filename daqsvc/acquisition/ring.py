@@ -1,0 +1,283 @@
+"""The sample ring: one writer, many readers, every sample at its absolute index.
+
+Missing samples keep their place as rows of NaN, so an index means the same instant to every reader. A
+reader that falls behind is told exactly how many samples it has lost; it never sees a row that was
+overwritten under its hands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import itertools
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daqsvc.acquisition.samples import SampleBlock, Samples
+
+ANCHORS = 4096
+
+
+class RingError(Exception):
+    """What a ring refuses."""
+
+
+class RingOverrun(RingError):  # noqa: N818 - the field's word
+    """The samples asked for have been overwritten.
+
+    Attributes:
+        lost: how many of them, exactly.
+        oldest: the oldest index still there.
+    """
+
+    def __init__(self, stream: str, first: int, oldest: int) -> None:
+        self.lost = oldest - first
+        self.oldest = oldest
+        super().__init__(f"{self.lost} samples of {stream!r} from index {first} on were overwritten")
+
+
+class RingNotYet(RingError):  # noqa: N818
+    """The samples asked for have not been written yet."""
+
+
+class RingClosed(RingError):  # noqa: N818
+    """The writer is gone and the index waited for will never come."""
+
+
+class SampleRing:
+    """A preallocated ring of float32 samples ``[capacity, channels]``.
+
+    `write` belongs to one thread, the event loop's; `read` may be called from any. A writer that
+    laps a reader in the middle of a copy is noticed after the copy and reported as an overrun.
+
+    Args:
+        stream: name of the stream.
+        channels: names of the columns.
+        capacity: samples it holds, at least 1.
+    """
+
+    def __init__(self, stream: str, channels: Sequence[str], capacity: int) -> None:
+        if capacity < 1 or not channels:
+            raise ValueError(
+                f"ring of {stream!r} needs a capacity >= 1 and channels, not {capacity}, {channels}"
+            )
+        self.stream = stream
+        self.channels = tuple(channels)
+        self.capacity = capacity
+        self.samples_lost = 0
+        self._data = np.full((capacity, len(channels)), np.nan, np.float32)
+        self._oldest = 0
+        self._end: int | None = None
+        self._anchor_index = [0] * ANCHORS
+        self._anchor_time = [(0, 0.0)] * ANCHORS
+        self._anchors = 0
+        self._order = itertools.count()
+        self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._closed = False
+
+    @property
+    def started(self) -> bool:
+        """Whether anything has been written."""
+        return self._end is not None
+
+    @property
+    def oldest_index(self) -> int:
+        """Index of the oldest sample that can be read."""
+        return self._oldest
+
+    @property
+    def end_index(self) -> int:
+        """One past the index of the newest sample; 0 before the first block."""
+        return 0 if self._end is None else self._end
+
+    def write(self, block: SampleBlock) -> None:
+        """Append a block; ``lost_before`` samples before it become rows of NaN.
+
+        Raises:
+            ValueError: the block has other channels, or does not follow the last one.
+        """
+        n = len(block.samples)
+        if block.samples.shape[1] != len(self.channels):
+            raise ValueError(
+                f"block of {self.stream!r} has {block.samples.shape[1]} channels, "
+                f"the ring {len(self.channels)}"
+            )
+        if self._end is None:
+            self._end = self._oldest = block.first_index - block.lost_before
+        if block.first_index != self._end + block.lost_before:
+            raise ValueError(
+                f"block of {self.stream!r} at index {block.first_index} does not follow {self._end} "
+                f"with {block.lost_before} samples lost between"
+            )
+        # Readers on other threads compare with this before and after they copy.
+        self._oldest = max(self._oldest, block.end_index - self.capacity)
+        self._fill(self._end, block.lost_before, None)
+        self._fill(block.first_index, n, block.samples)
+        self.samples_lost += block.lost_before
+        slot = self._anchors % ANCHORS
+        self._anchor_index[slot] = block.first_index
+        self._anchor_time[slot] = (block.t_first_ns, block.period_ns)
+        self._anchors += 1
+        self._end = block.end_index
+        self._wake()
+
+    def _fill(self, first: int, count: int, samples: Samples | None) -> None:
+        skip = max(0, count - self.capacity)  # what would be overwritten at once
+        done = skip
+        while done < count:
+            slot = (first + done) % self.capacity
+            run = min(count - done, self.capacity - slot)
+            self._data[slot : slot + run] = np.nan if samples is None else samples[done : done + run]
+            done += run
+
+    def read(self, first: int, count: int) -> Samples:
+        """A copy of ``count`` samples from index ``first`` on, float32 ``[count, channels]``.
+
+        Raises:
+            RingOverrun: some of them have been overwritten.
+            RingNotYet: some of them are still to come.
+        """
+        if count < 0 or first + count > self.end_index or self._end is None:
+            raise RingNotYet(
+                f"samples {first} to {first + count} of {self.stream!r} are not there; "
+                f"it ends at {self.end_index}"
+            )
+        if first < self._oldest:
+            raise RingOverrun(self.stream, first, self._oldest)
+        slot = first % self.capacity
+        head = min(count, self.capacity - slot)
+        copy = np.concatenate([self._data[slot : slot + head], self._data[: count - head]])
+        if first < self._oldest:
+            raise RingOverrun(self.stream, first, self._oldest)
+        return copy
+
+    def time_of(self, index: int) -> int:
+        """Host monotonic time in ns at which sample ``index`` was (or will be) taken.
+
+        Raises:
+            RingNotYet: nothing has been written.
+        """
+        return round(self._time_at(index)[0])
+
+    def period_at(self, index: int) -> float:
+        """Time between samples around ``index``, in ns."""
+        return self._time_at(index)[1]
+
+    def _time_at(self, index: int) -> tuple[float, float]:
+        if not self._anchors:
+            raise RingNotYet(f"{self.stream!r} has no samples yet, so no time")
+        known = range(max(0, self._anchors - ANCHORS), self._anchors)
+        place = bisect_right(known, index, key=lambda k: self._anchor_index[k % ANCHORS])
+        slot = known[max(place - 1, 0)] % ANCHORS
+        t_ns, period_ns = self._anchor_time[slot]
+        return t_ns + (index - self._anchor_index[slot]) * period_ns, period_ns
+
+    async def wait_for(self, index: int) -> None:
+        """Wait until sample ``index - 1`` has been written, so that everything below ``index`` is there.
+
+        Raises:
+            RingClosed: the ring was closed before.
+        """
+        if self._end is not None and self._end >= index:
+            return
+        if self._closed:
+            raise RingClosed(f"{self.stream!r} ended at {self.end_index}, before index {index}")
+        woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._waiting, (index, next(self._order), woken))
+        await woken
+
+    async def window(self, trigger: int, before: int, after: int) -> Samples:
+        """The samples around a trigger: ``before`` of them up to it and ``after`` from it on.
+
+        Raises:
+            RingOverrun: the oldest of them are gone.
+            RingClosed: the newest of them will not come.
+        """
+        await self.wait_for(trigger + after)
+        return self.read(trigger - before, before + after)
+
+    def _wake(self) -> None:
+        while self._waiting and self._waiting[0][0] <= self.end_index:
+            _, _, woken = heapq.heappop(self._waiting)
+            if not woken.done():
+                woken.set_result(None)
+
+    def close(self) -> None:
+        """Let nobody wait any longer; what was written can still be read."""
+        self._closed = True
+        for _, _, woken in self._waiting:
+            if not woken.done():
+                woken.set_exception(RingClosed(f"{self.stream!r} was closed at index {self.end_index}"))
+        self._waiting.clear()
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """What a reader got.
+
+    Attributes:
+        first_index: absolute index of the first row.
+        samples: float32 ``[n, channels]``, a private copy.
+        skipped: samples between the last chunk and this one that were overwritten before they were read.
+    """
+
+    first_index: int
+    samples: Samples
+    skipped: int
+
+
+class RingReader:
+    """One reader's place in a ring.
+
+    Attributes:
+        position: index of the next sample to read; None until the ring has its first block.
+        samples_skipped: samples lost to overruns since the start, exactly.
+    """
+
+    def __init__(self, ring: SampleRing) -> None:
+        self.ring = ring
+        self.position: int | None = ring.end_index if ring.started else None
+        self.samples_skipped = 0
+
+    @property
+    def behind(self) -> int:
+        """Samples written and not yet read."""
+        if self.position is None:
+            return self.ring.end_index - self.ring.oldest_index if self.ring.started else 0
+        return self.ring.end_index - self.position
+
+    async def take(self, block: int, most_blocks: int) -> Chunk:
+        """Wait for ``block`` samples and read as many whole blocks as there are, up to ``most_blocks``.
+
+        Raises:
+            RingClosed: the ring was closed with less than a block left.
+        """
+        ring = self.ring
+        if self.position is None:
+            if not ring.started:
+                await self._first_block()
+            self.position = ring.oldest_index
+        skipped = 0
+        while True:
+            await ring.wait_for(self.position + block)
+            count = min((ring.end_index - self.position) // block, most_blocks) * block
+            try:
+                samples = ring.read(self.position, count)
+            except RingOverrun as overrun:
+                skipped += overrun.lost
+                self.position = overrun.oldest
+                continue
+            chunk = Chunk(self.position, samples, skipped)
+            self.position += count
+            self.samples_skipped += skipped
+            return chunk
+
+    async def _first_block(self) -> None:
+        # Any index will do: the first block starts wherever the device's counter stands.
+        await self.ring.wait_for(-(2**63))

@@ -1,0 +1,77 @@
+"""Keeping a link up: when to try again, and how often to talk about it."""
+
+from __future__ import annotations
+
+import logging
+import random
+from dataclasses import dataclass, field
+from typing import Literal
+
+from daqsvc.acquisition.clock import NS_PER_S
+
+logger = logging.getLogger(__name__)
+
+LinkState = Literal["down", "up"]
+
+
+class Backoff:
+    """Exponential back-off with full jitter: a random wait up to a ceiling that doubles.
+
+    Args:
+        first_ns: first ceiling.
+        most_ns: highest ceiling.
+        rng: source of the jitter.
+    """
+
+    def __init__(
+        self, first_ns: int = NS_PER_S // 4, most_ns: int = 30 * NS_PER_S, rng: random.Random | None = None
+    ) -> None:
+        self._first_ns = first_ns
+        self._most_ns = most_ns
+        self._ceiling_ns = first_ns
+        # Jitter spreads reconnects, it keeps no secret.
+        self._rng = rng or random.Random()  # noqa: S311
+
+    def next_ns(self) -> int:
+        """How long to wait before the next try."""
+        wait_ns = self._rng.randint(self._first_ns // 10, self._ceiling_ns)
+        self._ceiling_ns = min(2 * self._ceiling_ns, self._most_ns)
+        return wait_ns
+
+    def reset(self) -> None:
+        """It worked: begin again at the first ceiling."""
+        self._ceiling_ns = self._first_ns
+
+
+@dataclass(slots=True)
+class Link:
+    """The state of one link, said once when it goes and once when it is back.
+
+    Attributes:
+        name: what a person calls it.
+        state: up or down.
+        losses: how often it went down after it had been up.
+        reason: why it is down.
+    """
+
+    name: str
+    state: LinkState = "down"
+    losses: int = 0
+    reason: str = ""
+    _said_down: bool = field(default=False, repr=False)
+
+    def up(self) -> None:
+        """The link works."""
+        if self._said_down:
+            logger.warning("%s is back", self.name)
+        elif self.state == "down":
+            logger.info("%s is up", self.name)
+        self.state, self.reason, self._said_down = "up", "", False
+
+    def down(self, reason: str) -> None:
+        """The link does not work, because of ``reason``; repeated calls are silent."""
+        if self.state == "up":
+            self.losses += 1
+        if not self._said_down:
+            logger.warning("%s is lost: %s; trying again until it is back", self.name, reason)
+        self.state, self.reason, self._said_down = "down", reason, True

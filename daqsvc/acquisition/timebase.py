@@ -1,0 +1,215 @@
+"""The time base: from a device's sample count to host monotonic time.
+
+Frames arrive late, never early: the bus, the kernel and the scheduler add delay and take none away.
+So the truth lies along the lower edge of the cloud of arrivals. The estimator keeps the earliest
+arrival of every tenth of a second and supports a line under them where it fits the whole window best
+(the linear programme of Moon, Skelly and Towsley 1999, solved on the lower convex hull). Jitter of
+10 ms then moves the estimate by far less than a millisecond. The constant part of the delay cannot be
+seen from one side and stays in.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.counter import CounterUnwrapper
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BUCKET_NS = 100_000_000
+WINDOW_BUCKETS = 600
+SETTLING_NS = 2 * NS_PER_S
+MAX_DRIFT = 0.05
+RECENT_DELAYS = 1024
+
+
+class TimeBaseState(NamedTuple):
+    """What the time base knows about a device's clock.
+
+    Attributes:
+        period_ns: estimated time between samples.
+        drift_ppm: by how much the device samples faster (+) or slower (-) than its nominal rate.
+        jitter_ns: 95th percentile of the delay of arrivals behind the earliest possible ones.
+        settled: whether rate and offset come from at least two seconds of arrivals.
+        restarts: how often the device has restarted its counter.
+    """
+
+    period_ns: float
+    drift_ppm: float
+    jitter_ns: float
+    settled: bool
+    restarts: int
+
+
+class Placed(NamedTuple):
+    """Where the frames of a batch belong: see `daqsvc.acquisition.counter.Placement`.
+
+    Attributes:
+        indices: int64 ``[n]``, sample index of each frame's first sample.
+        kept: bool ``[n]``.
+        restarts: places in the batch where the device restarted its counter.
+    """
+
+    indices: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    restarts: list[int]
+
+
+class TimeBase:
+    """Places frames by their counter and disciplines a line from sample index to host time.
+
+    Args:
+        rate_hz: nominal sampling rate.
+        counter_bits: 8, 16 or 32.
+        samples_per_frame: samples of each channel in a frame.
+        counts_per_frame: by how much the counter grows from frame to frame.
+        reorder_window_ns: how long a frame may be overtaken on its way.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        counter_bits: int,
+        samples_per_frame: int,
+        counts_per_frame: int,
+        reorder_window_ns: int = 10_000_000,
+    ) -> None:
+        self._nominal_ns = NS_PER_S / rate_hz
+        self._samples_per_count = samples_per_frame // counts_per_frame
+        count_rate_hz = rate_hz / self._samples_per_count
+        self._unwrapper = CounterUnwrapper(
+            counter_bits,
+            counts_per_frame,
+            count_rate_hz,
+            # Wider than the window: a frame that comes too late should be known as late, not as alien.
+            reorder_counts=round(4 * reorder_window_ns * count_rate_hz / NS_PER_S) + 2 * counts_per_frame,
+        )
+        # A frame is complete, and can leave, when its last sample has been taken.
+        self._last_in_frame = samples_per_frame - 1
+        self._restarts = 0
+        self._delays: deque[float] = deque(maxlen=RECENT_DELAYS)
+        self._buckets: deque[tuple[int, int]] = deque(maxlen=WINDOW_BUCKETS)
+        self._period_ns = self._nominal_ns
+        self._origin: tuple[int, int] | None = None
+        self._bucket_best: tuple[int, int] | None = None
+        self._bucket_start = 0
+        self._offset_ns = 0.0
+        self._settled = False
+
+    @property
+    def state(self) -> TimeBaseState:
+        """A snapshot of what is known."""
+        jitter = float(np.percentile(self._delays, 95)) if self._delays else 0.0
+        return TimeBaseState(
+            period_ns=self._period_ns,
+            drift_ppm=(self._nominal_ns / self._period_ns - 1) * 1e6,
+            jitter_ns=jitter,
+            settled=self._settled,
+            restarts=self._restarts,
+        )
+
+    @property
+    def period_ns(self) -> float:
+        """Estimated time between samples."""
+        return self._period_ns
+
+    @property
+    def settled(self) -> bool:
+        """Whether rate and offset come from at least two seconds of arrivals."""
+        return self._settled
+
+    def place(self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placed:
+        """Place a batch of frames and learn from their arrivals.
+
+        Args:
+            counter: int64 ``[n]``, as sent.
+            arrival_ns: int64 ``[n]``, host monotonic, not decreasing.
+        """
+        placement = self._unwrapper.place(counter, arrival_ns)
+        index = placement.counts * self._samples_per_count
+        if placement.restarts:
+            # A new epoch: where it begins on the old line is a guess, so the line starts afresh.
+            self._restarts += len(placement.restarts)
+            fresh = slice(placement.restarts[-1], None)
+            self._forget()
+            self._learn(index[fresh][placement.kept[fresh]], arrival_ns[fresh][placement.kept[fresh]])
+        else:
+            self._learn(index[placement.kept], arrival_ns[placement.kept])
+        return Placed(index, placement.kept, placement.restarts)
+
+    def time_of(self, index: int) -> int:
+        """Host monotonic time in ns at which sample ``index`` was taken.
+
+        Raises:
+            LookupError: no frame has arrived yet.
+        """
+        if self._origin is None:
+            raise LookupError("no frame has arrived yet: there is no time base")
+        index0, arrival0 = self._origin
+        return arrival0 + round((index - index0) * self._period_ns + self._offset_ns)
+
+    def _forget(self) -> None:
+        self._origin = self._bucket_best = None
+        self._buckets.clear()
+        self._delays.clear()
+        self._period_ns, self._offset_ns = self._nominal_ns, 0.0
+        self._settled = False
+
+    def _learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> None:
+        if not len(index):
+            return
+        if self._origin is None:
+            self._origin = (int(index[0]) + self._last_in_frame, int(arrival_ns[0]))
+            self._bucket_start = 0
+        x = index + self._last_in_frame - self._origin[0]
+        y = arrival_ns - self._origin[1]
+        delay = y - (x * self._period_ns + self._offset_ns)
+        self._delays.extend(delay.tolist()[-RECENT_DELAYS:])
+        earliest = int(np.argmin(delay))
+        point = (int(x[earliest]), int(y[earliest]))
+        if self._bucket_best is None or self._residual(point) < self._residual(self._bucket_best):
+            self._bucket_best = point
+        if not self._settled:
+            # Until there is a slope to speak of, hang the nominal line under the earliest arrival.
+            self._offset_ns = min(self._offset_ns, self._residual(self._bucket_best))
+        newest = int(y.max())
+        if newest - self._bucket_start >= BUCKET_NS:
+            self._buckets.append(self._bucket_best)
+            self._bucket_best = None
+            self._bucket_start = newest
+            self._support()
+
+    def _residual(self, point: tuple[int, int]) -> float:
+        return point[1] - point[0] * self._period_ns
+
+    def _support(self) -> None:
+        """Lay the line under the window's earliest arrivals, touching where the window is centred."""
+        points = sorted(self._buckets)
+        if points[-1][1] - points[0][1] < SETTLING_NS:
+            return
+        # In coordinates that take the nominal slope off, ints of any size stay exact enough as floats.
+        flat = [(x, y - x * self._nominal_ns) for x, y in points]
+        hull: list[tuple[int, float]] = []
+        for p in flat:
+            while len(hull) > 1 and _turns_right(hull[-2], hull[-1], p):
+                hull.pop()
+            hull.append(p)
+        middle = sum(x for x, _ in flat) / len(flat)
+        (x0, y0), (x1, y1) = next((a, b) for a, b in pairwise(hull) if a[0] <= middle <= b[0])
+        slope = (y1 - y0) / (x1 - x0)
+        limit = MAX_DRIFT * self._nominal_ns
+        slope = min(max(slope, -limit), limit)
+        self._period_ns = self._nominal_ns + slope
+        self._offset_ns = min(y - slope * x for x, y in flat)
+        self._settled = True
+
+
+def _turns_right(a: tuple[int, float], b: tuple[int, float], c: tuple[int, float]) -> bool:
+    """Whether b lies on or above the line from a to c, so that it is no corner of the lower hull."""
+    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])
