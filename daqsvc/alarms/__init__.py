@@ -1,0 +1,1 @@
+"""From a diagnosis to exactly one well-behaved alarm: setpoints, states, and who is told what."""

@@ -1,0 +1,1 @@
+"""What must reach the broker waits here, on disk, until the broker has acknowledged it."""

@@ -1,0 +1,1 @@
+"""Payloads and the way to the MQTT broker."""
