@@ -1,0 +1,1 @@
+"""Signal processing that knows shafts and sensors, but no machine and no fault."""

@@ -1,0 +1,1 @@
+"""The Laval rotor with rub impact: its model, its observers, and the bank that compares them."""

@@ -1,0 +1,103 @@
+"""Which mode the machine is in: two rules over the same observers.
+
+``cusum`` stands by a mode until another has gathered a threshold of evidence against it; this is the
+rule that may raise alarms. ``paper`` declares at a conditional probability of 0.9 and starts afresh;
+a posterior of 0.9 is an error of 10 % per declaration by construction, so it is shown and no more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+Rule = Literal["cusum", "paper"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecisionRules:
+    """Thresholds of both rules.
+
+    A mean time between failures belongs into these: a threshold is ln(1 / pi) of the prior pi per
+    decision, so a rarer transition gets a higher one. As a prior it would re-declare the favourite at
+    every sample.
+
+    Attributes:
+        rule: the rule whose mode counts as declared.
+        threshold_nats: evidence that changes the decision to a worse mode.
+        back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
+        probability_threshold: conditional probability that declares under the paper's rule.
+        priors: probabilities that the paper's rule starts and resets to; equal if not given.
+    """
+
+    rule: Rule = "cusum"
+    threshold_nats: float = 16.0
+    back_threshold_nats: float = 25.0
+    probability_threshold: float = 0.9
+    priors: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("cusum", "paper"):
+            raise ValueError(f"decision rule {self.rule!r} is unknown; use 'cusum' or 'paper'")
+        for name in ("threshold_nats", "back_threshold_nats"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"decision rule: {name} is {value}; evidence is a finite number above 0")
+        if not 0.5 <= self.probability_threshold < 1.0:
+            raise ValueError(
+                f"decision rule: probability_threshold is {self.probability_threshold}; "
+                "it must lie in [0.5, 1), so that only one mode can pass it"
+            )
+
+    def log_priors(self, names: Sequence[str]) -> Floats:
+        """Logarithms of the priors of the named modes, float64 ``[M]``.
+
+        Raises:
+            ValueError: not one prior for each mode, not summing to 1, or one that declares by itself.
+        """
+        count = len(names)
+        if self.priors is None:
+            return np.full(count, -math.log(count))
+        if len(self.priors) != count:
+            raise ValueError(f"decision rule: {len(self.priors)} priors for {count} modes; give one for each")
+        for name, prior in zip(names, self.priors, strict=True):
+            if not 0.0 < prior < self.probability_threshold:
+                raise ValueError(
+                    f"decision rule: the prior of mode {name!r} is {prior}; it must lie between 0 and the "
+                    f"threshold {self.probability_threshold}, or the rule declares without evidence; "
+                    "put what is known about failure rates into the evidence thresholds"
+                )
+        if not math.isclose(math.fsum(self.priors), 1.0, rel_tol=0.0, abs_tol=1e-6):
+            raise ValueError(f"decision rule: the priors sum to {math.fsum(self.priors)}, not to 1")
+        return np.log(np.asarray(self.priors, dtype=np.float64))
+
+    def thresholds(self, count: int) -> Floats:
+        """Evidence that changes the decision from the row's mode to the column's, float64 ``[M, M]``."""
+        back = np.tril(np.ones((count, count), dtype=bool), -1)
+        return np.where(back, self.back_threshold_nats, self.threshold_nats)
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """A change of the declared mode.
+
+    Attributes:
+        sample: position in the block of the sample that brought the decision.
+        mode: index of the mode declared.
+        previous: index of the mode before, -1 if there was none.
+        onset: position of the first sample of its evidence, relative to the same block; often negative.
+    """
+
+    sample: int
+    mode: int
+    previous: int
+    onset: int

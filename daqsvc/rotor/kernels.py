@@ -1,0 +1,304 @@
+"""Compiled recursions of the bank; the only module of the package that imports numba.
+
+An observer's state is the deviation ``(x, x', y, y')`` of its estimate from its reference orbit. The
+linear part of the motion is then homogeneous, and the sum of orbit and deviation is the estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from daqsvc.rotor.discretise import ESCAPE_RADIUS
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+    Flags = NDArray[np.bool_]
+    Observers = NDArray[np.void]
+    Observer = Any  # one element of it: numba makes a record of it
+    State = tuple[float, float, float, float]
+
+_ESCAPE_SQUARED = ESCAPE_RADIUS * ESCAPE_RADIUS
+UNDETERMINED = -1
+"""Index that stands for no mode."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _orbit(observer: Observer, cos: float, sin: float) -> State:
+    """Position and velocity on an observer's reference orbit at a shaft angle."""
+    u = observer.a * cos - observer.b * sin
+    v = observer.a * sin + observer.b * cos
+    return u + observer.rest_x, -observer.speed * v, v + observer.rest_y, observer.speed * u
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _flow(xx: float, xv: float, vx: float, vv: float, state: State) -> State:
+    """Exact homogeneous flow of both axes."""
+    x, u, y, v = state
+    return xx * x + xv * u, vx * x + vv * u, xx * y + xv * v, vx * y + vv * v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _kick(observer: Observer, cos: float, sin: float, state: State) -> State:
+    """Momentum from the contact in one sub-step: Hertzian repulsion and Coulomb friction."""
+    dx, du, dy, dv = state
+    ox, ou, oy, ov = _orbit(observer, cos, sin)
+    x = ox + dx
+    y = oy + dy
+    squared = x * x + y * y
+    if squared <= 1.0:
+        return state
+    radius = math.sqrt(squared)
+    slip = observer.surface_speed + (x * (ov + dv) - y * (ou + du)) / radius
+    mu = observer.mu * np.sign(slip)
+    impulse = observer.impulse * (radius - 1.0) ** observer.alpha / radius
+    return dx, du - impulse * (x - mu * y), dy, dv - impulse * (y + mu * x)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict_rub(observer: Observer, cos: float, sin: float, state: State) -> State:
+    """One sample ahead with contact, by Strang splitting, from the shaft angle of the present sample."""
+    c, s = observer.half_cos, observer.half_sin
+    xx, xv, vx, vv = observer.half_xx, observer.half_xv, observer.half_vx, observer.half_vv
+    cos, sin = cos * c - sin * s, sin * c + cos * s
+    state = _kick(observer, cos, sin, _flow(xx, xv, vx, vv, state))
+    c, s = observer.full_cos, observer.full_sin
+    for _ in range(1, observer.substeps):
+        state = _flow(observer.full_xx, observer.full_xv, observer.full_vx, observer.full_vv, state)
+        cos, sin = cos * c - sin * s, sin * c + cos * s
+        state = _kick(observer, cos, sin, state)
+    return _flow(xx, xv, vx, vv, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict(observer: Observer, cos: float, sin: float, state: State) -> State:
+    """One sample ahead."""
+    if observer.substeps > 0:
+        return _predict_rub(observer, cos, sin, state)
+    return _flow(observer.xx, observer.xv, observer.vx, observer.vv, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _transfer(source: Observer, target: Observer, cos: float, sin: float, state: State) -> State:
+    """The deviation from the target's orbit that is the same estimate as ``state`` on the source's."""
+    dx, du, dy, dv = state
+    sx, su, sy, sv = _orbit(source, cos, sin)
+    tx, tu, ty, tv = _orbit(target, cos, sin)
+    return dx + sx - tx, du + su - tu, dy + sy - ty, dv + sv - tv
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _guarded(observer: Observer, healthy: Observer, cos: float, sin: float, state: State) -> State:
+    """The state of a rub observer, or a new start on the healthy orbit if it is lost (escaped or NaN)."""
+    ox, _, oy, _ = _orbit(observer, cos, sin)
+    x, y = ox + state[0], oy + state[2]
+    if x * x + y * y < _ESCAPE_SQUARED and math.isfinite(state[1] + state[3]):
+        return state
+    return _transfer(healthy, observer, cos, sin, (0.0, 0.0, 0.0, 0.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _correct(
+    observer: Observer, cos: float, sin: float, x: float, y: float, state: State
+) -> tuple[State, float]:
+    """Kalman update by one sample; also the log-likelihood of the innovation in nats."""
+    dx, du, dy, dv = state
+    ex = x - (observer.a * cos - observer.b * sin + observer.rest_x) - dx
+    ey = y - (observer.a * sin + observer.b * cos + observer.rest_y) - dy
+    score = -0.5 * (ex * ex + ey * ey) * observer.precision - observer.log_norm
+    a, b = observer.gain_x, observer.gain_v
+    return (dx + a * ex, du + b * ex, dy + a * ey, dv + b * ey), score
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def run_free(
+    xy: Floats, usable: Flags, cos: Floats, sin: Floats, observers: Observers, states: Floats, scores: Floats
+) -> None:
+    """Free-running observers over a block; each keeps to its own hypothesis.
+
+    Args:
+        xy: float64 ``[n, 2]``, measured position in clearances.
+        usable: bool ``[n]``; a sample that is not is predicted through and is no evidence.
+        cos: float64 ``[n]``, cosine of the shaft angle.
+        sin: float64 ``[n]``, its sine.
+        observers: ``[M]`` of `discretise.OBSERVER`.
+        states: float64 ``[M, 4]``, deviations at the first sample; left at the sample after the last.
+        scores: float64 ``[M, n]``, out: log-likelihood of every sample under every mode, nats.
+    """
+    for i in range(len(states)):
+        observer = observers[i]
+        rubs = observer.substeps > 0
+        state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
+        for k in range(len(xy)):
+            if rubs:
+                state = _guarded(observer, observers[0], cos[k], sin[k], state)
+            score = 0.0
+            if usable[k]:
+                state, score = _correct(observer, cos[k], sin[k], xy[k, 0], xy[k, 1], state)
+            scores[i, k] = score
+            state = _predict(observer, cos[k], sin[k], state)
+        states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def decide_by_probability(  # noqa: C901 - one recursion: update, declare, hand over, predict
+    xy: Floats,
+    usable: Flags,
+    cos: Floats,
+    sin: Floats,
+    observers: Observers,
+    settling: int,
+    log_prior: Floats,
+    log_threshold: float,
+    states: Floats,
+    log_probability: Floats,
+    verdicts: Ints,
+) -> None:
+    """The paper's rule: conditional probabilities, declared at a threshold, then reset (section V).
+
+    At a declaration every observer takes over the declared one's estimate, and the probabilities go
+    back to their priors. Without the hand-over the observers that lost never learn that the machine
+    has changed.
+
+    Args:
+        xy: float64 ``[n, 2]``, measured position in clearances.
+        usable: bool ``[n]``.
+        cos: float64 ``[n]``, cosine of the shaft angle.
+        sin: float64 ``[n]``, its sine.
+        observers: ``[M]`` of `discretise.OBSERVER`.
+        settling: number of samples at the beginning that correct the observers but are no evidence.
+        log_prior: float64 ``[M]``.
+        log_threshold: logarithm of the probability that declares.
+        states: float64 ``[M, 4]``, deviations, changed in place.
+        log_probability: float64 ``[M]``, changed in place.
+        verdicts: int64 ``[n]``, out: mode declared at each sample, or -1.
+    """
+    count = len(states)
+    for k in range(len(xy)):
+        verdicts[k] = UNDETERMINED
+        best = 0
+        for i in range(count):
+            state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
+            if observers[i].substeps > 0:
+                state = _guarded(observers[i], observers[0], cos[k], sin[k], state)
+            if usable[k]:
+                state, score = _correct(observers[i], cos[k], sin[k], xy[k, 0], xy[k, 1], state)
+                if k >= settling:
+                    log_probability[i] += score
+            states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
+            if log_probability[i] > log_probability[best]:
+                best = i
+        largest = log_probability[best]
+        total = 0.0
+        for i in range(count):
+            total += math.exp(log_probability[i] - largest)
+        log_total = largest + math.log(total)
+        for i in range(count):
+            log_probability[i] -= log_total
+        if usable[k] and k >= settling and log_probability[best] > log_threshold:
+            verdicts[k] = best
+            declared = (states[best, 0], states[best, 1], states[best, 2], states[best, 3])
+            for i in range(count):
+                state = _transfer(observers[best], observers[i], cos[k], sin[k], declared)
+                states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
+                log_probability[i] = log_prior[i]
+        for i in range(count):
+            state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
+            state = _predict(observers[i], cos[k], sin[k], state)
+            states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _first_verdict(scores: Floats, k: int, threshold: float, duels: Floats) -> int:
+    """Every mode against every other; the index of one that leads them all by the threshold, or -1."""
+    count = len(scores)
+    winner = UNDETERMINED
+    for i in range(count):
+        narrowest = math.inf
+        for j in range(count):
+            if i != j:
+                duels[i, j] = max(0.0, duels[i, j] + scores[i, k] - scores[j, k])
+                narrowest = min(narrowest, duels[i, j])
+        if narrowest >= threshold:
+            winner = i
+    return winner
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next_verdict(scores: Floats, k: int, current: int, thresholds: Floats, cusum: Floats, ages: Ints) -> int:
+    """Every mode against the declared one; the index of the one furthest past its threshold, or -1."""
+    winner = UNDETERMINED
+    margin = 0.0
+    for j in range(len(scores)):
+        if j == current:
+            continue
+        cusum[j] += scores[j, k] - scores[current, k]
+        if cusum[j] <= 0.0:
+            cusum[j] = 0.0
+            ages[j] = 0
+        elif cusum[j] - thresholds[current, j] >= margin:
+            margin = cusum[j] - thresholds[current, j]
+            winner = j
+    return winner
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def decide_by_cusum(
+    scores: Floats,
+    thresholds: Floats,
+    first_threshold: float,
+    lead_limit: float,
+    current: int,
+    cusum: Floats,
+    lead: Floats,
+    duels: Floats,
+    ages: Ints,
+    verdicts: Ints,
+    onsets: Ints,
+) -> int:
+    """CUSUM of log-likelihood ratios over free-running observers (Page 1954).
+
+    Args:
+        scores: float64 ``[M, n]``, log-likelihoods from `run_free`, nats.
+        thresholds: float64 ``[M, M]``, nats that change the decision from the row's mode to the column's.
+        first_threshold: nats by which one mode must lead all others to be the first decision.
+        lead_limit: the lead of the decision over another mode counts up to here.
+        current: index of the decision before the block, or -1.
+        cusum: float64 ``[M]``, evidence of each mode against the decision since its onset, changed in place.
+        lead: float64 ``[M]``, evidence of the decision over each mode, changed in place.
+        duels: float64 ``[M, M]``, evidence of row over column until there is a decision, changed in place.
+        ages: int64 ``[M]``, samples since the onset of each CUSUM, changed in place.
+        verdicts: int64 ``[n]``, out: mode declared at each sample, or -1.
+        onsets: int64 ``[n]``, out: where there is a verdict, how many samples its evidence goes back.
+
+    Returns:
+        Index of the decision after the block, or -1.
+    """
+    count, n = scores.shape
+    for k in range(n):
+        for j in range(count):
+            ages[j] += 1
+        if current == UNDETERMINED:
+            winner = _first_verdict(scores, k, first_threshold, duels)
+        else:
+            winner = _next_verdict(scores, k, current, thresholds, cusum, ages)
+            for j in range(count):
+                lead[j] = min(lead_limit, lead[j] + scores[current, k] - scores[j, k])
+        verdicts[k] = winner
+        if winner != UNDETERMINED:
+            onsets[k] = ages[winner]
+            for j in range(count):
+                won = duels[winner, j] if current == UNDETERMINED else cusum[winner] - cusum[j]
+                lead[j] = min(lead_limit, won)
+            cusum[:] = 0.0
+            ages[:] = 0
+            current = winner
+    return current
