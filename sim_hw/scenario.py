@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from numpy.typing import NDArray
+    from pydantic_core import ErrorDetails
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -188,7 +189,10 @@ class Scenario(_Table):
                 raise ValueError(
                     f"onset {onset.mode!r} changes speed_ratio; the shaft's speed is constant in a scenario"
                 )
-            self._parameters(onset)
+            try:
+                self._parameters(onset)
+            except ValueError as error:
+                raise ValueError(f"onset {onset.mode!r}: {error}") from error
         if not self.plant.rotor.eccentricity:
             raise ValueError(
                 "plant.rotor.eccentricity is 0: without 1X vibration there is no signal-to-noise"
@@ -285,7 +289,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:
-        problems = "\n".join(_in_words(problem["loc"], problem["msg"]) for problem in error.errors())
+        problems = "\n".join(_in_words(problem) for problem in error.errors())
         raise ScenarioError(f"scenario {name_or_path} cannot be understood:\n{problems}") from error
 
 
@@ -303,6 +307,7 @@ def _check_names(parameters: dict[str, object] | dict[str, float]) -> None:
         )
 
 
-def _in_words(place: tuple[int | str, ...], message: str) -> str:
-    key = ".".join(str(step) for step in place) or "the file"
-    return f"  {key}: {message.removeprefix('Value error, ')}"
+def _in_words(problem: ErrorDetails) -> str:
+    key = ".".join(str(step) for step in problem["loc"]) or "the file"
+    unknown = problem["type"] == "extra_forbidden"
+    return f"  {key}: {'no such key' if unknown else problem['msg'].removeprefix('Value error, ')}"
