@@ -5,8 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.settings.problems import Finding, choice
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from cantools.database.can import Message
+
+    from daqsvc.settings.buses import DbcLayout
+    from daqsvc.settings.problems import KeyPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +24,6 @@ class DbcMessage:
     Attributes:
         frame_id: CAN id.
         extended: whether the id has 29 bits.
-        fd: whether the DBC says that it is a CAN FD frame.
         length: payload bytes.
         signal_bits: width of each signal in bits, by name.
         signal_units: unit of each signal, by name; empty if the DBC gives none.
@@ -24,7 +31,90 @@ class DbcMessage:
 
     frame_id: int
     extended: bool
-    fd: bool
     length: int
     signal_bits: Mapping[str, int]
     signal_units: Mapping[str, str]
+
+
+def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | None, list[Finding]]:
+    """Read the message that ``layout`` names and look for its signals.
+
+    Args:
+        layout: names the message and its signals.
+        file: the DBC file, as an absolute path.
+        at: key path of the layout.
+
+    Returns:
+        The message, or None if it cannot be had; and what is wrong.
+    """
+    try:
+        from cantools.database import can, load_file  # noqa: PLC0415 - an extra, and slow to import
+        from cantools.database.errors import Error  # noqa: PLC0415
+    except ImportError:
+        return None, [
+            Finding((*at, "dbc"), "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'")
+        ]
+    if not file.is_file():
+        return None, [
+            Finding(
+                (*at, "dbc"),
+                f"there is no file {file}",
+                "correct the path; a relative one starts at the directory of the machine file",
+            )
+        ]
+    try:
+        database = load_file(file)
+    except (OSError, UnicodeError, ValueError, Error) as error:
+        reason = " ".join(str(error).split())
+        return None, [
+            Finding(
+                (*at, "dbc"),
+                f"{file} cannot be read as a DBC file: {reason}",
+                "open it in the tool it came from and export it as DBC again",
+            )
+        ]
+    if not isinstance(database, can.Database):
+        return None, [
+            Finding(
+                (*at, "dbc"), f"{file} describes no CAN messages", "give a DBC file, not a diagnostics one"
+            )
+        ]
+    messages = {message.name: message for message in database.messages}
+    if layout.message not in messages:
+        return None, [
+            Finding((*at, "message"), f"{file} has no such message", choice(layout.message, messages))
+        ]
+    message = messages[layout.message]
+    facts = DbcMessage(
+        frame_id=message.frame_id,
+        extended=message.is_extended_frame,
+        length=message.length,
+        signal_bits={signal.name: signal.length for signal in message.signals},
+        signal_units={signal.name: signal.unit or "" for signal in message.signals},
+    )
+    return facts, list(_signal_findings(layout, message, at))
+
+
+def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterator[Finding]:
+    signals = {signal.name: signal for signal in message.signals}
+    asked: list[tuple[KeyPath, str]] = [((*at, "counter", "signal"), layout.counter.signal)]
+    for index, channel in enumerate(layout.channels):
+        asked += [
+            ((*at, "channels", index, "signals", place), name) for place, name in enumerate(channel.signals)
+        ]
+    for path, name in asked:
+        if name not in signals:
+            yield Finding(path, f'message "{message.name}" has no such signal', choice(name, signals))
+        elif signals[name].multiplexer_ids is not None:
+            yield Finding(
+                path,
+                f'is multiplexed in message "{message.name}", so it is not in every frame',
+                "have the device send it in a message without multiplexing",
+            )
+    counter = signals.get(layout.counter.signal)
+    if counter is not None and (counter.is_signed or counter.is_float):
+        yield Finding(
+            (*at, "counter", "signal"),
+            "is signed or a float; a counter runs from 0 upwards and wraps",
+            "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
+        )

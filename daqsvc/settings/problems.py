@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 KeyPath: TypeAlias = tuple[str | int, ...]
@@ -70,3 +71,13 @@ class MachineFileError(Exception):
 
     def __str__(self) -> str:
         return "\n\n".join(str(problem) for problem in self.problems)
+
+
+def choice(wanted: str, known: Iterable[str]) -> str:
+    """A remedy for a name that is not known: the closest one, or all there are."""
+    names = sorted(known)
+    if not names:
+        return "there is none to choose from; define one first"
+    close = get_close_matches(wanted, names, n=1)
+    listed = ", ".join(names)
+    return f'did you mean "{close[0]}"? There are: {listed}' if close else f"take one of: {listed}"

@@ -22,8 +22,11 @@ AngleDeg = Annotated[float, Field(ge=-360, le=360)]
 DampingRatio = Annotated[float, Field(ge=0, le=2)]
 
 
-class UnusableValueError(AttributeError):
-    """A check asked for a value that the file does not hold in valid form (that is reported already)."""
+class UnusableValueError(Exception):
+    """A check asked for a value that the file does not hold in valid form (that is reported already).
+
+    Deliberately no `AttributeError`, which a property of a section would turn into something else.
+    """
 
 
 class Section(BaseModel):

@@ -51,12 +51,12 @@ class BaseSensor(Section):
 
     @property
     def gain(self) -> float:
-        """Physical units per unit on the wire: physical = wire * gain + bias."""
+        """Physical units per unit on the wire: physical = wire * gain + shift."""
         return 1.0 if self.sensitivity_mv_per_unit is None else 1000.0 / self.sensitivity_mv_per_unit
 
     @property
-    def bias(self) -> float:
-        """Physical value of a zero on the wire: physical = wire * gain + bias."""
+    def shift(self) -> float:
+        """Physical value of a zero on the wire: physical = wire * gain + shift."""
         return 0.0 if self.sensitivity_mv_per_unit is None else -self.zero_v * self.gain
 
 

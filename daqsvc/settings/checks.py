@@ -1,0 +1,371 @@
+"""Whether the parts of a machine file fit each other: everything that one value alone cannot show.
+
+Each check is a generator over a few values. On a faulty file it runs on what is valid, and ends quietly
+where it asks for a value that is not (`UnusableValueError`): one mistake never hides another.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.buses import DbcLayout, PlainLayout
+from daqsvc.settings.layout_checks import (
+    check_channel_use,
+    check_channels,
+    check_counter,
+    check_dbc_unit,
+    check_frame_length,
+    check_ids,
+    check_plain_layout,
+    check_sensor_channel,
+    check_stream_bus,
+    check_voltages,
+    unique,
+)
+from daqsvc.settings.pipeline import ROTOR_BANK
+from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from daqsvc.settings.dbc import DbcMessage
+    from daqsvc.settings.models import MachineFile, Mqtt, Sensor
+    from daqsvc.settings.pipeline import RotorBank
+    from daqsvc.settings.problems import KeyPath
+
+_LEAST_PROBE_ANGLE_DEG = 10.0
+_RING_WINDOWS = 2
+_LEAST_WINDOW_SAMPLES = 16
+
+
+def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Finding]:
+    """Run every check on a machine file.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+        messages: by stream, the DBC messages that could be read.
+    """
+    findings: list[Finding] = []
+    for found in _checks(draft, messages):
+        with suppress(UnusableValueError):
+            for finding in found:
+                findings.append(finding)  # noqa: PERF402 - extend would lose those before an unusable value
+    return findings
+
+
+def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Iterator[Finding]]:
+    """Every check with what it is about."""
+    with suppress(UnusableValueError):
+        for name, stream in draft.streams.items():
+            at: KeyPath = ("streams", name)
+            yield check_stream_bus(draft, stream, at)
+            yield check_frame_length(draft, stream, messages.get(name), at)
+            yield check_counter(stream, messages.get(name), at)
+            with suppress(UnusableValueError):
+                if isinstance(stream.layout, PlainLayout):
+                    yield check_plain_layout(stream.layout, (*at, "layout"))
+                yield check_channels(stream.layout, (*at, "layout"))
+    yield check_ids(draft, messages)
+    yield _unused_buses(draft)
+    with suppress(UnusableValueError):
+        for index, sensor in enumerate(draft.sensors):
+            at = ("sensors", index)
+            yield check_sensor_channel(draft, sensor, at)
+            yield check_voltages(sensor, at)
+            yield check_dbc_unit(draft, sensor, messages, at)
+    yield _names(draft)
+    yield check_channel_use(draft)
+    with suppress(UnusableValueError):
+        if draft.pipeline.levels is not None:
+            yield _window(draft)
+            yield _velocity_band(draft)
+    with suppress(UnusableValueError):
+        if draft.pipeline.rotor_bank is not None:
+            bank = draft.pipeline.rotor_bank
+            yield _rotor(draft)
+            yield _bank_sensors(draft, bank)
+            yield _bank_geometry(draft, bank)
+            yield _modes(bank)
+    with suppress(UnusableValueError):
+        for index, alarm in enumerate(draft.alarms):
+            at = ("alarms", index)
+            if isinstance(alarm, LevelAlarm):
+                yield _setpoints(alarm, at)
+                yield _alarm_sensor(draft, alarm, at)
+                yield _alarm_levels(draft, at)
+            elif isinstance(alarm, DiagnosisAlarm):
+                yield _alarm_detector(draft, alarm, at)
+    with suppress(UnusableValueError):
+        if draft.mqtt is not None:
+            yield _transport(draft.mqtt)
+            yield _credentials(draft.mqtt)
+
+
+def _names(draft: MachineFile) -> Iterator[Finding]:
+    with suppress(UnusableValueError):
+        yield from unique([sensor.name for sensor in draft.sensors], ("sensors",), "sensor")
+    yield from unique([alarm.name for alarm in draft.alarms], ("alarms",), "alarm")
+
+
+def _unused_buses(draft: MachineFile) -> Iterator[Finding]:
+    used = {stream.bus for stream in draft.streams.values()}
+    for name in draft.buses:
+        if name not in used:
+            yield Finding(
+                ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
+            )
+
+
+def _named(draft: MachineFile) -> dict[str, Sensor]:
+    return {sensor.name: sensor for sensor in draft.sensors}
+
+
+def _rate_hz(draft: MachineFile, sensor: Sensor) -> float | None:
+    return draft.streams[sensor.stream].rate_hz if sensor.stream in draft.streams else None
+
+
+def _window(draft: MachineFile) -> Iterator[Finding]:
+    pipeline = draft.pipeline
+    if pipeline.levels is None:
+        return
+    window_s = pipeline.levels.window_s
+    at = ("pipeline", "levels", "window_s")
+    slowest_hz = min((stream.rate_hz for stream in draft.streams.values()), default=math.inf)
+    if window_s * slowest_hz < _LEAST_WINDOW_SAMPLES:
+        yield Finding(
+            at,
+            f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
+            f"write window_s = {_LEAST_WINDOW_SAMPLES / slowest_hz:.3g} or more",
+        )
+    if pipeline.ring_s < _RING_WINDOWS * window_s:
+        yield Finding(
+            at,
+            f"a ring of {pipeline.ring_s:g} s must hold at least {_RING_WINDOWS} windows",
+            f"write ring_s = {_RING_WINDOWS * window_s:g} or more in [pipeline], or a shorter window",
+        )
+
+
+def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
+    if draft.pipeline.levels is None:
+        return
+    low_hz, high_hz = draft.pipeline.levels.velocity_band_hz
+    for sensor in draft.sensors:
+        rate_hz = _rate_hz(draft, sensor)
+        if not isinstance(sensor, Accelerometer | VelocitySensor) or rate_hz is None:
+            continue
+        if high_hz >= rate_hz / 2:
+            usable_hz = 0.4 * rate_hz
+            yield Finding(
+                ("pipeline", "levels", "velocity_band_hz"),
+                f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
+                f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
+                f"write velocity_band_hz = [{low_hz:.1f}, {usable_hz:.1f}]"
+                if usable_hz > low_hz
+                else "sample faster, or write a lower band",
+            )
+            return
+
+
+def _rotor(draft: MachineFile) -> Iterator[Finding]:
+    if draft.machine.rotor is None:
+        yield Finding(
+            ("pipeline", "rotor_bank"),
+            "the model bank needs the rotor's data",
+            "write a table [machine.rotor], or remove [pipeline.rotor_bank]",
+        )
+
+
+def _bank_sensors(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
+    """The probes and the keyphasor exist, are what they should be, and share a stream."""
+    at: KeyPath = ("pipeline", "rotor_bank")
+    sensors = _named(draft)
+    asked: list[tuple[KeyPath, str, type[Sensor], str]] = [
+        ((*at, "probes", 0), bank.probes[0], ProximityProbe, "proximity"),
+        ((*at, "probes", 1), bank.probes[1], ProximityProbe, "proximity"),
+        ((*at, "keyphasor"), bank.keyphasor, Keyphasor, "keyphasor"),
+    ]
+    for path, name, wanted, type_name in asked:
+        if name not in sensors:
+            yield Finding(path, "there is no such sensor", choice(name, sensors))
+        elif not isinstance(sensors[name], wanted):
+            suitable = [sensor.name for sensor in draft.sensors if isinstance(sensor, wanted)]
+            yield Finding(path, f'must be a sensor of type "{type_name}"', choice(name, suitable))
+    streams = {name: sensors[name].stream for _, name, *_ in asked if name in sensors}
+    keyphasor_stream = streams.get(bank.keyphasor)
+    for index, probe in enumerate(bank.probes):
+        if keyphasor_stream is not None and streams.get(probe, keyphasor_stream) != keyphasor_stream:
+            yield Finding(
+                (*at, "probes", index),
+                f'is in stream "{streams[probe]}", but keyphasor "{bank.keyphasor}" is in stream '
+                f'"{keyphasor_stream}"',
+                "take sensors of one stream: their samples must be taken at the same instants",
+            )
+
+
+def _bank_geometry(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
+    """The two probes look at the shaft from directions that tell x from y."""
+    at: KeyPath = ("pipeline", "rotor_bank", "probes")
+    if bank.probes[0] == bank.probes[1]:
+        yield Finding((*at, 1), "is the same probe twice", "name two different probes")
+        return
+    sensors = _named(draft)
+    angles: list[float] = []
+    for index, name in enumerate(bank.probes):
+        probe = sensors.get(name)
+        if not isinstance(probe, ProximityProbe):
+            return
+        if probe.angle_deg is None:
+            yield Finding(
+                (*at, index),
+                f'sensor "{name}" does not say where it points',
+                f'add angle_deg to the entry "{name}" of sensors, e.g. {90 * index}.0',
+            )
+        else:
+            angles.append(probe.angle_deg)
+    if len(angles) == len(bank.probes):
+        apart = abs(math.degrees(math.asin(math.sin(math.radians(angles[1] - angles[0])))))
+        if apart < _LEAST_PROBE_ANGLE_DEG:
+            yield Finding(
+                at,
+                f"the probes point along one line ({angles[0]:g} and {angles[1]:g} deg): they see one "
+                "direction of the motion only",
+                "correct angle_deg of the sensors, or take probes that are some 90 deg apart",
+            )
+
+
+def _modes(bank: RotorBank) -> Iterator[Finding]:
+    at: KeyPath = ("pipeline", "rotor_bank", "modes")
+    if bank.modes[0].severity != "normal":
+        yield Finding(
+            (*at, 0, "severity"),
+            "the first mode is the healthy one",
+            'write severity = "normal", or put the healthy mode first',
+        )
+    yield from unique([mode.name for mode in bank.modes], at, "mode")
+
+
+def _setpoints(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
+    setpoints = [level for level in (alarm.alert, alarm.danger) if level is not None]
+    if not setpoints:
+        yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
+        return
+    if alarm.alert is not None and alarm.danger is not None and alarm.alert >= alarm.danger:
+        yield Finding(
+            (*at, "alert"),
+            f"must be below danger = {alarm.danger:g}",
+            "correct one of the two"
+            if alarm.alert == alarm.danger
+            else "swap the two, or correct one of them",
+        )
+    if alarm.deadband >= min(setpoints):
+        yield Finding(
+            (*at, "deadband"),
+            f"must be smaller than the setpoint {min(setpoints):g}, or the alarm never returns",
+            f"write e.g. deadband = {min(setpoints) / 20:.3g}",
+        )
+
+
+def _alarm_sensor(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
+    sensors = _named(draft)
+    if alarm.sensor not in sensors:
+        yield Finding((*at, "sensor"), "there is no such sensor", choice(alarm.sensor, sensors))
+        return
+    sensor = sensors[alarm.sensor]
+    if isinstance(sensor, Keyphasor):
+        vibration = [name for name, other in sensors.items() if not isinstance(other, Keyphasor)]
+        yield Finding(
+            (*at, "sensor"), "is a keyphasor, which measures no vibration", choice(alarm.sensor, vibration)
+        )
+    elif isinstance(sensor, ProximityProbe) and alarm.measure == "velocity_rms":
+        yield Finding(
+            (*at, "measure"),
+            f'needs an accelerometer or a velocity sensor, but "{alarm.sensor}" is a proximity probe',
+            'write measure = "rms" or "peak", with setpoints in ' + sensor.unit,
+        )
+
+
+def _alarm_levels(draft: MachineFile, at: KeyPath) -> Iterator[Finding]:
+    if draft.pipeline.levels is None:
+        yield Finding(
+            (*at, "sensor"),
+            "nothing measures its level",
+            "write a table [pipeline.levels] (it may be empty), or remove the alarm",
+        )
+
+
+def _alarm_detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterator[Finding]:
+    bank = draft.pipeline.rotor_bank
+    if alarm.detector != ROTOR_BANK:
+        yield Finding((*at, "detector"), "there is no such detector", f'write detector = "{ROTOR_BANK}"')
+    elif bank is None:
+        yield Finding(
+            (*at, "detector"),
+            "this detector is not configured",
+            "write a table [pipeline.rotor_bank], or remove the alarm",
+        )
+    elif bank.rule == "paper":
+        yield Finding(
+            (*at, "detector"),
+            'would never raise it: pipeline.rotor_bank.rule = "paper" gives probabilities only',
+            'write rule = "cusum", or remove the alarm',
+        )
+
+
+def _transport(mqtt: Mqtt) -> Iterator[Finding]:
+    if not mqtt.tls and not mqtt.insecure:
+        yield Finding(
+            ("mqtt", "url"),
+            "would go over the network unencrypted, and to whoever answers",
+            "write mqtts://, or insecure = true if that is meant",
+        )
+    if mqtt.tls and mqtt.insecure:
+        yield Finding(
+            ("mqtt", "insecure"),
+            "contradicts mqtts://, which always verifies the broker",
+            "remove it; a broker with a certificate of your own is trusted by ca_file",
+        )
+    if not mqtt.tls and mqtt.ca_file is not None:
+        yield Finding(
+            ("mqtt", "ca_file"),
+            "has no effect with mqtt://, which uses no certificates",
+            "write mqtts:// in the url, or remove it",
+            fatal=False,
+        )
+
+
+def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
+    if mqtt.password_file is None:
+        return
+    if mqtt.username is None:
+        yield Finding(
+            ("mqtt", "password_file"), "is a password without a user", "add username to [mqtt], or remove it"
+        )
+    if not mqtt.tls and not _is_this_host(mqtt.host):
+        yield Finding(
+            ("mqtt", "password_file"),
+            f"the password would go to {mqtt.host} unencrypted",
+            "write mqtts:// in the url",
+            fatal=False,
+        )
+
+
+def _is_this_host(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def dbc_layouts(draft: MachineFile) -> Iterable[tuple[str, DbcLayout]]:
+    """The streams of a draft whose layout comes from a DBC file, with that layout."""
+    with suppress(UnusableValueError):
+        for name, stream in draft.streams.items():
+            with suppress(UnusableValueError):
+                if isinstance(stream.layout, DbcLayout):
+                    yield name, stream.layout

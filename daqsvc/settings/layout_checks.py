@@ -1,0 +1,264 @@
+"""Whether buses, streams, layouts and sensors fit each other."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.settings.buses import CRC_BYTES, CanBus, DbcLayout, PlainLayout, Stream
+from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.sensors import ProximityProbe
+from daqsvc.settings.wire import CLASSIC_MAX_LENGTH
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daqsvc.settings.dbc import DbcMessage
+    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.problems import KeyPath
+
+SHORTEST_WRAP_S = 0.040
+"""A counter that wraps sooner cannot tell a long gap from a short one."""
+
+
+class FrameFacts(NamedTuple):
+    """What the wire shows of a stream, wherever its layout comes from."""
+
+    frame_id: int
+    extended: bool
+    length: int
+    counter_bits: int
+    counts_samples: bool
+    samples_per_frame: int
+
+
+def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None:
+    """Id, length and counter of a stream's frames; None if they are in a DBC message that is not at hand."""
+    layout = stream.layout
+    counts_samples = layout.counter.counts == "samples"
+    if isinstance(layout, PlainLayout):
+        return FrameFacts(
+            layout.id,
+            layout.extended,
+            layout.length,
+            layout.counter.bits,
+            counts_samples,
+            layout.samples_per_frame,
+        )
+    if message is None or layout.counter.signal not in message.signal_bits:
+        return None
+    return FrameFacts(
+        message.frame_id,
+        message.extended,
+        message.length,
+        message.signal_bits[layout.counter.signal],
+        counts_samples,
+        layout.samples_per_frame,
+    )
+
+
+def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
+    """Counter, CRC and samples lie within the frame and beside each other; the id has its width."""
+    if not layout.extended and layout.id > 0x7FF:
+        yield Finding(
+            (*at, "id"),
+            "does not fit into 11 bits (0x7ff)",
+            "write extended = true if the device sends 29-bit ids, else correct the id",
+        )
+    fields = [("counter", layout.counter.byte, layout.counter.end_byte)]
+    if layout.crc_byte is not None:
+        fields.append(("crc_byte", layout.crc_byte, layout.crc_byte + CRC_BYTES))
+    fields.append(("first_byte", layout.first_byte, layout.samples_end_byte))
+    names = {"counter": "the counter", "crc_byte": "the CRC", "first_byte": "the samples"}
+    for key, start, end in fields:
+        if end > layout.length:
+            room = (layout.length - layout.first_byte) // layout.sample_bytes
+            remedy = (
+                f"write samples_per_frame = {room}, or make the frame longer"
+                if key == "first_byte" and room > 0
+                else f"move it to byte {layout.length - (end - start)} or before, or make the frame longer"
+                if key != "first_byte" and layout.length >= end - start
+                else "make the frame longer"
+            )
+            yield Finding(
+                (*at, key),
+                f"{names[key]} would take bytes {start} to {end - 1} of a frame of {layout.length} bytes",
+                remedy,
+            )
+    for (_, start, end), (later, later_start, later_end) in combinations(
+        sorted(fields, key=lambda f: f[1]), 2
+    ):
+        if later_start < end:
+            first = next(names[key] for key, s, e in fields if (s, e) == (start, end) and key != later)
+            yield Finding(
+                (*at, later),
+                f"{names[later]} (bytes {later_start} to {later_end - 1}) would overlap {first} "
+                f"(bytes {start} to {end - 1})",
+                f"move {names[later]} to byte {end} or behind, as the device sends it",
+            )
+
+
+def check_channels(layout: PlainLayout | DbcLayout, at: KeyPath) -> Iterator[Finding]:
+    """Channel names are unique; in a DBC layout every channel has as many samples, each its own signal."""
+    yield from unique([channel.name for channel in layout.channels], (*at, "channels"), "channel")
+    if not isinstance(layout, DbcLayout):
+        return
+    taken: dict[str, str] = {layout.counter.signal: "the counter"}
+    for index, channel in enumerate(layout.channels):
+        path = (*at, "channels", index, "signals")
+        if len(channel.signals) != layout.samples_per_frame:
+            yield Finding(
+                path,
+                f"has {len(channel.signals)} samples in a frame, but channel "
+                f'"{layout.channels[0].name}" has {layout.samples_per_frame}',
+                "name as many signals for every channel of the stream",
+            )
+        for place, signal in enumerate(channel.signals):
+            if signal in taken:
+                yield Finding(
+                    (*path, place),
+                    f"is taken by {taken[signal]} already",
+                    "name each signal once",
+                )
+            taken[signal] = f'channel "{channel.name}"'
+
+
+def check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
+    """The stream's bus exists."""
+    if stream.bus not in draft.buses:
+        yield Finding((*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses))
+
+
+def check_frame_length(
+    draft: MachineFile, stream: Stream, message: DbcMessage | None, at: KeyPath
+) -> Iterator[Finding]:
+    """The stream's bus can carry its frames."""
+    facts, bus = frame_facts(stream, message), draft.buses.get(stream.bus)
+    if facts is None or not isinstance(bus, CanBus):
+        return
+    if facts.length > CLASSIC_MAX_LENGTH and not bus.fd:
+        key = "length" if isinstance(stream.layout, PlainLayout) else "message"
+        yield Finding(
+            (*at, "layout", key),
+            f"has {facts.length} bytes: only CAN FD carries more than 8, "
+            f'and bus "{stream.bus}" is classic CAN',
+            f"write fd = true in [buses.{stream.bus}], or make the frame 8 bytes or shorter",
+        )
+
+
+def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> Iterator[Finding]:
+    """The counter is wide enough to tell how much is missing after a gap."""
+    facts = frame_facts(stream, message)
+    if facts is None:
+        return
+    per_count = 1 if facts.counts_samples else facts.samples_per_frame
+    wrap_s = 2**facts.counter_bits * per_count / stream.rate_hz
+    if wrap_s < SHORTEST_WRAP_S:
+        yield Finding(
+            (*at, "layout", "counter"),
+            f"a counter of {facts.counter_bits} bits wraps every {wrap_s * 1e3:.3g} ms at "
+            f"{stream.rate_hz:g} Hz: the loss in a longer gap is estimated from the host clock",
+            'have the device send a wider counter, or count "frames"',
+            fatal=False,
+        )
+
+
+def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
+    """No two streams of one bus share an id."""
+    owners: dict[tuple[str, bool, int], str] = {}
+    for name, stream in draft.streams.items():
+        with suppress(UnusableValueError):
+            facts = frame_facts(stream, messages.get(name))
+            if facts is None:
+                continue
+            owner = owners.setdefault((stream.bus, facts.extended, facts.frame_id), name)
+            if owner != name:
+                key = "id" if isinstance(stream.layout, PlainLayout) else "message"
+                yield Finding(
+                    ("streams", name, "layout", key),
+                    f'id {facts.frame_id:#x} on bus "{stream.bus}" belongs to stream "{owner}" already',
+                    "give each stream of a bus an id of its own, as the devices send it",
+                )
+
+
+def check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """The sensor's stream and channel exist."""
+    if sensor.stream not in draft.streams:
+        yield Finding((*at, "stream"), "there is no such stream", choice(sensor.stream, draft.streams))
+        return
+    channels = draft.streams[sensor.stream].layout.channel_names
+    if sensor.channel not in channels:
+        yield Finding(
+            (*at, "channel"),
+            f'stream "{sensor.stream}" has no such channel',
+            choice(sensor.channel, channels),
+        )
+
+
+def check_channel_use(draft: MachineFile) -> Iterator[Finding]:
+    """No channel is claimed by two sensors."""
+    owners: dict[tuple[str, str], int] = {}
+    for index, sensor in enumerate(draft.sensors):
+        with suppress(UnusableValueError):
+            owner = owners.setdefault((sensor.stream, sensor.channel), index)
+            if owner != index:
+                yield Finding(
+                    ("sensors", index, "channel"),
+                    f'channel "{sensor.channel}" of stream "{sensor.stream}" belongs to '
+                    f'sensor "{draft.sensors[owner].name}" already',
+                    "give each sensor a channel of its own",
+                )
+
+
+def check_voltages(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """What is said in volts has a sensitivity to go with it."""
+    if sensor.sensitivity_mv_per_unit is not None:
+        return
+    if sensor.zero_v != 0:
+        yield Finding(
+            (*at, "zero_v"),
+            "has no effect without sensitivity_mv_per_unit",
+            "add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
+        )
+    if isinstance(sensor, ProximityProbe):
+        yield Finding(
+            (*at, "gap_ok_v"),
+            "cannot be checked: without sensitivity_mv_per_unit the gap voltage is not known",
+            "add sensitivity_mv_per_unit and zero_v, and let the channel carry volts",
+            fatal=False,
+        )
+
+
+def check_dbc_unit(
+    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
+) -> Iterator[Finding]:
+    """The DBC file and the sensor agree on the unit."""
+    layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
+    message = messages.get(sensor.stream)
+    if not isinstance(layout, DbcLayout) or message is None:
+        return
+    wire_unit = sensor.unit if sensor.sensitivity_mv_per_unit is None else "V"
+    for channel in layout.channels:
+        unit = message.signal_units.get(channel.signals[0], "")
+        if channel.name == sensor.channel and unit not in {"", wire_unit}:
+            yield Finding(
+                (*at, "unit"),
+                f'the DBC file gives signal "{channel.signals[0]}" in "{unit}", '
+                f'but this sensor takes it as "{wire_unit}"',
+                "correct unit (or sensitivity_mv_per_unit), or the unit in the DBC file",
+                fatal=False,
+            )
+
+
+def unique(names: list[str], at: KeyPath, what: str) -> Iterator[Finding]:
+    """Findings for every name that has been given before in the same array."""
+    seen: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if seen.setdefault(name, index) != index:
+            yield Finding(
+                (*at, index, "name"),
+                f"is the name of an earlier {what} already",
+                f"give each {what} a name of its own",
+            )

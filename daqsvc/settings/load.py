@@ -1,0 +1,232 @@
+"""Reading a machine file: either it is good, or everything wrong with it is said at once."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from daqsvc.settings.checks import check, dbc_layouts
+from daqsvc.settings.dbc import DbcMessage, check_dbc
+from daqsvc.settings.locate import Spot, locate
+from daqsvc.settings.models import MachineFile, Origin
+from daqsvc.settings.problems import Finding, MachineFileError, Problem
+from daqsvc.settings.schema import declared_at, section_of, valid_part, value_at
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.words import Words, dotted, is_secret, suggested_key
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+    from daqsvc.settings.problems import KeyPath
+
+_MASK = '"***"'
+_LONGEST_VALUE = 60
+
+
+def load_machine_file(path: Path) -> MachineFile:
+    """Read a machine file and everything that it names.
+
+    Args:
+        path: the TOML file.
+
+    Returns:
+        The machine file, all of whose parts fit each other.
+
+    Raises:
+        MachineFileError: it cannot be read or used; holds every problem found.
+    """
+    return parse_machine_file(_read(path), path)
+
+
+def parse_machine_file(text: str, path: Path) -> MachineFile:
+    """Read a machine file from its text, as if it stood at ``path``.
+
+    Args:
+        text: TOML.
+        path: the file that messages name and relative paths start from; it need not exist.
+
+    Raises:
+        MachineFileError: the text cannot be used; holds every problem found.
+    """
+    text = text.removeprefix("\ufeff")
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MachineFileError([_syntax_problem(path, text, error)]) from None
+    reading = _Reading(document, locate(text), path)
+    draft = reading.validate()
+    messages = _read_dbc(draft, path, reading.findings)
+    reading.findings += check(draft, messages)
+    problems, warnings = reading.problems()
+    if problems:
+        raise MachineFileError(problems)
+    origin = Origin(path, tuple(warnings), MappingProxyType(messages))
+    return MachineFile.model_validate(document, context=origin)
+
+
+class _Reading:
+    """A parsed file on its way to a `MachineFile`, and what was found wrong with it so far."""
+
+    def __init__(self, document: dict[str, Any], spots: Mapping[KeyPath, Spot], path: Path) -> None:
+        self._document = document
+        self._spots = spots
+        self._path = path
+        self._written_as: dict[KeyPath, str] = {}
+        self.findings: list[Finding] = []
+
+    def validate(self) -> MachineFile:
+        """Check every value for itself; returns the file, or what is valid of it."""
+        errors = _errors(self._document)
+        if not errors:
+            return MachineFile.model_validate(self._document)
+        unknown = [error for error in errors if error["type"] == "extra_forbidden"]
+        self._say(unknown, self._document)
+        meant = self._without_unknown_keys([error["loc"] for error in unknown]) if unknown else self._document
+        self._say([error for error in _errors(meant) if error["type"] != "extra_forbidden"], meant)
+        draft = valid_part(MachineFile, meant)
+        assert isinstance(draft, MachineFile)  # noqa: S101 - for the type checker
+        return draft
+
+    def _without_unknown_keys(self, unknown: Iterable[KeyPath]) -> dict[str, Any]:
+        """The document as it was probably meant: misspelt keys put right, other unknown keys left out."""
+        meant: dict[str, Any] = _copy(self._document)
+        # Deepest first, so that the paths of the rest still lead somewhere.
+        for path in sorted(unknown, key=len, reverse=True):
+            table = value_at(meant, path[:-1])
+            key = str(path[-1])
+            section = section_of(declared_at(MachineFile, meant, path[:-1]), table)
+            better = suggested_key(section, table, key) if section is not None else None
+            value = table.pop(key)
+            if better is not None:
+                table[better] = value
+                self._written_as[*path[:-1], better] = key
+        return meant
+
+    def _say(self, errors: Iterable[ErrorDetails], document: dict[str, Any]) -> None:
+        words = Words(MachineFile, document)
+        for error in errors:
+            path = tuple(step for step in error["loc"] if step != "[key]")
+            message, remedy = words.say(error, path)
+            self.findings.append(Finding(path, message, remedy))
+
+    def problems(self) -> tuple[list[Problem], list[Problem]]:
+        """What makes the file unusable, and what is worth a warning; both in the order of the file."""
+        found = dict.fromkeys(self.findings)
+        fatal = [self._problem(finding) for finding in found if finding.fatal]
+        warnings = [self._problem(finding) for finding in found if not finding.fatal]
+        return sorted(fatal, key=_place), sorted(warnings, key=_place)
+
+    def _problem(self, finding: Finding) -> Problem:
+        path = self._as_written(finding.path)
+        try:
+            value_at(self._document, path)
+        except LookupError:
+            source = ""
+        else:
+            source = _shown(path, self._spots.get(path, Spot(1)).source)
+        # A key that is missing has no line: its table has.
+        line = next(
+            self._spots[path[:end]].line for end in range(len(path), -1, -1) if path[:end] in self._spots
+        )
+        return Problem(self._path, line, dotted(path), source, finding.message, finding.remedy)
+
+    def _as_written(self, path: KeyPath) -> KeyPath:
+        """A path of the document as it was meant, in the keys that the file really has."""
+        return tuple(self._written_as.get(path[: depth + 1], step) for depth, step in enumerate(path))
+
+
+def _errors(document: dict[str, Any]) -> list[ErrorDetails]:
+    try:
+        MachineFile.model_validate(document)
+    except ValidationError as error:
+        return [item for item in error.errors(include_url=False) if not _follows(item, document)]
+    return []
+
+
+def _follows(error: ErrorDetails, document: dict[str, Any]) -> bool:
+    """Whether an array is too short only because pydantic left out elements with errors of their own."""
+    if error["type"] != "too_short":
+        return False
+    kept: int = error["ctx"]["min_length"]
+    return len(value_at(document, error["loc"])) >= kept
+
+
+def _copy(value: Any) -> Any:
+    """A copy of the tables and arrays of a document; the values in them do not change."""
+    if isinstance(value, dict):
+        return {key: _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+def _read_dbc(draft: MachineFile, path: Path, findings: list[Finding]) -> dict[str, DbcMessage]:
+    """The messages in DBC files that the streams name."""
+    messages: dict[str, DbcMessage] = {}
+    for name, layout in dbc_layouts(draft):
+        try:
+            file = (path.parent / layout.dbc).absolute()
+            message, found = check_dbc(layout, file, ("streams", name, "layout"))
+        except UnusableValueError:
+            continue
+        findings += found
+        if message is not None:
+            messages[name] = message
+    return messages
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        message, remedy = (
+            "there is no such file",
+            "correct the path, or copy an example from config/machines/",
+        )
+    except IsADirectoryError:
+        message, remedy = "is a directory", "name a machine file in it, e.g. one that ends in .toml"
+    except PermissionError:
+        message, remedy = "may not be read by this user", f"chmod a+r {path}, or run as a user who may"
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        byte = error.object[error.start]
+        message = f"is not UTF-8: byte {byte:#04x} at offset {error.start}"
+        problem = Problem(path, line, "", "", message, "save the file as UTF-8")
+        raise MachineFileError([problem]) from None
+    except OSError as error:
+        message, remedy = f"cannot be read: {error.strerror or error}", "make the file readable"
+    raise MachineFileError([Problem(path, None, "", "", message, remedy)]) from None
+
+
+def _syntax_problem(path: Path, text: str, error: Exception) -> Problem:
+    if isinstance(error, RecursionError):
+        return Problem(path, None, "", "", "is nested too deeply", "write fewer brackets inside brackets")
+    reason, line = str(error), None
+    place = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", reason)
+    if place is not None:
+        reason = reason[: place.start()]
+        line = int(place[1]) if place[1] else text.rstrip("\n").count("\n") + 1
+        where = f"column {place[2]}" if place[2] else "the end of the file"
+        reason = f"{reason}, at {where}"
+    remedy = "correct the TOML there: text stands in quotes, tables are [name], values are key = value"
+    return Problem(path, line, "", "", f"is not valid TOML: {reason}", remedy)
+
+
+def _shown(path: KeyPath, source: str) -> str:
+    """A value as the file has it, on one short line and without secrets."""
+    if source and is_secret(path):
+        return _MASK
+    if path[-2:] == ("mqtt", "url") and re.search(r"//[^/]*@", source):
+        return json.dumps(re.sub(r"//[^/]*@", "//***@", source.strip("\"'")))
+    line = " ".join(source.split())
+    return line if len(line) <= _LONGEST_VALUE else f"{line[: _LONGEST_VALUE - 4]} ..."
+
+
+def _place(problem: Problem) -> tuple[int, str]:
+    return problem.line or 0, problem.key

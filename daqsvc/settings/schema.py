@@ -1,0 +1,123 @@
+"""Finding one's way through the models by the keys of a machine file, and reading what is valid of one."""
+
+from __future__ import annotations
+
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+
+from pydantic import TypeAdapter, ValidationError
+
+from daqsvc.settings.section import Kinds, Section
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pydantic.fields import FieldInfo
+
+    from daqsvc.settings.problems import KeyPath
+
+
+def value_at(document: Any, path: KeyPath) -> Any:
+    """The value at a path of a parsed TOML document.
+
+    Raises:
+        LookupError: there is none.
+    """
+    value = document
+    for step in path:
+        if not isinstance(value, list if isinstance(step, int) else dict):
+            raise LookupError(path)  # noqa: TRY004 - the path leads nowhere, whatever stands there
+        value = value[step]
+    return value
+
+
+def field_type(field: FieldInfo) -> Any:
+    """The type of a field with its annotations, as it was declared."""
+    return Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+
+
+def section_of(declared: Any, value: object) -> type[Section] | None:
+    """The section that a key of type ``declared`` means by ``value``; None if it does not mean a table."""
+    kinds = kinds_of(declared)
+    if kinds is not None:
+        return kinds.choose(value) if isinstance(value, dict) else None
+    bare = _bare(declared)
+    return bare if isinstance(bare, type) and issubclass(bare, Section) else None
+
+
+def kinds_of(declared: Any) -> Kinds | None:
+    """The kinds of tables that a key of type ``declared`` can hold, if there are several."""
+    if get_origin(declared) is not Annotated:
+        return None
+    return next((mark for mark in declared.__metadata__ if isinstance(mark, Kinds)), None)
+
+
+def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
+    """The declared type of what stands at ``path``; None if the models know nothing there."""
+    declared: Any = root
+    for depth, step in enumerate(path):
+        value = value_at(document, path[:depth])
+        section = section_of(declared, value)
+        if section is None:
+            declared = _element_type(declared)
+        elif step in section.model_fields:
+            declared = field_type(section.model_fields[str(step)])
+        else:
+            return None
+    return declared
+
+
+def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
+    """The section with those values of ``table`` that are valid, each for itself, at any depth.
+
+    Returns:
+        An instance that raises `UnusableValueError` for the values that are missing or not valid.
+    """
+    values: dict[str, Any] = {}
+    unusable: list[str] = []
+    for name, field in section.model_fields.items():
+        if name in table:
+            try:
+                values[name] = _valid_value(field_type(field), table[name])
+            except (ValidationError, TypeError):
+                unusable.append(name)
+    part = section.model_construct(**values)
+    for name in unusable:
+        part.__dict__.pop(name, None)  # the default is not what the file says
+    return part
+
+
+def _valid_value(declared: Any, value: Any) -> Any:
+    try:
+        return TypeAdapter(declared).validate_python(value)
+    except ValidationError:
+        section = section_of(declared, value)
+        if section is not None and isinstance(value, dict):
+            return valid_part(section, value)
+        element = _element_type(declared)
+        if isinstance(value, dict) and element is not None:
+            return {key: _valid_value(element, item) for key, item in value.items()}
+        if isinstance(value, list) and section_of(element, {}) is not None:
+            return tuple(_valid_value(element, item) for item in value)
+        raise
+
+
+def _bare(declared: Any) -> Any:
+    """A type without its annotations and without ``| None``."""
+    while True:
+        if get_origin(declared) is Annotated:
+            declared = get_args(declared)[0]
+        elif get_origin(declared) in {Union, UnionType} and type(None) in get_args(declared):
+            declared = next(arm for arm in get_args(declared) if arm is not type(None))
+        else:
+            return declared
+
+
+def _element_type(declared: Any) -> Any:
+    """The type of the elements of an array or of the values of a table with free keys; None if neither."""
+    bare = _bare(declared)
+    if get_origin(bare) is tuple:
+        return get_args(bare)[0]
+    if get_origin(bare) is dict and get_args(bare)[1] is not Any:
+        return get_args(bare)[1]
+    return None

@@ -1,0 +1,284 @@
+"""What pydantic found, in words for the person who wrote the file."""
+
+from __future__ import annotations
+
+import json
+import re
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+
+from daqsvc.settings.schema import declared_at, kinds_of, section_of, value_at
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from pydantic.fields import FieldInfo
+    from pydantic_core import ErrorDetails
+
+    from daqsvc.settings.problems import KeyPath
+    from daqsvc.settings.section import Section
+
+_TRUE_WORDS = {"1", "on", "true", "y", "yes"}
+_FALSE_WORDS = {"0", "off", "false", "n", "no"}
+_SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
+
+
+def dotted(path: KeyPath) -> str:
+    """A key path as people write it, e.g. ``sensors[0].name``; keys that need quotes get them."""
+    text = ""
+    for step in path:
+        if isinstance(step, int):
+            text += f"[{step}]"
+        else:
+            key = step if re.fullmatch(r"[A-Za-z0-9_-]+", step) else json.dumps(step, ensure_ascii=False)
+            text += f".{key}" if text else key
+    return text
+
+
+def is_secret(path: KeyPath) -> bool:
+    """Whether the value at ``path`` must not be repeated in a message."""
+    key = next((step for step in reversed(path) if isinstance(step, str)), "")
+    return bool(_SECRET.search(key)) and not key.endswith("_file")
+
+
+def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) -> str | None:
+    """The key of ``section`` that an unknown ``key`` was probably meant to be."""
+    free = [name for name in section.model_fields if name not in table]
+    close = get_close_matches(key.lower(), free, n=1, cutoff=0.7)
+    return close[0] if close else None
+
+
+class Words:
+    """Turns one error of pydantic into a message and a remedy.
+
+    Args:
+        root: the model of the whole file.
+        document: the parsed file that was validated.
+    """
+
+    def __init__(self, root: type[Section], document: Mapping[str, Any]) -> None:
+        self._root = root
+        self._document = document
+
+    def say(self, error: ErrorDetails, path: KeyPath) -> tuple[str, str]:
+        """Message (to be read after the value) and remedy for an error at ``path``."""
+        context = error.get("ctx", {})
+        if "remedy" in context:
+            return error["msg"], str(context["remedy"])
+        say: Callable[[KeyPath, Mapping[str, Any]], tuple[str, str]]
+        say = getattr(self, f"_{error['type']}", self._other)
+        message, remedy = say(path, context)
+        return message or f"is not valid: {error['msg']}", remedy
+
+    # Each method below is named after the pydantic error type it puts into words.
+
+    def _missing(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        if isinstance(path[-1], int):
+            return "is missing: the array needs one more value", self._write_example(path)
+        field = self._field(path)
+        about = f": {field.description}" if field is not None and field.description else ""
+        return f"is missing{about}", self._add(path)
+
+    def _extra_forbidden(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        key = str(path[-1])
+        table = value_at(self._document, path[:-1])
+        declared = declared_at(self._root, self._document, path[:-1])
+        section = section_of(declared, table)
+        if section is None:
+            raise LookupError(path)
+        kinds = kinds_of(declared)
+        others = [other.kind for other in (kinds.sections if kinds else ()) if key in other.model_fields]
+        if others:
+            return f"belongs to {' or '.join(others)}, but this is {section.kind}", "remove it"
+        if is_secret(path):
+            return (
+                "does not belong into a machine file",
+                "write it into a file that only the service can read and name that in password_file",
+            )
+        meant = suggested_key(section, table, key)
+        if meant is not None:
+            return "unknown key", f"did you mean {meant}?"
+        free = sorted(name for name in section.model_fields if name not in table)
+        keys = f"; possible here: {', '.join(free)}" if free else ""
+        return "unknown key", f"remove it{keys}"
+
+    def _bool_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        word = str(value_at(self._document, path)).lower()
+        meant = "true" if word in _TRUE_WORDS else "false" if word in _FALSE_WORDS else "true or false"
+        return "must be true or false", f"write {self._key(path)} = {meant}"
+
+    def _int_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        value = value_at(self._document, path)
+        if isinstance(value, str):
+            try:
+                int(value, 0)
+            except ValueError:
+                pass
+            else:
+                return "must be a whole number", f"take the quotes away: {self._key(path)} = {value}"
+        if isinstance(value, float) and value.is_integer():
+            return "must be a whole number", f"write {self._key(path)} = {int(value)}"
+        return "must be a whole number", self._write_example(path)
+
+    def _float_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        value = value_at(self._document, path)
+        if isinstance(value, str) and re.fullmatch(r"[+-]?\d+(\.\d+)?([eE][+-]?\d+)?", value.strip()):
+            return "must be a number", f"take the quotes away: {self._key(path)} = {value.strip()}"
+        return "must be a number", self._write_example(path)
+
+    def _finite_number(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        return "must be a finite number", self._write_example(path)
+
+    def _string_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        value = value_at(self._document, path)
+        if isinstance(value, bool | int | float):
+            return "must be text in quotes", f"write {self._key(path)} = {json.dumps(str(value))}"
+        return "must be text in quotes", self._write_example(path)
+
+    def _path_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        return "must be a path in quotes", self._write_example(path)
+
+    def _literal_error(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        value = value_at(self._document, path)
+        allowed = self._allowed(path)
+        listed = [json.dumps(item) for item in allowed]
+        message = (
+            f"must be {' or '.join([', '.join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)}"
+        )
+        if len(allowed) == 1:
+            return message, f"write {self._key(path)} = {listed[0]}"
+        if isinstance(value, str):
+            if value in {str(item) for item in allowed}:
+                return message, f"take the quotes away: {self._key(path)} = {value}"
+            close = get_close_matches(value.lower(), [item for item in allowed if isinstance(item, str)], n=1)
+            if close:
+                return message, f'did you mean "{close[0]}"?'
+        return message, f"write one of these, e.g. {self._key(path)} = {listed[0]}"
+
+    def _greater_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        return f"must be greater than {context['gt']:g}", self._write_example(path)
+
+    def _greater_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        return f"must be {context['ge']:g} or more", self._write_example(path)
+
+    def _less_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        return f"must be less than {context['lt']:g}", self._write_example(path)
+
+    def _less_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        limit = context["le"]
+        shown = hex(limit) if path[-1] == "id" else f"{limit:g}" if limit < 1_000_000 else f"{limit:,.0f}"
+        return f"must be {shown} or less", self._write_example(path)
+
+    def _string_pattern_mismatch(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        parts = "/" in str(context["pattern"])
+        also = " (and '/' between parts)" if parts else ""
+        # The key of a free table is checked by the name it has, not by what it holds.
+        key, value = path[-1], value_at(self._document, path)
+        named = isinstance(value, str)
+        text = value if named else str(key)
+        allowed = re.sub(r"[^A-Za-z0-9_./-]+" if parts else r"[^A-Za-z0-9_.-]+", "-", text).strip("-/")
+        subject = "" if named else "its name "
+        message = f"{subject}may only have letters, digits, '_', '.' and '-'{also}, and must not be empty"
+        remedy = f"write e.g. {json.dumps(allowed)}" if allowed else "give it a name"
+        return message, remedy
+
+    def _string_too_short(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        return "must not be empty", self._write_example(path)
+
+    def _string_too_long(self, _path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        return f"is longer than {context['max_length']} characters", "shorten it"
+
+    def _too_short(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        least = context["min_length"]
+        number = "one entry" if least == 1 else f"{least} entries"
+        return f"must have at least {number}", self._add(path)
+
+    def _too_long(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
+        return f"must have {context['max_length']} values", self._write_example(path)
+
+    def _tuple_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        field = self._field(path)
+        if field is not None and not field.examples:
+            return "must be an array", self._add(path)
+        return "must be an array in brackets", self._write_example(path)
+
+    def _model_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        return "must be a table", self._add(path)
+
+    _section_type = _dict_type = _model_type
+
+    def _other(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
+        return "", self._write_example(path)
+
+    # What the remedies are made of.
+
+    def _key(self, path: KeyPath) -> str:
+        """The last key of a path; elements of an array of values go by the array's name and position."""
+        names = [depth for depth, step in enumerate(path) if isinstance(step, str)]
+        return dotted(path[names[-1] :]) if names else dotted(path)
+
+    def _field(self, path: KeyPath) -> FieldInfo | None:
+        """The field of the models that ``path`` belongs to."""
+        for depth in range(len(path), 0, -1):
+            step = path[depth - 1]
+            try:
+                table = value_at(self._document, path[: depth - 1])
+            except LookupError:
+                continue
+            section = section_of(declared_at(self._root, self._document, path[: depth - 1]), table)
+            if section is not None and step in section.model_fields:
+                return section.model_fields[str(step)]
+        return None
+
+    def _allowed(self, path: KeyPath) -> tuple[Any, ...]:
+        declared = declared_at(self._root, self._document, path)
+        while get_origin(declared) is not Literal:
+            declared = get_args(declared)[0]
+        return get_args(declared)
+
+    def _example(self, path: KeyPath) -> str | None:
+        """A valid value as TOML, from the field's examples or its default."""
+        field = self._field(path)
+        if field is None:
+            return None
+        if field.examples:
+            example = field.examples[0]
+            # Examples that are TOML already: arrays, inline tables, hexadecimal numbers.
+            if isinstance(example, str) and example.startswith(("[", "{", "0x")):
+                return example
+            return json.dumps(example)
+        if isinstance(field.default, bool | int | float | str | tuple):
+            return json.dumps(field.default)
+        return None
+
+    def _write_example(self, path: KeyPath) -> str:
+        example = self._example(path)
+        field = self._field(path)
+        names = [depth for depth, step in enumerate(path) if isinstance(step, str)]
+        key = dotted(path[names[-1] : names[-1] + 1])
+        about = f" ({field.description})" if field is not None and field.description else ""
+        return f"write {key} = {example}{about}" if example else f"correct {key}{about}"
+
+    def _add(self, path: KeyPath) -> str:
+        """How to add what is missing at ``path``, or to make a table of it."""
+        key = dotted(path[-1:])
+        example = self._example(path)
+        if example is not None:
+            return f"add {key} = {example} to {self._table(path[:-1])}"
+        declared = declared_at(self._root, self._document, path)
+        if get_origin(declared) is not None and path in {("sensors",), ("alarms",)}:
+            return f"write a table [[{key}]] for each of the {key}"
+        if path in {("buses",), ("streams",)}:
+            return f"write a table [{key}.NAME] for each of the {key}"
+        return f"write a table [{dotted(path)}]"
+
+    def _table(self, path: KeyPath) -> str:
+        """The table at ``path``, as a person would point at it."""
+        if not path:
+            return "the top of the file"
+        table = value_at(self._document, path)
+        name = table.get("name") if isinstance(table, dict) else None
+        if isinstance(path[-1], int):
+            named = f' "{name}"' if isinstance(name, str) else ""
+            return f"the entry{named} of {dotted(path[:-1])}"
+        return f"[{dotted(path)}]"
