@@ -1,0 +1,109 @@
+"""The contract between a driver and the service.
+
+A driver owns one link. It takes frames off the bus, decodes them in bulk, and delivers blocks; it
+keeps the link up by itself, counts what goes wrong, and lets no exception out. Drivers register by
+entry point in the group ``daqsvc.drivers`` as a callable that takes a `BusPort`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.acquisition.supervisor import Link
+    from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.frames import FrameLayout
+
+StartPolicy = Literal["error", "retry", "ignore"]
+
+
+class DeviceAbsentError(Exception):
+    """The device is not there at start, and the machine file says that this is an error."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSpec:
+    """One stream on a bus.
+
+    Attributes:
+        name: name of the stream in the machine file.
+        layout: where its counter and samples lie, in the sensors' physical units.
+        rate_hz: nominal sampling rate.
+        reorder_window_ns: how long a gap may wait for a late frame.
+    """
+
+    name: str
+    layout: FrameLayout
+    rate_hz: float
+    reorder_window_ns: int = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class BusPort:
+    """All that a driver is given.
+
+    Attributes:
+        name: name of the bus in the machine file.
+        options: the bus's settings, by key.
+        streams: what is expected on the bus.
+        clock: the service's clock.
+        deliver: called with each block, on the event loop.
+        start: what to do if the device is absent at start: fail, try again, or go on without it.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    streams: Sequence[StreamSpec]
+    clock: Clock
+    deliver: Callable[[SampleBlock], None]
+    start: StartPolicy = "retry"
+
+
+@dataclass(slots=True)
+class BusCounters:
+    """What happened on a bus beside its streams; every figure only grows.
+
+    Attributes:
+        frames_unknown: frames with an id that no stream has.
+        frames_remote: remote-transmission requests.
+        frames_error: error frames.
+        bus_off: how often the controller went bus-off.
+        open_failures: how often the bus could not be opened.
+        reader_failures: how often the reader gave up on an error that nobody had foreseen.
+        unknown_ids: frames per unknown id, for the first ids seen.
+    """
+
+    frames_unknown: int = 0
+    frames_remote: int = 0
+    frames_error: int = 0
+    bus_off: int = 0
+    open_failures: int = 0
+    reader_failures: int = 0
+    unknown_ids: dict[int, int] = field(default_factory=dict)
+
+
+class Driver(Protocol):
+    """One link, kept up."""
+
+    name: str
+    link: Link
+    counters: BusCounters
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """Counters and clock of each stream, by name."""
+        ...
+
+    async def run(self) -> None:
+        """Open the link and deliver blocks until cancelled; then hand over what is held back and close.
+
+        Raises:
+            DeviceAbsentError: the device is absent at start and the policy is ``"error"``. Nothing else.
+        """
+        ...
