@@ -98,6 +98,7 @@ class DrivenPacer:
         heapq.heappush(self._waited_for, deadline_ns)
         try:
             while self._clock.monotonic_ns() < deadline_ns:
+                await asyncio.sleep(0)
                 await self._hold_for_receiver()
                 next_ns = min(self._clock.monotonic_ns() + STEP_NS, self._waited_for[0])
                 await self._hold_for_speed(next_ns)
@@ -106,7 +107,6 @@ class DrivenPacer:
                 next_ns = min(next_ns, self._waited_for[0])
                 if next_ns > self._clock.monotonic_ns():
                     self._clock.advance_to(next_ns)
-                await asyncio.sleep(0)
         finally:
             self._waited_for.remove(deadline_ns)
             heapq.heapify(self._waited_for)
