@@ -73,5 +73,5 @@ class Link:
         if self.state == "up":
             self.losses += 1
         if not self._said_down:
-            logger.warning("%s is lost: %s; trying again until it is back", self.name, reason)
+            logger.warning("%s is lost: %s; it is being tried again", self.name, reason)
         self.state, self.reason, self._said_down = "down", reason, True
