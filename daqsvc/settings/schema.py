@@ -25,7 +25,8 @@ def value_at(document: Any, path: KeyPath) -> Any:
     """
     value = document
     for step in path:
-        if not isinstance(value, list if isinstance(step, int) else dict):
+        container: type[Any] = list if isinstance(step, int) else dict
+        if not isinstance(value, container):
             raise LookupError(path)  # noqa: TRY004 - the path leads nowhere, whatever stands there
         value = value[step]
     return value

@@ -1,0 +1,260 @@
+"""What was understood of a machine file, as text for a person at a terminal."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.alarms import LevelAlarm
+from daqsvc.settings.buses import CanBus
+from daqsvc.settings.layout_checks import frame_facts
+from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
+from daqsvc.settings.wire import frame_time
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from daqsvc.settings.buses import Stream
+    from daqsvc.settings.models import MachineFile, Mqtt, Sensor
+
+COLUMNS = 100
+_INDENT = "  "
+_GAP = "  "
+_NO_BREAK = "\N{NO-BREAK SPACE}"
+
+
+def describe(machine: MachineFile) -> str:
+    """Summary of a machine file: plain text for a terminal of 100 columns, without secrets, warnings last."""
+    blocks = [
+        _facts(_identity(machine)),
+        ["Buses", *_table([], [(name, _bus(machine, name)) for name in machine.buses])],
+        ["Streams", *_table(_STREAM_HEADER, [_stream(machine, *item) for item in machine.streams.items()])],
+        ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
+        ["Detectors", *_table([], list(_detectors(machine)))],
+        ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
+        _facts(_outlets(machine)),
+    ]
+    if machine.warnings:
+        warnings = [
+            textwrap.fill(
+                str(warning),
+                COLUMNS,
+                initial_indent=_INDENT,
+                subsequent_indent=2 * _INDENT,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+            for warning in machine.warnings
+        ]
+        blocks.append([f"Warnings: {len(warnings)}", *warnings])
+    return "\n\n".join("\n".join(block) for block in blocks)
+
+
+def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
+    yield "File", str(machine.path)
+    about = f" - {machine.machine.description}" if machine.machine.description else ""
+    yield "Machine", f"{machine.machine.name}{about}"
+    speed_rpm = machine.machine.speed_rpm
+    yield "Speed", f"{speed_rpm:g} rpm ({speed_rpm / 60:.4g} Hz)"
+    yield "Box", f"{machine.box} at site {machine.site}"
+    rotor = machine.machine.rotor
+    if rotor is not None:
+        text = (
+            f"natural frequency {rotor.natural_frequency_hz:g} Hz, damping ratio {rotor.damping_ratio:g}, "
+            f"eccentricity {rotor.eccentricity_um:g} um at {rotor.heavy_spot_deg:g} deg, "
+            f"clearance {rotor.clearance_um:g} um, sag {rotor.static_sag_um:g} um, "
+            f"contact stiffness K* {rotor.contact_stiffness:g}"
+        )
+        yield "Rotor", text
+
+
+def _bus(machine: MachineFile, name: str) -> str:
+    bus = machine.buses[name]
+    if not isinstance(bus, CanBus):
+        options = f" with options {', '.join(sorted(bus.options))}" if bus.options else ""
+        return f"driver {bus.driver}{options}; if absent at start: {bus.start}"
+    parts = [f"{'CAN FD' if bus.fd else 'classic CAN'}, {bus.interface} {bus.channel}"]
+    if bus.bitrate is not None:
+        parts.append(_bit_rate(bus.bitrate))
+    if bus.fd and bus.data_bitrate is not None:
+        parts.append(f"data {_bit_rate(bus.data_bitrate)}")
+    if bus.options:
+        parts.append(f"options {' '.join(sorted(bus.options))}")
+    loads = [_bus_share(machine, key) for key, stream in machine.streams.items() if stream.bus == name]
+    known = [load for load in loads if load is not None]
+    if loads and len(known) == len(loads):
+        load = _percent(sum(least for least, _ in known), sum(most for _, most in known))
+        parts.append(f"load about {load} of the bus")
+    return f"{', '.join(parts)}; if absent at start: {bus.start}"
+
+
+_STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
+
+
+def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
+    facts = frame_facts(stream, machine.dbc_messages.get(name))
+    share = _bus_share(machine, name)
+    shown_share = "" if share is None else _percent(*share)
+    if facts is None:
+        return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", "", "", shown_share
+    samples = f"{facts.samples_per_frame} x {len(stream.layout.channels)} samples"
+    return (
+        name,
+        stream.bus,
+        f"{facts.frame_id:#x}",
+        f"{stream.rate_hz:g} Hz",
+        f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
+        f"{facts.length} bytes, {samples}",
+        f"{facts.counter_bits} bit {stream.layout.counter.counts}",
+        shown_share,
+    )
+
+
+def _bus_share(machine: MachineFile, name: str) -> tuple[float, float] | None:
+    """Share of the bus's time that a stream takes, with the fewest and the most stuff bits."""
+    stream = machine.streams[name]
+    bus = machine.buses[stream.bus]
+    facts = frame_facts(stream, machine.dbc_messages.get(name))
+    if not isinstance(bus, CanBus) or bus.bitrate is None or facts is None:
+        return None
+    time = frame_time(
+        facts.length, extended=facts.extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
+    )
+    frames_per_s = stream.rate_hz / facts.samples_per_frame
+    return frames_per_s * time.least_s, frames_per_s * time.most_s
+
+
+_SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")
+
+
+def _sensor(sensor: Sensor) -> Sequence[str]:
+    if sensor.sensitivity_mv_per_unit is None:
+        sensitivity = f"in {sensor.unit} already"
+    else:
+        sensitivity = f"{sensor.sensitivity_mv_per_unit:g} mV/{sensor.unit}"
+        if sensor.zero_v != 0:
+            sensitivity += f", 0 at {sensor.zero_v:g} V"
+    return (
+        sensor.name,
+        sensor.type,
+        f"{sensor.stream}.{sensor.channel}",
+        sensor.unit,
+        sensitivity,
+        "; ".join(_sensor_details(sensor)),
+    )
+
+
+def _sensor_details(sensor: Sensor) -> Iterator[str]:
+    if isinstance(sensor, ProximityProbe):
+        yield f"OK while gap is {sensor.gap_ok_v[0]:g} to {sensor.gap_ok_v[1]:g} V"
+    if isinstance(sensor, ProximityProbe | Accelerometer) and sensor.angle_deg is not None:
+        yield f"at {sensor.angle_deg:g} deg"
+    if isinstance(sensor, Keyphasor):
+        yield f"{sensor.edge} through {sensor.threshold_v:g} V, hysteresis {sensor.hysteresis_v:g} V"
+
+
+def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
+    pipeline = machine.pipeline
+    yield "ring", f"{pipeline.ring_s:g} s of every stream"
+    if pipeline.levels is not None:
+        vibration = [sensor.name for sensor in machine.sensors if not isinstance(sensor, Keyphasor)]
+        text = f"RMS, peak and crest factor over {pipeline.levels.window_s:g} s of {', '.join(vibration)}"
+        velocity = [
+            sensor.name for sensor in machine.sensors if isinstance(sensor, Accelerometer | VelocitySensor)
+        ]
+        if velocity:
+            low_hz, high_hz = pipeline.levels.velocity_band_hz
+            text += f"; velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(velocity)}"
+        yield "levels", text
+    bank = pipeline.rotor_bank
+    if bank is not None:
+        modes = ", ".join(
+            f"{mode.name} (zeta {mode.damping_ratio:g}{', rub' if mode.rub else ''}: {mode.severity})"
+            for mode in bank.modes
+        )
+        text = (
+            f"{bank.probes[0]}, {bank.probes[1]} and {bank.keyphasor}; noise {bank.noise_um:g} um; "
+            f"rule {bank.rule}, {bank.threshold_nats:g} nats forward, {bank.back_threshold_nats:g} back; "
+            f"modes {modes}"
+        )
+        yield "rotor-bank", text
+
+
+_ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay on, off", "latching")
+
+
+def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
+    for alarm in machine.alarms:
+        latching = "yes" if alarm.latching else "no"
+        if not isinstance(alarm, LevelAlarm):
+            yield alarm.name, alarm.detector, "by mode", "by mode", "", "", latching
+            continue
+        unit = {"velocity_rms": "mm/s", "crest_factor": ""}.get(
+            alarm.measure, machine.sensor(alarm.sensor).unit
+        )
+        yield (
+            alarm.name,
+            f"{alarm.measure} of {alarm.sensor}",
+            "-" if alarm.alert is None else f"{alarm.alert:g} {unit}".rstrip(),
+            "-" if alarm.danger is None else f"{alarm.danger:g} {unit}".rstrip(),
+            f"{alarm.deadband:g} {unit}".rstrip(),
+            f"{alarm.on_delay_s:g} s, {alarm.off_delay_s:g} s",
+            latching,
+        )
+
+
+def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
+    yield "MQTT", "no broker configured" if machine.mqtt is None else _broker(machine, machine.mqtt)
+    yield (
+        "Store",
+        "no directory configured" if machine.store is None else str(machine.resolve(machine.store.directory)),
+    )
+
+
+def _broker(machine: MachineFile, mqtt: Mqtt) -> str:
+    trust = f"certificates from {mqtt.ca_file}" if mqtt.ca_file is not None else "the system's certificates"
+    parts = [f"{mqtt.host} port {mqtt.port}, {f'TLS, {trust}' if mqtt.tls else 'without TLS'}"]
+    if mqtt.username is not None:
+        secret = f", password from {mqtt.password_file}" if mqtt.password_file is not None else ""
+        parts.append(f"user {mqtt.username}{secret}")
+    parts.append(f"client {machine.mqtt_client_id}, keep-alive {mqtt.keepalive_s} s")
+    parts.append(f"topics {mqtt.topic_root}/{machine.site}/{machine.box}/...")
+    return "; ".join(parts)
+
+
+def _bit_rate(rate: int) -> str:
+    return f"{rate / 1_000_000:g} Mbit/s" if rate >= 1_000_000 else f"{rate / 1000:g} kbit/s"
+
+
+def _percent(least: float, most: float) -> str:
+    """A range of shares; the wire's stuff bits depend on the data, so there is no single figure."""
+    low, high = f"{100 * least:.2g}", f"{100 * most:.2g}"
+    return f"{low} %" if low == high else f"{low} to {high} %"
+
+
+def _facts(facts: Iterable[tuple[str, str]]) -> list[str]:
+    """Labels in a column, their texts wrapped beside them."""
+    return [line for label, text in facts for line in _wrapped(f"{label:<9}", text)]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows in aligned columns under a header (none if empty); the last column is wrapped."""
+    if not rows:
+        return [f"{_INDENT}none"]
+    shown = [header, *rows] if header else list(rows)
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)][:-1]
+    lines: list[str] = []
+    for row in shown:
+        cells = [f"{cell:<{width}}{_GAP}" for cell, width in zip(row, widths, strict=False)]
+        lines += _wrapped(f"{_INDENT}{''.join(cells)}", row[-1])
+    return lines
+
+
+def _wrapped(label: str, text: str) -> list[str]:
+    together = re.sub(r"(?<=\d) (?=[A-Za-z%])", _NO_BREAK, text)  # a number stays with its unit
+    wrapped = textwrap.wrap(
+        together, max(COLUMNS - len(label), 20), break_long_words=False, break_on_hyphens=False
+    )
+    first, *rest = [line.replace(_NO_BREAK, " ") for line in wrapped] or [""]
+    return [f"{label}{first}".rstrip(), *(" " * len(label) + line for line in rest)]
