@@ -28,6 +28,18 @@ DELIMITERS = ("\t", ";", "|", ",", " ")
 
 SNIFFED_LINES = 20
 
+DAMAGED = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What the readers of these formats raise on damaged files."""
+
 
 class RecordingError(ValueError):
     """A recording cannot be read, or does not hold what is asked of it."""
@@ -113,11 +125,7 @@ def _read(path: Path) -> dict[str, NDArray[np.generic]]:
         return dict(reader(path))
     except RecordingError:
         raise
-    except NotImplementedError:
-        raise RecordingError(
-            f"{path} is a MATLAB v7.3 file, which cannot be read; save it in MATLAB with save(..., '-v7')"
-        ) from None
-    except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except DAMAGED as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
 
 
@@ -129,6 +137,10 @@ def _read_mat(path: Path) -> Iterator[tuple[str, NDArray[np.generic]]]:
         variables = loadmat(path, squeeze_me=True, struct_as_record=False)
     except MatReadError as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
+    except NotImplementedError:
+        raise RecordingError(
+            f"{path} is a MATLAB v7.3 file, which cannot be read; save it in MATLAB with save(..., '-v7')"
+        ) from None
     for name, value in variables.items():
         if not name.startswith("__"):
             yield from _flattened(name, value)
