@@ -205,14 +205,10 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_truncated_mat_and_gzip(tmp_path, mat):
     whole = mat.read_bytes()
-    refused = 0
     for length in range(0, len(whole) - 8, 97):
         mat.write_bytes(whole[:length])
-        try:
+        with pytest.raises(RecordingError, match=r"rig\.mat cannot be read"):
             load_recording(mat, rate_hz=1)
-        except RecordingError:
-            refused += 1
-    assert refused >= 30  # the others end between two variables: nothing tells that one is missing
     path = write_csv(tmp_path, rows(","), "rig.csv.gz")
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(RecordingError, match="cannot be read"):
