@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -11,8 +10,6 @@ if TYPE_CHECKING:
 
 Severity = Literal["normal", "alert", "danger"]
 DataQuality = Literal["good", "missing", "not_ok"]
-
-_NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +29,9 @@ class Diagnosis:
         severity: how bad the decision is.
         probabilities: conditional probability per mode, summing to one; empty if the detector has none.
         group: modes that the evidence cannot tell apart, the decision among them.
-        statistics: what was measured, by name with its unit, e.g. ``{"rms_g": 0.07}``.
-        thresholds: limits that the statistics were held against, by the same names plus a suffix.
+        statistics: what was measured, by name, e.g. ``{"rms": 0.07}``.
+        units: unit of each statistic, by the same names; a pure number has none.
+        thresholds: limits that the statistics were held against, e.g. ``{"rms.alert": 0.11}``.
         evidence: log-likelihood ratios in nats, by name.
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
         quality: ``"good"``; ``"missing"`` if too many samples of the window are missing;
@@ -53,11 +51,12 @@ class Diagnosis:
     decision: str
     changed: bool = False
     severity: Severity = "normal"
-    probabilities: Mapping[str, float] = field(default=_NOTHING)
+    probabilities: Mapping[str, float] = field(default_factory=dict)
     group: tuple[str, ...] = ()
-    statistics: Mapping[str, float] = field(default=_NOTHING)
-    thresholds: Mapping[str, float] = field(default=_NOTHING)
-    evidence: Mapping[str, float] = field(default=_NOTHING)
+    statistics: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    thresholds: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, float] = field(default_factory=dict)
     revolutions: float | None = None
     quality: DataQuality = "good"
     reason: str = ""

@@ -1,0 +1,219 @@
+"""The level detector: how much each sensor shakes, and whether the sensor is to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.record import Severity
+
+MIN_PRESENT = 0.5
+"""Share of a window's samples that must be there for its levels to be given."""
+
+SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
+
+# How a band velocity in mm/s comes from the samples: factor, and whether to integrate.
+_TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
+    "g": (1000.0 * STANDARD_GRAVITY, True),
+    "m/s2": (1000.0, True),
+    "mm/s": (1.0, False),
+}
+_DECISIONS: tuple[Severity, ...] = ("normal", "alert", "danger")
+
+
+class Limits(NamedTuple):
+    """Setpoints of one measure; None where there is none."""
+
+    measure: str
+    alert: float | None
+    danger: float | None
+
+
+class GapCheck(NamedTuple):
+    """OK limits of a proximity probe (API 670): its mean gap voltage must lie between them.
+
+    Attributes:
+        volts_per_unit: gap voltage per unit of displacement.
+        zero_v: gap voltage at displacement zero.
+        low_v: lower limit.
+        high_v: upper limit.
+    """
+
+    volts_per_unit: float
+    zero_v: float
+    low_v: float
+    high_v: float
+
+
+@dataclass(frozen=True, slots=True)
+class LevelChannel:
+    """One sensor as the level detector sees it.
+
+    Attributes:
+        sensor: its name.
+        column: its column in the stream.
+        unit: unit of its samples.
+        limits: setpoints of its measures.
+        gap: OK limits, for a proximity probe.
+    """
+
+    sensor: str
+    column: int
+    unit: SensorUnit
+    limits: Sequence[Limits] = ()
+    gap: GapCheck | None = None
+
+
+class LevelDetector:
+    """RMS, peak, crest factor and band velocity of every sensor of a stream, window by window.
+
+    Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``.
+
+    Args:
+        machine: name of the machine.
+        stream: name of the stream.
+        rate_hz: its sampling rate.
+        channels: the sensors.
+        window_s: length of a window.
+        velocity_band_hz: band of the velocity, in Hz.
+    """
+
+    def __init__(
+        self,
+        machine: str,
+        stream: str,
+        rate_hz: float,
+        channels: Sequence[LevelChannel],
+        *,
+        window_s: float = 0.5,
+        velocity_band_hz: tuple[float, float] = (10.0, 1000.0),
+    ) -> None:
+        self.name = f"levels/{stream}"
+        self.stream = stream
+        self.block = max(4, round(window_s * rate_hz))
+        self._machine = machine
+        self._rate_hz = rate_hz
+        self._channels = tuple(channels)
+        self._band_hz = velocity_band_hz
+        self._decided: dict[str, Severity] = {}
+
+    def warm(self) -> None:
+        """Make the taper and the band's weights; there is nothing to compile."""
+        for channel in self._channels:
+            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)))
+
+    def process(self, window: Window) -> list[Diagnosis]:
+        """See `daqsvc.diagnosis.detector.Detector.process`."""
+        said: list[Diagnosis] = []
+        for start in range(0, len(window.samples), self.block):
+            part = window.samples[start : start + self.block]
+            after = len(window.samples) - start - len(part)
+            t_ns = window.t_end_ns - round(after * window.period_ns)
+            said += [
+                self._judge(c, part[:, c.column], window.first_index + start, t_ns) for c in self._channels
+            ]
+        return said
+
+    def _judge(
+        self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int
+    ) -> Diagnosis:
+        before = self._decided.get(channel.sensor)
+        present = np.isfinite(samples)
+        count = int(present.sum())
+        quality: Literal["good", "missing", "not_ok"] = "good"
+        reason = ""
+        statistics: dict[str, float] = {}
+        if count < MIN_PRESENT * len(samples):
+            quality = "missing"
+            reason = (
+                f"only {count} of {len(samples)} samples of {channel.sensor} arrived; check bus and device"
+            )
+        else:
+            statistics = self._measure(channel, samples)
+            reason = _why_not_ok(channel, statistics, samples[present])
+            quality = "not_ok" if reason else "good"
+        severity = before or "normal"
+        if quality == "good":
+            severity = max(
+                (_severity(statistics[limit.measure], limit) for limit in channel.limits),
+                key=_DECISIONS.index,
+                default="normal",
+            )
+            self._decided[channel.sensor] = severity
+        return Diagnosis(
+            machine=self._machine,
+            detector=f"levels/{channel.sensor}",
+            t_ns=t_ns,
+            stream=self.stream,
+            first_index=first_index,
+            end_index=first_index + len(samples),
+            decision=severity if quality == "good" or before else "undetermined",
+            changed=quality == "good" and before not in {None, severity},
+            severity=severity,
+            statistics=statistics,
+            units={name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"},
+            thresholds={
+                f"{limit.measure}.{name}": value
+                for limit in channel.limits
+                for name, value in (("alert", limit.alert), ("danger", limit.danger))
+                if value is not None
+            },
+            quality=quality,
+            reason=reason,
+            sensors=(channel.sensor,),
+            model="levels/1",
+        )
+
+    def _measure(self, channel: LevelChannel, samples: NDArray[np.float32]) -> dict[str, float]:
+        found = levels(samples)
+        statistics = {
+            "mean": found.mean,
+            "rms": found.rms,
+            "peak": found.peak,
+            "crest_factor": found.crest_factor,
+        }
+        if channel.gap is not None:
+            statistics["gap_voltage"] = channel.gap.zero_v + found.mean * channel.gap.volts_per_unit
+        if channel.unit in _TO_VELOCITY:
+            factor, integrate = _TO_VELOCITY[channel.unit]
+            there = np.nan_to_num(
+                samples.astype(np.float64), nan=found.mean, posinf=found.mean, neginf=found.mean
+            )
+            rms = band_rms(there, self._rate_hz, *self._band_hz, integrate=integrate)
+            statistics["velocity_rms"] = factor * rms
+        return statistics
+
+
+def _severity(value: float, limits: Limits) -> Severity:
+    if limits.danger is not None and value >= limits.danger:
+        return "danger"
+    if limits.alert is not None and value >= limits.alert:
+        return "alert"
+    return "normal"
+
+
+def _why_not_ok(channel: LevelChannel, statistics: Mapping[str, float], present: NDArray[np.float32]) -> str:
+    gap = channel.gap
+    if gap is not None and not gap.low_v <= statistics["gap_voltage"] <= gap.high_v:
+        return (
+            f"gap voltage of {channel.sensor} is {statistics['gap_voltage']:.2f} V, outside its OK limits "
+            f"{gap.low_v:g} to {gap.high_v:g} V; check probe, cable and driver"
+        )
+    if np.ptp(present) == 0:
+        return f"{channel.sensor} does not move at all ({present[0]:g} {channel.unit}): dead or disconnected"
+    return ""
+
+
+def _unit(statistic: str, unit: str) -> str:
+    return {"velocity_rms": "mm/s", "gap_voltage": "V"}.get(statistic, unit)

@@ -1,0 +1,138 @@
+"""The pipeline: one task per detector takes windows from a ring and has them processed off the loop."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.ring import RingClosed, RingReader
+from daqsvc.diagnosis.detector import Window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from daqsvc.acquisition.ring import Chunk, SampleRing
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.record import Diagnosis
+
+logger = logging.getLogger(__name__)
+
+MOST_BLOCKS = 64
+"""Blocks in one window at most: a detector that is behind catches up in long strides."""
+
+
+@dataclass(slots=True)
+class DetectorCounters:
+    """What a detector has done; every figure only grows.
+
+    Attributes:
+        windows: windows processed.
+        samples: samples in them.
+        samples_skipped: samples it was too slow for, exactly.
+        failures: windows in which it raised, against its contract.
+        busy_ns: time its kernels took, on the host's clock.
+    """
+
+    windows: int = 0
+    samples: int = 0
+    samples_skipped: int = 0
+    failures: int = 0
+    busy_ns: int = 0
+
+
+class Pipeline:
+    """Runs detectors over rings until the rings are closed.
+
+    Args:
+        rings: by stream name.
+        detectors: each names its stream.
+        report: called on the event loop with each diagnosis, per detector in order.
+        threads: kernels that may run at a time.
+    """
+
+    def __init__(
+        self,
+        rings: Mapping[str, SampleRing],
+        detectors: Sequence[Detector],
+        report: Callable[[Diagnosis], None],
+        threads: int = 2,
+    ) -> None:
+        self.counters = {detector.name: DetectorCounters() for detector in detectors}
+        self._detectors = tuple(detectors)
+        self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
+        self._report = report
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
+
+    @property
+    def behind_samples(self) -> int:
+        """Samples that the slowest detector has not read yet."""
+        return max((reader.behind for reader in self._readers.values()), default=0)
+
+    async def warm(self) -> None:
+        """Compile every kernel before the first sample comes."""
+        loop = asyncio.get_running_loop()
+        for detector in self._detectors:
+            await loop.run_in_executor(self._pool, detector.warm)
+
+    async def run(self) -> None:
+        """Process until every ring is closed and every whole block in it is processed."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for detector in self._detectors:
+                    group.create_task(self._follow(detector), name=f"detector {detector.name}")
+        finally:
+            # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.
+            await asyncio.shield(asyncio.to_thread(self._pool.shutdown))
+
+    async def _follow(self, detector: Detector) -> None:
+        reader, counters = self._readers[detector.name], self.counters[detector.name]
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                chunk = await reader.take(detector.block, MOST_BLOCKS)
+            except RingClosed:
+                return
+            if chunk.skipped:
+                counters.samples_skipped += chunk.skipped
+                logger.warning(
+                    "detector %s was too slow and has missed %d samples of %r from index %d on",
+                    detector.name,
+                    chunk.skipped,
+                    detector.stream,
+                    chunk.first_index - chunk.skipped,
+                )
+            window = _window(reader.ring, chunk)
+            said = await loop.run_in_executor(self._pool, _process, detector, window, counters)
+            for diagnosis in said:
+                self._report(diagnosis)
+
+
+def _window(ring: SampleRing, chunk: Chunk) -> Window:
+    last = chunk.first_index + len(chunk.samples) - 1
+    return Window(chunk.first_index, chunk.samples, ring.time_of(last), ring.period_at(last), chunk.skipped)
+
+
+def _process(detector: Detector, window: Window, counters: DetectorCounters) -> Sequence[Diagnosis]:
+    # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
+    begun_ns = time.perf_counter_ns()
+    try:
+        return detector.process(window)
+    except Exception:
+        counters.failures += 1
+        if counters.failures == 1:
+            logger.exception(
+                "detector %s failed on samples %d to %d of %r; it goes on with the next window",
+                detector.name,
+                window.first_index,
+                window.first_index + len(window.samples),
+                detector.stream,
+            )
+        return []
+    finally:
+        counters.windows += 1
+        counters.samples += len(window.samples)
+        counters.busy_ns += time.perf_counter_ns() - begun_ns

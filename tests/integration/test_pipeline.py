@@ -1,0 +1,108 @@
+"""The pipeline: order, catching up, overruns, and a detector that breaks its contract."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.record import Diagnosis
+
+if TYPE_CHECKING:
+    import pytest
+
+    from daqsvc.diagnosis.detector import Window
+
+
+class Listener:
+    """Remembers its windows; raises on demand, or waits."""
+
+    def __init__(self, name: str, block: int, *, fail_at: int | None = None) -> None:
+        self.name, self.stream, self.block = name, "s", block
+        self.windows: list[Window] = []
+        self.threads: set[str] = set()
+        self.fail_at = fail_at
+        self.go_on = threading.Event()
+        self.go_on.set()
+        self.warmed = False
+
+    def warm(self) -> None:
+        self.warmed = True
+
+    def process(self, window: Window) -> list[Diagnosis]:
+        self.go_on.wait(5)
+        self.threads.add(threading.current_thread().name)
+        self.windows.append(window)
+        if len(self.windows) - 1 == self.fail_at:
+            raise ZeroDivisionError("a detector broke its contract")
+        end = window.first_index + len(window.samples)
+        return [Diagnosis("m", self.name, window.t_end_ns, "s", window.first_index, end, "N")]
+
+
+def write(ring: SampleRing, n: int) -> None:
+    first = ring.end_index
+    samples = np.arange(first, first + n, dtype=np.float32)[:, None]
+    ring.write(SampleBlock("s", first, samples, 1000 * first, 1000.0))
+
+
+async def test_every_detector_sees_every_sample_in_order_off_the_loop() -> None:
+    ring = SampleRing("s", ("a",), 1000)
+    detectors = [Listener("one", 7), Listener("two", 16)]
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, detectors, said.append)
+    await pipeline.warm()
+    assert all(d.warmed for d in detectors)
+    running = asyncio.create_task(pipeline.run())
+    for n in (3, 30, 5, 100, 1, 60):
+        write(ring, n)
+        await asyncio.sleep(0.002)
+    ring.close()
+    await running
+    for detector in detectors:
+        got = np.concatenate([w.samples[:, 0] for w in detector.windows])
+        whole = 199 // detector.block * detector.block
+        np.testing.assert_array_equal(got, np.arange(whole))
+        assert all(w.t_end_ns == 1000 * (w.first_index + len(w.samples) - 1) for w in detector.windows)
+        assert all(name.startswith("kernel") for name in detector.threads)
+        assert [d.first_index for d in said if d.detector == detector.name] == [
+            w.first_index for w in detector.windows
+        ]
+    assert not [t for t in threading.enumerate() if t.name.startswith("kernel")]
+
+
+async def test_a_detector_that_is_too_slow_learns_exactly_what_it_missed() -> None:
+    ring = SampleRing("s", ("a",), 50)
+    slow = Listener("slow", 10)
+    pipeline = Pipeline({"s": ring}, [slow], lambda _: None)
+    running = asyncio.create_task(pipeline.run())
+    slow.go_on.clear()
+    write(ring, 10)
+    await asyncio.sleep(0.05)
+    write(ring, 175)
+    slow.go_on.set()
+    await asyncio.sleep(0.05)
+    ring.close()
+    await running
+    assert [(w.first_index, len(w.samples), w.skipped) for w in slow.windows] == [(0, 10, 0), (135, 50, 125)]
+    assert pipeline.counters["slow"].samples_skipped == 125
+
+
+async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10, fail_at=0)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [broken], said.append)
+    running = asyncio.create_task(pipeline.run())
+    for _ in range(3):
+        write(ring, 10)
+        await asyncio.sleep(0.02)
+    ring.close()
+    await running
+    assert pipeline.counters["broken"].failures == 1
+    assert [d.first_index for d in said] == [10, 20]
+    assert sum("detector broken failed on samples 0 to 10" in r.message for r in caplog.records) == 1
