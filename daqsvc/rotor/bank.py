@@ -198,8 +198,9 @@ class ModelBank:
         cusum_verdicts = np.empty(n, dtype=np.int64)
         ages = np.zeros(n, dtype=np.int64)
         self._cusum_decision = kernels.decide_by_cusum(
-            scores, self._thresholds, self.rules.threshold_nats, _LEAD_LIMIT * self.rules.threshold_nats,
-            self._cusum_decision, self._cusum, self._lead, self._duels, self._ages, cusum_verdicts, ages,
+            scores, self._thresholds, self.rules.threshold_nats, self.rules.identity_nats,
+            _LEAD_LIMIT * self.rules.threshold_nats, self._cusum_decision,
+            self._cusum, self._lead, self._duels, self._ages, cusum_verdicts, ages,
         )  # fmt: skip
         paper_changes = self._paper_changes(paper_verdicts)
         paper_declarations = int(np.count_nonzero(paper_verdicts != UNDETERMINED))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     State = tuple[float, float, float, float]
 
 _ESCAPE_SQUARED = ESCAPE_RADIUS * ESCAPE_RADIUS
+_PATIENCE = 1.5
 UNDETERMINED = -1
 """Index that stands for no mode."""
 
@@ -233,20 +234,32 @@ def _first_verdict(scores: Floats, k: int, threshold: float, duels: Floats) -> i
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _next_verdict(scores: Floats, k: int, current: int, thresholds: Floats, cusum: Floats, ages: Ints) -> int:
-    """Every mode against the declared one; the index of the one furthest past its threshold, or -1."""
-    winner = UNDETERMINED
-    margin = 0.0
+def _gather(scores: Floats, k: int, current: int, cusum: Floats, ages: Ints) -> None:
+    """One sample's evidence of every mode against the declared one."""
     for j in range(len(scores)):
-        if j == current:
-            continue
-        cusum[j] += scores[j, k] - scores[current, k]
+        cusum[j] = cusum[j] + scores[j, k] - scores[current, k]
         if cusum[j] <= 0.0:
             cusum[j] = 0.0
             ages[j] = 0
-        elif cusum[j] - thresholds[current, j] >= margin:
-            margin = cusum[j] - thresholds[current, j]
-            winner = j
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next_verdict(current: int, thresholds: Floats, identity_margin: float, cusum: Floats) -> int:
+    """The index of the mode that takes over from the declared one, or -1.
+
+    A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
+    takes over must lead the rest by the margin; past one and a half thresholds it need not any more.
+    """
+    winner, best, second = UNDETERMINED, 0.0, 0.0
+    for j in range(len(cusum)):
+        if cusum[j] > best:
+            winner, best, second = j, cusum[j], best
+        elif cusum[j] > second:
+            second = cusum[j]
+    if winner == UNDETERMINED or best < thresholds[current, winner]:
+        return UNDETERMINED
+    if best - second < identity_margin and best < _PATIENCE * thresholds[current, winner]:
+        return UNDETERMINED
     return winner
 
 
@@ -255,6 +268,7 @@ def decide_by_cusum(
     scores: Floats,
     thresholds: Floats,
     first_threshold: float,
+    identity_margin: float,
     lead_limit: float,
     current: int,
     cusum: Floats,
@@ -270,6 +284,7 @@ def decide_by_cusum(
         scores: float64 ``[M, n]``, log-likelihoods from `run_free`, nats.
         thresholds: float64 ``[M, M]``, nats that change the decision from the row's mode to the column's.
         first_threshold: nats by which one mode must lead all others to be the first decision.
+        identity_margin: nats by which the next decision must lead the other candidates.
         lead_limit: the lead of the decision over another mode counts up to here.
         current: index of the decision before the block, or -1.
         cusum: float64 ``[M]``, evidence of each mode against the decision since its onset, changed in place.
@@ -289,7 +304,8 @@ def decide_by_cusum(
         if current == UNDETERMINED:
             winner = _first_verdict(scores, k, first_threshold, duels)
         else:
-            winner = _next_verdict(scores, k, current, thresholds, cusum, ages)
+            _gather(scores, k, current, cusum, ages)
+            winner = _next_verdict(current, thresholds, identity_margin, cusum)
             for j in range(count):
                 lead[j] = min(lead_limit, lead[j] + scores[current, k] - scores[j, k])
         verdicts[k] = winner
