@@ -1,0 +1,237 @@
+"""JSON payloads, each with its schema and version: what consumers may rely on.
+
+A change that an old consumer would not survive gets a new version number; a new optional key does not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
+
+from daqsvc.acquisition.clock import iso_utc
+from daqsvc.alarms.events import EventKind  # noqa: TC001  pydantic reads annotations at run time
+from daqsvc.alarms.states import AlarmState  # noqa: TC001
+from daqsvc.diagnosis.record import DataQuality, Severity  # noqa: TC001
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.events import AlarmEvent, Identity
+    from daqsvc.diagnosis.record import Diagnosis
+
+
+def _finite_or_none(value: Any) -> Any:
+    """JSON knows neither NaN nor infinity: what is not a finite number becomes null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Number = Annotated[float | None, BeforeValidator(_finite_or_none)]
+WholeOrNumber = Annotated[int | float | None, BeforeValidator(_finite_or_none)]
+
+
+class _Payload(BaseModel):
+    model_config = ConfigDict(
+        frozen=True,
+        populate_by_name=True,
+        use_enum_values=True,
+        json_schema_serialization_defaults_required=True,
+    )
+
+    def to_json(self) -> bytes:
+        """The payload as UTF-8 JSON."""
+        return self.model_dump_json(by_alias=True).encode()
+
+
+class _Stamped(_Payload):
+    site: str
+    box: str
+    time: str = Field(description="ISO 8601, UTC, microseconds; a label, the wall clock may step")
+    wall_ns: int = Field(description="the same instant in nanoseconds since 1970-01-01T00:00Z")
+    monotonic_ns: int = Field(description="the same instant on the box's monotonic clock; orders events")
+
+
+class WindowPayload(_Payload):
+    """Which samples a statement rests on: absolute sample indices of the stream."""
+
+    stream: str
+    first_index: int
+    end_index: int = Field(description="one past the last sample")
+
+
+class _Statement(_Payload):
+    detector: str
+    decision: str
+    severity: Severity
+    changed: bool
+    probabilities: dict[str, Number] = Field(description="by mode; empty if the detector has none")
+    group: tuple[str, ...] = Field(description="modes that the evidence cannot tell apart")
+    statistics: dict[str, Number]
+    thresholds: dict[str, Number]
+    evidence: dict[str, Number] = Field(description="log-likelihood ratios in nats")
+    revolutions: Number = Field(description="shaft revolutions since the detector started")
+    window: WindowPayload
+    quality: DataQuality
+    reason: str = Field(description="why the quality is not good")
+    sensors: tuple[str, ...]
+    model: str
+
+
+class CausePayload(_Statement):
+    """The diagnosis behind an alarm event."""
+
+    monotonic_ns: int = Field(description="when the last sample of the window was taken")
+
+
+class PreviousPayload(_Payload):
+    """How the alarm stood before the event."""
+
+    state: AlarmState
+    level: Severity
+
+
+class AlarmPayload(_Stamped):
+    """One event of one alarm; the latest one is the alarm's state."""
+
+    schema_: Literal["daqsvc.alarm/1"] = Field("daqsvc.alarm/1", alias="schema")
+    id: str = Field(description="unique; a message that comes twice has the same id")
+    sequence: int = Field(description="rises from event to event of the box, never used twice")
+    machine: str
+    alarm: str
+    occurrence: str | None = Field(description="id of the activation; null if normal before and after")
+    kind: EventKind
+    state: AlarmState
+    level: Severity
+    previous: PreviousPayload
+    message: str
+    by: str = Field(description="who acknowledged or reset; empty if the data did it")
+    cause: CausePayload
+
+
+class DiagnosisPayload(_Stamped, _Statement):
+    """One statement of one detector."""
+
+    schema_: Literal["daqsvc.diagnosis/1"] = Field("daqsvc.diagnosis/1", alias="schema")
+    machine: str
+
+
+class Figures(RootModel[dict[str, "WholeOrNumber | Figures"]]):
+    """Numbers by name, or groups of them."""
+
+
+class StatusPayload(_Stamped):
+    """Figures of the service itself, nested by what they belong to."""
+
+    schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema")
+    figures: Figures
+
+
+class AvailabilityPayload(_Stamped):
+    """Whether the box is there; in a last will, the time is that of the connection that it belongs to."""
+
+    schema_: Literal["daqsvc.availability/1"] = Field("daqsvc.availability/1", alias="schema")
+    state: Literal["online", "offline"]
+    reason: str
+
+
+def alarm_payload(event: AlarmEvent, sequence: int) -> AlarmPayload:
+    """The payload of an alarm event that the outbox has given ``sequence``."""
+    identity = event.identity
+    return AlarmPayload(
+        **_stamp(identity.site, identity.box, event.t_ns, event.wall_ns),
+        id=f"{identity.box}-{sequence}",
+        sequence=sequence,
+        machine=identity.machine,
+        alarm=event.alarm,
+        occurrence=event.occurrence,
+        kind=event.kind,
+        state=event.to_state,
+        level=event.to_level.label,
+        previous=PreviousPayload(state=event.from_state, level=event.from_level.label),
+        message=event.message,
+        by=event.by,
+        cause=CausePayload(**_statement(event.cause), monotonic_ns=event.cause.t_ns),
+    )
+
+
+def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) -> DiagnosisPayload:
+    """The payload of a diagnosis, stamped with the time of its last sample."""
+    wall_ns = clock.wall_ns() - clock.monotonic_ns() + diagnosis.t_ns
+    return DiagnosisPayload(
+        **_stamp(identity.site, identity.box, diagnosis.t_ns, wall_ns),
+        **_statement(diagnosis),
+        machine=identity.machine,
+    )
+
+
+def status_payload(site: str, box: str, figures: Mapping[str, Any], clock: Clock) -> StatusPayload:
+    """The payload of the service's figures as they are now.
+
+    Args:
+        site: name of the site.
+        box: name of the box.
+        figures: numbers, or mappings of numbers, by name.
+        clock: for the stamp.
+
+    Raises:
+        pydantic.ValidationError: a figure is neither a number nor a mapping of numbers.
+    """
+    return StatusPayload(**_now(site, box, clock), figures=Figures.model_validate(figures))
+
+
+def availability_payload(
+    site: str, box: str, state: Literal["online", "offline"], reason: str, clock: Clock
+) -> AvailabilityPayload:
+    """The payload that says whether the box is there, and why."""
+    return AvailabilityPayload(**_now(site, box, clock), state=state, reason=reason)
+
+
+def json_schemas() -> dict[str, dict[str, Any]]:
+    """The JSON Schema (2020-12) of every payload, by the value of its ``schema`` key."""
+    models: dict[str, type[_Payload]] = {
+        "daqsvc.alarm/1": AlarmPayload,
+        "daqsvc.diagnosis/1": DiagnosisPayload,
+        "daqsvc.status/1": StatusPayload,
+        "daqsvc.availability/1": AvailabilityPayload,
+    }
+    return {
+        name: model.model_json_schema(by_alias=True, mode="serialization") for name, model in models.items()
+    }
+
+
+def _stamp(site: str, box: str, t_ns: int, wall_ns: int) -> dict[str, Any]:
+    return {
+        "site": site,
+        "box": box,
+        "time": iso_utc(wall_ns),
+        "wall_ns": wall_ns,
+        "monotonic_ns": t_ns,
+    }
+
+
+def _now(site: str, box: str, clock: Clock) -> dict[str, Any]:
+    return _stamp(site, box, clock.monotonic_ns(), clock.wall_ns())
+
+
+def _statement(diagnosis: Diagnosis) -> dict[str, Any]:
+    return {
+        "detector": diagnosis.detector,
+        "decision": diagnosis.decision,
+        "severity": diagnosis.severity,
+        "changed": diagnosis.changed,
+        "probabilities": dict(diagnosis.probabilities),
+        "group": diagnosis.group,
+        "statistics": dict(diagnosis.statistics),
+        "thresholds": dict(diagnosis.thresholds),
+        "evidence": dict(diagnosis.evidence),
+        "revolutions": diagnosis.revolutions,
+        "window": WindowPayload(
+            stream=diagnosis.stream, first_index=diagnosis.first_index, end_index=diagnosis.end_index
+        ),
+        "quality": diagnosis.quality,
+        "reason": diagnosis.reason,
+        "sensors": diagnosis.sensors,
+        "model": diagnosis.model,
+    }

@@ -1,0 +1,57 @@
+"""The topic tree: where each kind of message goes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+_NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """The topics of one box: everything lies below ``<root>/<site>/<box>``.
+
+    Raises:
+        ValueError: a name that is not safe in a topic.
+    """
+
+    root: str
+    site: str
+    box: str
+
+    def __post_init__(self) -> None:
+        for name in (self.root, self.site, self.box):
+            _safe(name)
+
+    @property
+    def base(self) -> str:
+        """What all topics of the box begin with."""
+        return f"{self.root}/{self.site}/{self.box}"
+
+    @property
+    def availability(self) -> str:
+        """Online or offline; retained, and the last will."""
+        return f"{self.base}/availability"
+
+    @property
+    def status(self) -> str:
+        """Figures of the service itself."""
+        return f"{self.base}/status"
+
+    def alarm(self, machine: str, alarm: str) -> str:
+        """Every event of one alarm, in order; the latest is retained."""
+        return f"{self.base}/{_safe(machine)}/alarms/{_safe(alarm)}"
+
+    def diagnosis(self, machine: str, detector: str) -> str:
+        """Every diagnosis of one detector."""
+        return f"{self.base}/{_safe(machine)}/diagnosis/{_safe(detector)}"
+
+
+def _safe(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{name!r} cannot stand in an MQTT topic; use letters, digits, '_', '.', '-', "
+            f"and '/' between parts"
+        )
+    return name

@@ -1,0 +1,1 @@
+"""`daqsvc demo`: the whole service against a simulated machine, in one process."""

@@ -1,0 +1,77 @@
+"""An MQTT broker inside the process: for the demo, and for tests without Mosquitto."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from typing import TYPE_CHECKING, Self
+
+from amqtt.broker import Broker
+from amqtt.contexts import BrokerConfig, ListenerConfig
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+_LOOPBACK = "127.0.0.1"
+
+# These tell about every client that comes and goes, at warning level and above.
+_NOISY_LOGGERS = ("amqtt", "transitions")
+
+
+class EmbeddedBroker:
+    """An anonymous amqtt broker (MQTT 3.1.1) on a loopback port; use it with ``async with``.
+
+    Args:
+        port: the port to listen on; 0 for a free one.
+    """
+
+    def __init__(self, port: int = 0) -> None:
+        self._wanted_port = port
+        self._port: int | None = None
+        self._broker: Broker | None = None
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on.
+
+        Raises:
+            RuntimeError: the broker does not run.
+        """
+        if self._port is None:
+            raise RuntimeError("the embedded broker does not run; enter it with 'async with'")
+        return self._port
+
+    @property
+    def url(self) -> str:
+        """Where to reach it, as a machine file says it."""
+        return f"mqtt://{_LOOPBACK}:{self.port}"
+
+    async def __aenter__(self) -> Self:
+        for name in _NOISY_LOGGERS:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        port = self._wanted_port or _free_port()
+        config = BrokerConfig(
+            listeners={"default": ListenerConfig(bind=f"{_LOOPBACK}:{port}")},
+            plugins={"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
+        )
+        self._broker = Broker(config)
+        await self._broker.start()
+        self._port = port
+        return self
+
+    async def __aexit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._broker is not None:
+            await self._broker.shutdown()
+        self._broker = self._port = None
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((_LOOPBACK, 0))
+        port: int = probe.getsockname()[1]
+        return port
