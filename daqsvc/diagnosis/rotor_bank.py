@@ -105,8 +105,8 @@ class RotorBankDetector:
     declared one since the onset of its evidence. Under the paper's rule every severity is normal: a
     posterior of 0.9 is no ground for an alarm.
 
-    A gap of up to a revolution is predicted through; after a longer one the observers start anew. A
-    probe that is dead or clipped, and a shaft without angle, stop the evidence; the decision is held.
+    A gap of up to a revolution is predicted through; after a longer one the observers start anew. While
+    the quality is not good there is no evidence, and the decision is held.
 
     Args:
         machine: name of the machine.
@@ -201,7 +201,9 @@ class RotorBankDetector:
     def warm(self) -> None:
         """Compile the kernels on a bank that is thrown away."""
         n = self.block
-        self._new_bank().process(np.zeros((n, 2)), np.ones(n), np.zeros(n))
+        bank = self._new_bank()
+        bank.process(np.zeros((n, 2)), np.ones(n), np.zeros(n))
+        bank.retune(bank.speed, 0.0)
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
@@ -239,14 +241,12 @@ class RotorBankDetector:
         revolution = round(self._tracker.period_samples)
         self._last_revolution = np.concatenate((self._last_revolution, samples))[-revolution:]
         verdict = self._judge()
-        self._follow_speed()
+        angle = self._direction * track.angle_rad
+        self._follow_speed(float(angle[0]))
 
         xy = samples[:, :2] @ self._to_xy
-        if verdict.quality == "not_ok" or _stands_still(samples[:, :2]):
+        if verdict.quality != "good" or _stands_still(samples[:, :2]):
             xy[:] = np.nan
-        angle = self._direction * track.angle_rad
-        if self._tracker.revolutions_since_edge > _BLIND_REVOLUTIONS:
-            angle[:] = np.nan
         report = self._bank.process(xy, np.cos(angle), np.sin(angle))
 
         said = []
@@ -268,12 +268,12 @@ class RotorBankDetector:
             )
         return said
 
-    def _follow_speed(self) -> None:
-        if not self._tracker.locked:
+    def _follow_speed(self, angle_rad: float) -> None:
+        if math.isnan(angle_rad):
             return
         speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
         if abs(speed / self._bank.speed - 1.0) > _RETUNE:
-            self._bank.retune(speed)
+            self._bank.retune(speed, angle_rad)
 
     def _judge(self) -> _Verdict:
         """What the last revolution is worth."""
@@ -368,9 +368,7 @@ def _at_an_extreme(signal: Floats) -> float | None:
     A coarse converter repeats its values everywhere, not only at the extremes; it does not count.
     """
     n = len(signal)
-    if len(np.unique(signal)) < n / 3:
-        return None
     for extreme in (float(signal.min()), float(signal.max())):
         if np.count_nonzero(signal == extreme) >= max(3.0, _CLIPPED * n):
-            return extreme
+            return extreme if len(np.unique(signal)) >= n / 3 else None
     return None

@@ -127,21 +127,25 @@ class ModelBank:
         self._duels[:] = 0.0
         self._ages[:] = 0
         self._paper_age = 0
-        self._unusable = 0
+        self._unusable = self._samples_per_rev + 1
         self._settling = self._samples_per_rev
 
-    def retune(self, speed: float) -> None:
-        """Follow the shaft to another speed; estimates stay, their reference orbits move.
+    def retune(self, speed: float, angle_rad: float) -> None:
+        """Follow the shaft to another speed: the reference orbits move, the estimates do not.
 
         Args:
             speed: normalised shaft speed w, with the sign it was built with.
+            angle_rad: shaft angle at the next sample.
 
         Raises:
             ValueError: the shaft stands or turns the other way.
         """
         if speed * self.speed <= 0.0 or not math.isfinite(speed):
             raise ValueError(f"rotor bank: normalised speed {speed} is not one of a shaft that keeps turning")
-        self.observers = at_speed(self.observers, self.modes, speed, duration=self._duration)
+        moved = at_speed(self.observers, self.modes, speed, duration=self._duration)
+        for states in (self._states, self._paper_states):
+            kernels.change_orbits(self.observers, moved, math.cos(angle_rad), math.sin(angle_rad), states)
+        self.observers = moved
         self.speed = speed
 
     def process(self, xy: Floats, cos: Floats, sin: Floats) -> BankReport:
@@ -156,6 +160,7 @@ class ModelBank:
         Returns:
             The bank's report at the end of the block.
         """
+        xy, cos, sin = (np.ascontiguousarray(array, dtype=np.float64) for array in (xy, cos, sin))
         with np.errstate(invalid="ignore", over="ignore"):
             usable = (xy[:, 0] ** 2 + xy[:, 1] ** 2 < self._usable_squared) & np.isfinite(cos + sin)
         declarations: list[Declaration] = []
@@ -168,7 +173,10 @@ class ModelBank:
         return self._report(tuple(declarations), paper_declarations)
 
     def _stretches(self, usable: Flags) -> Iterator[tuple[int, int]]:
-        """Cut a block where samples come back after more than a revolution, and start anew there."""
+        """Cut a block where samples begin, or come back after more than a revolution; start anew there."""
+        if not self._unusable and usable.all():
+            yield 0, len(usable)
+            return
         first = 0
         present = np.flatnonzero(usable)
         gaps = np.diff(present, prepend=-1 - self._unusable) - 1

@@ -120,6 +120,23 @@ def _correct(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def change_orbits(before: Observers, after: Observers, cos: float, sin: float, states: Floats) -> None:
+    """Keep every estimate while the orbits that it is counted from change.
+
+    Args:
+        before: ``[M]`` of `discretise.OBSERVER` that the states belong to.
+        after: the same observers with other orbits.
+        cos: cosine of the shaft angle at the sample that the states are for.
+        sin: its sine.
+        states: float64 ``[M, 4]``, deviations, changed in place.
+    """
+    for i in range(len(states)):
+        state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
+        state = _transfer(before[i], after[i], cos, sin, state)
+        states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def run_free(
     xy: Floats, usable: Flags, cos: Floats, sin: Floats, observers: Observers, states: Floats, scores: Floats
 ) -> None:
