@@ -1,0 +1,253 @@
+"""From a machine file to the parts of a service: layouts, drivers, detectors, alarm rules."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.rules import DiagnosisRule, LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
+from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.settings.models import (
+    Accelerometer,
+    CanBus,
+    DbcLayout,
+    Keyphasor,
+    LevelAlarm,
+    PlainLayout,
+    ProximityProbe,
+    VelocitySensor,
+)
+from drivers.base import BusPort, StreamSpec
+from drivers.frames import FrameLayout, Kind
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.settings.models import MachineFile, RotorBank, Sensor
+    from drivers.base import Driver
+
+DRIVERS = "daqsvc.drivers"
+_NS_PER_MS = 1_000_000
+
+
+class AssemblyError(Exception):
+    """A machine file that is sound by itself asks for something that is not there."""
+
+
+def identity(machine: MachineFile) -> Identity:
+    """Whose alarms these are."""
+    return Identity(machine.site, machine.box, machine.machine.name)
+
+
+def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
+    """The layout of a stream, decoding straight to the physical units of its sensors.
+
+    Raises:
+        LayoutError: the DBC file does not hold what the machine file says.
+    """
+    given = machine.streams[stream].layout
+    if isinstance(given, DbcLayout):
+        layout = FrameLayout.from_dbc(
+            machine.resolve(given.dbc),
+            given.message,
+            counter=given.counter.signal,
+            counts=given.counter.counts,
+            channels={channel.name: channel.signals for channel in given.channels},
+        )
+    else:
+        layout = _plain_layout(given)
+    units = {s.channel: (s.gain, s.shift) for s in machine.sensors if s.stream == stream}
+    return layout.in_units(units)
+
+
+def _plain_layout(given: PlainLayout) -> FrameLayout:
+    def kind(raw_type: str) -> Kind:
+        return "float" if raw_type == "float32" else "unsigned" if raw_type.startswith("u") else "signed"
+
+    return FrameLayout.plain(
+        frame_id=given.id,
+        extended=given.extended,
+        length=given.length,
+        channels=[(c.name, 8 * c.raw_bytes, kind(c.type), c.scale, c.offset) for c in given.channels],
+        samples_per_frame=given.samples_per_frame,
+        counter_byte=given.counter.byte,
+        counter_bits=given.counter.bits,
+        counts=given.counter.counts,
+        first_byte=given.first_byte,
+        crc_byte=given.crc_byte,
+        byte_order=given.byte_order,
+    )
+
+
+def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> list[Driver]:
+    """One driver per bus, found by its entry point.
+
+    Raises:
+        AssemblyError: no driver of that name is installed.
+        LayoutError: see `frame_layout`.
+    """
+    installed = {point.name: point for point in entry_points(group=DRIVERS)}
+    made: list[Driver] = []
+    for name, bus in machine.buses.items():
+        if bus.driver not in installed:
+            raise AssemblyError(
+                f"{machine.path}: buses.{name}.driver = {bus.driver!r}: no such driver is installed; "
+                f"there are {', '.join(sorted(installed)) or 'none'}. "
+                "Install the package that brings it, or correct the name"
+            )
+        options: Mapping[str, Any] = bus.model_dump() if isinstance(bus, CanBus) else bus.options
+        streams = [
+            StreamSpec(
+                stream_name,
+                frame_layout(machine, stream_name),
+                stream.rate_hz,
+                round(stream.reorder_window_ms * _NS_PER_MS),
+            )
+            for stream_name, stream in machine.streams.items()
+            if stream.bus == name
+        ]
+        port = BusPort(name, options, streams, clock, deliver, bus.start)
+        made.append(installed[bus.driver].load()(port))
+    return made
+
+
+def detectors(machine: MachineFile) -> list[Detector]:
+    """Every detector that the pipeline section asks for."""
+    made: list[Detector] = []
+    if machine.pipeline.levels is not None:
+        for stream in machine.streams:
+            channels = [
+                LevelChannel(s.name, _column(machine, s), s.unit, _limits(machine, s.name), _gap_check(s))
+                for s in machine.sensors
+                if s.stream == stream and isinstance(s, ProximityProbe | Accelerometer | VelocitySensor)
+            ]
+            if channels:
+                made.append(
+                    LevelDetector(
+                        machine.machine.name,
+                        stream,
+                        machine.streams[stream].rate_hz,
+                        channels,
+                        window_s=machine.pipeline.levels.window_s,
+                        velocity_band_hz=machine.pipeline.levels.velocity_band_hz,
+                    )
+                )
+    if machine.pipeline.rotor_bank is not None:
+        made.append(_rotor_bank(machine, machine.pipeline.rotor_bank))
+    return made
+
+
+def _column(machine: MachineFile, sensor: Sensor) -> int:
+    return machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+
+
+def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
+    return [
+        Limits(alarm.measure, alarm.alert, alarm.danger)
+        for alarm in machine.alarms
+        if isinstance(alarm, LevelAlarm) and alarm.sensor == sensor
+    ]
+
+
+def _gap_check(sensor: Sensor) -> GapCheck | None:
+    if not isinstance(sensor, ProximityProbe) or sensor.sensitivity_mv_per_unit is None:
+        return None
+    return GapCheck(sensor.sensitivity_mv_per_unit / 1000.0, sensor.zero_v, *sensor.gap_ok_v)
+
+
+def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
+    # Here, not above: the kernels bring a compiler, which costs a second that `daqsvc check` need not wait.
+    from daqsvc.diagnosis.rotor_bank import (  # noqa: PLC0415
+        KeyphasorProbe,
+        Probe,
+        RotorBankDetector,
+        RotorMode,
+    )
+    from daqsvc.rotor.decision import DecisionRules  # noqa: PLC0415
+    from daqsvc.rotor.model import RotorParameters  # noqa: PLC0415
+
+    rotor, keyphasor = machine.machine.rotor, machine.sensor(bank.keyphasor)
+    assert rotor is not None  # noqa: S101 - settings/checks.py: a rotor bank needs [machine.rotor]
+    assert isinstance(keyphasor, Keyphasor)  # noqa: S101 - and a keyphasor
+
+    def probe(name: str, default_deg: float) -> Probe:
+        sensor = machine.sensor(name)
+        assert isinstance(sensor, ProximityProbe)  # noqa: S101 - and two proximity probes
+        angle_deg = default_deg if sensor.angle_deg is None else sensor.angle_deg
+        return Probe(name, _column(machine, sensor), angle_deg)
+
+    return RotorBankDetector(
+        machine=machine.machine.name,
+        stream=keyphasor.stream,
+        rate_hz=machine.streams[keyphasor.stream].rate_hz,
+        speed_rpm=machine.machine.speed_rpm,
+        probes=(probe(bank.probes[0], 0.0), probe(bank.probes[1], 90.0)),
+        keyphasor=KeyphasorProbe(
+            keyphasor.name,
+            _column(machine, keyphasor),
+            keyphasor.threshold_v,
+            keyphasor.hysteresis_v,
+            keyphasor.edge,
+        ),
+        rotor=RotorParameters(
+            natural_frequency_hz=rotor.natural_frequency_hz,
+            damping_ratio=rotor.damping_ratio,
+            eccentricity_um=rotor.eccentricity_um,
+            heavy_spot_deg=rotor.heavy_spot_deg,
+            clearance_um=rotor.clearance_um,
+            static_sag_um=rotor.static_sag_um,
+            contact_stiffness=rotor.contact_stiffness,
+        ),
+        modes=[RotorMode(m.name, m.damping_ratio, m.severity, m.rub) for m in bank.modes],
+        noise_um=bank.noise_um,
+        process_noise=bank.process_noise,
+        rub_process_noise=bank.rub_process_noise,
+        rules=DecisionRules(
+            rule=bank.rule,
+            threshold_nats=bank.threshold_nats,
+            back_threshold_nats=bank.back_threshold_nats,
+        ),
+    )
+
+
+def alarm_rules(machine: MachineFile) -> list[LevelRule | DiagnosisRule]:
+    """One rule per alarm."""
+    rules: list[LevelRule | DiagnosisRule] = []
+    for alarm in machine.alarms:
+        if isinstance(alarm, LevelAlarm):
+            setpoint = Setpoint(
+                alarm.alert,
+                alarm.danger,
+                alarm.deadband,
+                round(alarm.on_delay_s * NS_PER_S),
+                round(alarm.off_delay_s * NS_PER_S),
+            )
+            rules.append(LevelRule(alarm.name, alarm.sensor, alarm.measure, setpoint, alarm.latching))
+        else:
+            rules.append(DiagnosisRule(alarm.name, alarm.detector, alarm.latching))
+    return rules
+
+
+def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
+    """How to reach the broker; None if the machine file has none."""
+    given = machine.mqtt
+    if given is None:
+        return None
+    return MqttSettings(
+        host=given.host,
+        port=given.port,
+        client_id=machine.mqtt_client_id,
+        tls=given.tls,
+        ca_file=None if given.ca_file is None else machine.resolve(given.ca_file),
+        username=given.username,
+        password_file=None if given.password_file is None else machine.resolve(given.password_file),
+        keepalive_s=given.keepalive_s,
+        topic_root=given.topic_root,
+    )

@@ -1,0 +1,232 @@
+"""The service: one machine file, one event loop, and everything that runs on it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daqsvc import assembly
+from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from daqsvc.acquisition.ring import SampleRing
+from daqsvc.alarms.manager import AlarmManager
+from daqsvc.alarms.states import Level
+from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.outbox.store import Outbox
+from daqsvc.publish.mqtt import MqttPublisher
+from daqsvc.publish.payloads import alarm_payload, diagnosis_payload, status_payload
+from daqsvc.publish.topics import Topics
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Mapping, Sequence
+    from pathlib import Path
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings.models import MachineFile
+    from drivers.base import Driver
+
+logger = logging.getLogger(__name__)
+
+STATUS_EVERY_NS = NS_PER_S
+LAG_EVERY_S = 0.01
+LAG_REMEMBERED = 6000
+DRAIN_S = 0.5
+GOODBYE_S = 0.6
+CLOSE_S = 0.4
+"""Together they stay below the two seconds in which the service promises to stop."""
+
+
+class LoopLag:
+    """How late the event loop gets round to things: a timer's lateness, every 10 ms for a minute."""
+
+    def __init__(self) -> None:
+        self._late_s: deque[float] = deque(maxlen=LAG_REMEMBERED)
+
+    async def watch(self) -> None:
+        """Measure until cancelled; real time, whatever clock the samples have."""
+        loop = asyncio.get_running_loop()
+        while True:
+            due_s = loop.time() + LAG_EVERY_S
+            await asyncio.sleep(LAG_EVERY_S)
+            self._late_s.append(loop.time() - due_s)
+
+    def figures_ms(self) -> dict[str, float]:
+        """Median, 99th percentile and maximum of the lateness, in ms."""
+        if not self._late_s:
+            return {"p50": 0.0, "p99": 0.0, "max": 0.0}
+        late_ms = 1000.0 * np.fromiter(self._late_s, np.float64)
+        p50, p99 = np.percentile(late_ms, [50, 99])
+        return {"p50": float(p50), "p99": float(p99), "max": float(late_ms.max())}
+
+
+class Service:
+    """Acquires, diagnoses and tells, as a machine file says.
+
+    Args:
+        machine: the machine file.
+        store: directory of the journal.
+        clock: the service's clock.
+
+    Raises:
+        AssemblyError: the machine file asks for a driver that is not installed.
+        LayoutError: a DBC file does not hold what the machine file says.
+    """
+
+    def __init__(self, machine: MachineFile, store: Path, clock: Clock | None = None) -> None:
+        self.machine = machine
+        self.clock: Clock = clock or SystemClock()
+        self.lag = LoopLag()
+        self.ready = asyncio.Event()
+        self._identity = assembly.identity(machine)
+        detectors = assembly.detectors(machine)
+        self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
+        self.drivers: list[Driver] = assembly.drivers(machine, self.clock, self._deliver)
+        self.pipeline = Pipeline(self.rings, detectors, self._report)
+        self.alarms = AlarmManager(self._identity, assembly.alarm_rules(machine), self.clock)
+        self.outbox = Outbox(store / "outbox.sqlite", self.clock)
+        mqtt = assembly.mqtt_settings(machine)
+        self.publisher = (
+            None if mqtt is None else MqttPublisher(mqtt, machine.site, machine.box, self.outbox, self.clock)
+        )
+        root = "daqsvc" if mqtt is None else mqtt.topic_root
+        self._topics = Topics(root, machine.site, machine.box)
+        self._under_way: set[asyncio.Future[int]] = set()
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
+
+        Raises:
+            OutboxError: the journal's directory cannot be used.
+            DeviceAbsentError: a device is absent whose bus has ``start = "error"``.
+        """
+        await self.outbox.open()
+        try:
+            await self.pipeline.warm()
+            await self._serve(stop)
+        finally:
+            await self.outbox.close(CLOSE_S)
+
+    async def _serve(self, stop: asyncio.Event) -> None:
+        helpers = [self._task(self.lag.watch(), "loop lag"), self._task(self._tell_status(), "status")]
+        publishing = None if self.publisher is None else self._task(self.publisher.run(), "mqtt")
+        pipeline = self._task(self.pipeline.run(), "pipeline")
+        reading = [self._task(driver.run(), f"driver {driver.name}") for driver in self.drivers]
+        stopped = self._task(stop.wait(), "stop")
+        everything = [*helpers, *reading, pipeline, stopped, *([publishing] if publishing else [])]
+        try:
+            self.ready.set()
+            await self._until_stopped(stopped, everything)
+        finally:
+            await _cancel(reading)
+            for ring in self.rings.values():
+                ring.close()
+            await asyncio.wait([pipeline], timeout=DRAIN_S)
+            await self._settle()
+            if self.publisher is not None and publishing is not None:
+                self._publish_status()
+                await self.publisher.stop(GOODBYE_S)
+            await _cancel(everything)
+
+    async def _until_stopped(self, stopped: asyncio.Task[Any], tasks: list[asyncio.Task[Any]]) -> None:
+        waiting = set(tasks)
+        while not stopped.done():
+            done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                # A driver that is to be ignored if absent may end; nothing may fail unheard.
+                task.result()
+
+    @staticmethod
+    def _task(work: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        return asyncio.create_task(work, name=name)
+
+    def _deliver(self, block: SampleBlock) -> None:
+        self.rings[block.stream].write(block)
+
+    def _report(self, diagnosis: Diagnosis) -> None:
+        for event in self.alarms.take(diagnosis):
+            self._post(event)
+        if self.publisher is not None:
+            payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
+            self.publisher.telemetry(f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload)
+
+    def _post(self, event: AlarmEvent) -> None:
+        loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
+        logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
+        committed = self.outbox.submit(
+            self._topics.alarm(event.identity.machine, event.alarm),
+            lambda sequence: alarm_payload(event, sequence).to_json(),
+            retain=True,
+        )
+        self._under_way.add(committed)
+        committed.add_done_callback(self._under_way.discard)
+
+    async def _settle(self) -> None:
+        """Wait until the events that are under way are on disk, for as long as the drain may take."""
+        if self._under_way:
+            await asyncio.wait(set(self._under_way), timeout=DRAIN_S)
+
+    async def _tell_status(self) -> None:
+        while True:
+            await self.clock.sleep_ns(STATUS_EVERY_NS)
+            self._publish_status()
+
+    def _publish_status(self) -> None:
+        if self.publisher is not None:
+            payload = status_payload(self.machine.site, self.machine.box, self.figures(), self.clock)
+            self.publisher.telemetry("status", payload.to_json())
+
+    def figures(self) -> dict[str, Any]:
+        """The service's figures by what they belong to: streams, buses, detectors, loop, outbox, MQTT."""
+        streams: dict[str, Mapping[str, float]] = {}
+        buses: dict[str, Mapping[str, Any]] = {}
+        for driver in self.drivers:
+            counted = asdict(driver.counters)
+            unknown = {f"{frame_id:#x}": n for frame_id, n in counted.pop("unknown_ids").items()}
+            up = int(driver.link.state == "up")
+            buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted, "unknown_ids": unknown}
+            for name, (counters, base) in driver.streams.items():
+                ring = self.rings[name]
+                streams[name] = {
+                    **asdict(counters),
+                    "drift_ppm": base.drift_ppm,
+                    "jitter_ms": base.jitter_ns / 1e6,
+                    "time_settled": int(base.settled),
+                    "counter_restarts": base.restarts,
+                    "end_index": ring.end_index,
+                }
+        return {
+            "streams": streams,
+            "buses": buses,
+            "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
+            "loop_lag_ms": self.lag.figures_ms(),
+            "outbox": asdict(self.outbox.counters),
+            "mqtt": {} if self.publisher is None else _numbers(asdict(self.publisher.counters)),
+        }
+
+
+def _ring(machine: MachineFile, stream: str, detectors: Sequence[Detector]) -> SampleRing:
+    described = machine.streams[stream]
+    wanted = round(machine.pipeline.ring_s * described.rate_hz)
+    # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
+    needed = max((4 * d.block for d in detectors if d.stream == stream), default=1)
+    return SampleRing(stream, described.layout.channel_names, max(wanted, needed))
+
+
+def _numbers(figures: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: int(value) if isinstance(value, bool) else value for name, value in figures.items()}
+
+
+async def _cancel(tasks: list[asyncio.Task[Any]]) -> None:
+    for task in tasks:
+        task.cancel()
+    for task, outcome in zip(tasks, await asyncio.gather(*tasks, return_exceptions=True), strict=True):
+        if isinstance(outcome, Exception):
+            logger.error("%s failed while the service stopped", task.get_name(), exc_info=outcome)
