@@ -29,7 +29,6 @@ from daqsvc.settings.layout_checks import (
 from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
-from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -157,7 +156,7 @@ def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
     low_hz, high_hz = draft.pipeline.levels.velocity_band_hz
     for sensor in draft.sensors:
         rate_hz = _rate_hz(draft, sensor)
-        if not isinstance(sensor, Accelerometer | VelocitySensor) or rate_hz is None:
+        if sensor.type not in {"accelerometer", "velocity"} or rate_hz is None:
             continue
         if high_hz >= rate_hz / 2:
             usable_hz = 0.4 * rate_hz
@@ -185,18 +184,22 @@ def _bank_sensors(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
     """The probes and the keyphasor exist, are what they should be, and share a stream."""
     at: KeyPath = ("pipeline", "rotor_bank")
     sensors = _named(draft)
-    asked: list[tuple[KeyPath, str, type[Sensor], str]] = [
-        ((*at, "probes", 0), bank.probes[0], ProximityProbe, "proximity"),
-        ((*at, "probes", 1), bank.probes[1], ProximityProbe, "proximity"),
-        ((*at, "keyphasor"), bank.keyphasor, Keyphasor, "keyphasor"),
+    asked: list[tuple[KeyPath, str, str]] = [
+        ((*at, "probes", 0), bank.probes[0], "proximity"),
+        ((*at, "probes", 1), bank.probes[1], "proximity"),
+        ((*at, "keyphasor"), bank.keyphasor, "keyphasor"),
     ]
-    for path, name, wanted, type_name in asked:
+    for path, name, wanted in asked:
         if name not in sensors:
             yield Finding(path, "there is no such sensor", choice(name, sensors))
-        elif not isinstance(sensors[name], wanted):
-            suitable = [sensor.name for sensor in draft.sensors if isinstance(sensor, wanted)]
-            yield Finding(path, f'must be a sensor of type "{type_name}"', choice(name, suitable))
-    streams = {name: sensors[name].stream for _, name, *_ in asked if name in sensors}
+        elif sensors[name].type != wanted:
+            suitable = [sensor.name for sensor in draft.sensors if sensor.type == wanted]
+            yield Finding(path, f'must be a sensor of type "{wanted}"', choice(name, suitable))
+    streams = {
+        name: sensors[name].stream
+        for _, name, _ in asked
+        if name in sensors and sensors[name].stream in draft.streams
+    }
     keyphasor_stream = streams.get(bank.keyphasor)
     for index, probe in enumerate(bank.probes):
         if keyphasor_stream is not None and streams.get(probe, keyphasor_stream) != keyphasor_stream:
@@ -218,7 +221,7 @@ def _bank_geometry(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
     angles: list[float] = []
     for index, name in enumerate(bank.probes):
         probe = sensors.get(name)
-        if not isinstance(probe, ProximityProbe):
+        if probe is None or probe.type != "proximity":
             return
         if probe.angle_deg is None:
             yield Finding(
@@ -277,12 +280,12 @@ def _alarm_sensor(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterato
         yield Finding((*at, "sensor"), "there is no such sensor", choice(alarm.sensor, sensors))
         return
     sensor = sensors[alarm.sensor]
-    if isinstance(sensor, Keyphasor):
-        vibration = [name for name, other in sensors.items() if not isinstance(other, Keyphasor)]
+    if sensor.type == "keyphasor":
+        vibration = [name for name, other in sensors.items() if other.type != "keyphasor"]
         yield Finding(
             (*at, "sensor"), "is a keyphasor, which measures no vibration", choice(alarm.sensor, vibration)
         )
-    elif isinstance(sensor, ProximityProbe) and alarm.measure == "velocity_rms":
+    elif sensor.type == "proximity" and alarm.measure == "velocity_rms":
         yield Finding(
             (*at, "measure"),
             f'needs an accelerometer or a velocity sensor, but "{alarm.sensor}" is a proximity probe',

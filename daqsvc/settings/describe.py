@@ -147,11 +147,11 @@ def _sensor(sensor: Sensor) -> Sequence[str]:
 
 def _sensor_details(sensor: Sensor) -> Iterator[str]:
     if isinstance(sensor, ProximityProbe):
-        yield f"OK while gap is {sensor.gap_ok_v[0]:g} to {sensor.gap_ok_v[1]:g} V"
+        yield f"gap OK {sensor.gap_ok_v[0]:g} to {sensor.gap_ok_v[1]:g} V"
     if isinstance(sensor, ProximityProbe | Accelerometer) and sensor.angle_deg is not None:
         yield f"at {sensor.angle_deg:g} deg"
     if isinstance(sensor, Keyphasor):
-        yield f"{sensor.edge} through {sensor.threshold_v:g} V, hysteresis {sensor.hysteresis_v:g} V"
+        yield f"{sensor.edge} at {sensor.threshold_v:g} V, hysteresis {sensor.hysteresis_v:g} V"
 
 
 def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
@@ -181,14 +181,14 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         yield "rotor-bank", text
 
 
-_ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay on, off", "latching")
+_ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay")
 
 
 def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
     for alarm in machine.alarms:
-        latching = "yes" if alarm.latching else "no"
+        latching = "; latching" if alarm.latching else ""
         if not isinstance(alarm, LevelAlarm):
-            yield alarm.name, alarm.detector, "by mode", "by mode", "", "", latching
+            yield alarm.name, alarm.detector, "by mode", "by mode", "", f"none{latching}"
             continue
         unit = {"velocity_rms": "mm/s", "crest_factor": ""}.get(
             alarm.measure, machine.sensor(alarm.sensor).unit
@@ -199,8 +199,7 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
             "-" if alarm.alert is None else f"{alarm.alert:g} {unit}".rstrip(),
             "-" if alarm.danger is None else f"{alarm.danger:g} {unit}".rstrip(),
             f"{alarm.deadband:g} {unit}".rstrip(),
-            f"{alarm.on_delay_s:g} s, {alarm.off_delay_s:g} s",
-            latching,
+            f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{latching}",
         )
 
 

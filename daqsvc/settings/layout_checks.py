@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from daqsvc.settings.buses import CRC_BYTES, CanBus, DbcLayout, PlainLayout, Stream
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
-from daqsvc.settings.sensors import ProximityProbe
 from daqsvc.settings.wire import CLASSIC_MAX_LENGTH
 
 if TYPE_CHECKING:
@@ -67,37 +66,39 @@ def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
             "does not fit into 11 bits (0x7ff)",
             "write extended = true if the device sends 29-bit ids, else correct the id",
         )
-    fields = [("counter", layout.counter.byte, layout.counter.end_byte)]
+    fields = [
+        ("counter", "the counter", layout.counter.byte, layout.counter.end_byte),
+        ("first_byte", "the samples", layout.first_byte, layout.samples_end_byte),
+    ]
     if layout.crc_byte is not None:
-        fields.append(("crc_byte", layout.crc_byte, layout.crc_byte + CRC_BYTES))
-    fields.append(("first_byte", layout.first_byte, layout.samples_end_byte))
-    names = {"counter": "the counter", "crc_byte": "the CRC", "first_byte": "the samples"}
-    for key, start, end in fields:
+        fields.append(("crc_byte", "the CRC", layout.crc_byte, layout.crc_byte + CRC_BYTES))
+    fields.sort(key=lambda field: field[2])
+    for key, what, start, end in fields:
         if end > layout.length:
-            room = (layout.length - layout.first_byte) // layout.sample_bytes
-            remedy = (
-                f"write samples_per_frame = {room}, or make the frame longer"
-                if key == "first_byte" and room > 0
-                else f"move it to byte {layout.length - (end - start)} or before, or make the frame longer"
-                if key != "first_byte" and layout.length >= end - start
-                else "make the frame longer"
-            )
             yield Finding(
                 (*at, key),
-                f"{names[key]} would take bytes {start} to {end - 1} of a frame of {layout.length} bytes",
-                remedy,
+                f"{what} would take bytes {start} to {end - 1} of a frame of {layout.length} bytes",
+                _make_room(layout, key, end - start),
             )
-    for (_, start, end), (later, later_start, later_end) in combinations(
-        sorted(fields, key=lambda f: f[1]), 2
-    ):
+    inside = [field for field in fields if field[3] <= layout.length]
+    for (_, first, start, end), (key, what, later_start, later_end) in combinations(inside, 2):
         if later_start < end:
-            first = next(names[key] for key, s, e in fields if (s, e) == (start, end) and key != later)
             yield Finding(
-                (*at, later),
-                f"{names[later]} (bytes {later_start} to {later_end - 1}) would overlap {first} "
+                (*at, key),
+                f"{what} (bytes {later_start} to {later_end - 1}) would overlap {first} "
                 f"(bytes {start} to {end - 1})",
-                f"move {names[later]} to byte {end} or behind, as the device sends it",
+                f"move {what} to byte {end} or behind, as the device sends it",
             )
+
+
+def _make_room(layout: PlainLayout, key: str, needed_bytes: int) -> str:
+    """What to do about a field that reaches past the end of the frame."""
+    fitting_samples = (layout.length - layout.first_byte) // layout.sample_bytes
+    if key == "first_byte" and fitting_samples > 0:
+        return f"write samples_per_frame = {fitting_samples}, or make the frame longer"
+    if key != "first_byte" and layout.length >= needed_bytes:
+        return f"move it to byte {layout.length - needed_bytes} or before, or make the frame longer"
+    return "make the frame longer"
 
 
 def check_channels(layout: PlainLayout | DbcLayout, at: KeyPath) -> Iterator[Finding]:
@@ -222,7 +223,7 @@ def check_voltages(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
             "has no effect without sensitivity_mv_per_unit",
             "add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
         )
-    if isinstance(sensor, ProximityProbe):
+    if sensor.type == "proximity":
         yield Finding(
             (*at, "gap_ok_v"),
             "cannot be checked: without sensitivity_mv_per_unit the gap voltage is not known",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard, Union, get_args, get_origin
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from daqsvc.settings.section import Kinds, Section
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
     from daqsvc.settings.problems import KeyPath
+
+_STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 def value_at(document: Any, path: KeyPath) -> Any:
@@ -43,7 +45,7 @@ def section_of(declared: Any, value: object) -> type[Section] | None:
     if kinds is not None:
         return kinds.choose(value) if isinstance(value, dict) else None
     bare = _bare(declared)
-    return bare if isinstance(bare, type) and issubclass(bare, Section) else None
+    return bare if _is_section(bare) else None
 
 
 def kinds_of(declared: Any) -> Kinds | None:
@@ -89,18 +91,25 @@ def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
 
 
 def _valid_value(declared: Any, value: Any) -> Any:
+    # A section brings its configuration along; for any other type it must be said.
+    config = None if _is_section(_bare(declared)) else _STRICT
     try:
-        return TypeAdapter(declared).validate_python(value)
+        return TypeAdapter(declared, config=config).validate_python(value)
     except ValidationError:
         section = section_of(declared, value)
         if section is not None and isinstance(value, dict):
             return valid_part(section, value)
-        element = _element_type(declared)
-        if isinstance(value, dict) and element is not None:
-            return {key: _valid_value(element, item) for key, item in value.items()}
-        if isinstance(value, list) and section_of(element, {}) is not None:
-            return tuple(_valid_value(element, item) for item in value)
+        container, element = get_origin(_bare(declared)), _element_type(declared)
+        if section_of(element, {}) is not None:
+            if container is dict and isinstance(value, dict):
+                return {key: _valid_value(element, item) for key, item in value.items()}
+            if container is tuple and isinstance(value, list):
+                return tuple(_valid_value(element, item) for item in value)
         raise
+
+
+def _is_section(bare: Any) -> TypeGuard[type[Section]]:
+    return isinstance(bare, type) and issubclass(bare, Section)
 
 
 def _bare(declared: Any) -> Any:

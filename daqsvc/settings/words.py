@@ -44,7 +44,8 @@ def is_secret(path: KeyPath) -> bool:
 def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) -> str | None:
     """The key of ``section`` that an unknown ``key`` was probably meant to be."""
     free = [name for name in section.model_fields if name not in table]
-    close = get_close_matches(key.lower(), free, n=1, cutoff=0.7)
+    without_unit = [name for name in free if name.startswith(f"{key.lower()}_")]
+    close = without_unit or get_close_matches(key.lower(), free, n=1, cutoff=0.7)
     return close[0] if close else None
 
 
