@@ -55,7 +55,6 @@ class LevelRule:
         measure: key in `Diagnosis.statistics`, e.g. ``"rms"``.
         setpoint: the limits, in the unit of the measure.
         latching: whether the alarm outlives its condition until it is reset.
-        unit: unit of the measure, for messages.
     """
 
     alarm: str
@@ -63,7 +62,6 @@ class LevelRule:
     measure: str
     setpoint: Setpoint
     latching: bool = False
-    unit: str = ""
 
     @property
     def detector(self) -> str:
@@ -126,14 +124,14 @@ class _LevelWatch:
                 )
             return None
         level = self._monitor.update(value, diagnosis.t_ns)
-        return Finding(level, "", self._sentence(value, level))
+        return Finding(level, "", self._sentence(diagnosis, value, level))
 
     def hold(self) -> None:
         self._monitor.hold()
 
-    def _sentence(self, value: float, level: Level) -> str:
+    def _sentence(self, diagnosis: Diagnosis, value: float, level: Level) -> str:
         rule = self._rule
-        unit = f" {rule.unit}" if rule.unit else ""
+        unit = f" {diagnosis.units[rule.measure]}" if rule.measure in diagnosis.units else ""
         measured = f"{rule.measure} of {rule.sensor} is {value:.4g}{unit}"
         limit = rule.setpoint.limit(level)
         if limit is not None:

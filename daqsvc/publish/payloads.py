@@ -69,6 +69,7 @@ class _Statement(_Payload):
     probabilities: dict[str, Number] = Field(description="by mode; empty if the detector has none")
     group: tuple[str, ...] = Field(description="modes that the evidence cannot tell apart")
     statistics: dict[str, Number]
+    units: dict[str, str] = Field(description="units of the statistics that have one")
     thresholds: dict[str, Number]
     evidence: dict[str, Number] = Field(description="log-likelihood ratios in nats")
     revolutions: Number = Field(description="shaft revolutions since the detector started")
@@ -224,6 +225,7 @@ def _statement(diagnosis: Diagnosis) -> dict[str, Any]:
         "probabilities": dict(diagnosis.probabilities),
         "group": diagnosis.group,
         "statistics": dict(diagnosis.statistics),
+        "units": dict(diagnosis.units),
         "thresholds": dict(diagnosis.thresholds),
         "evidence": dict(diagnosis.evidence),
         "revolutions": diagnosis.revolutions,
