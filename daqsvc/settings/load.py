@@ -15,7 +15,7 @@ from daqsvc.settings.dbc import DbcMessage, check_dbc
 from daqsvc.settings.locate import Spot, locate
 from daqsvc.settings.models import MachineFile, Origin
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
-from daqsvc.settings.schema import declared_at, section_of, valid_part, value_at
+from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.words import Words, dotted, is_secret, suggested_key
 
@@ -147,16 +147,8 @@ def _errors(document: dict[str, Any]) -> list[ErrorDetails]:
     try:
         MachineFile.model_validate(document)
     except ValidationError as error:
-        return [item for item in error.errors(include_url=False) if not _follows(item, document)]
+        return [item for item in error.errors(include_url=False) if not only_follows(item, document)]
     return []
-
-
-def _follows(error: ErrorDetails, document: dict[str, Any]) -> bool:
-    """Whether an array is too short only because pydantic left out elements with errors of their own."""
-    if error["type"] != "too_short":
-        return False
-    kept: int = error["ctx"]["min_length"]
-    return len(value_at(document, error["loc"])) >= kept
 
 
 def _copy(value: Any) -> Any:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pydantic.fields import FieldInfo
+    from pydantic_core import ErrorDetails
 
     from daqsvc.settings.problems import KeyPath
 
@@ -70,6 +71,14 @@ def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
     return declared
 
 
+def only_follows(error: ErrorDetails, document: Any) -> bool:
+    """Whether an array or table is too short only because pydantic left out what has errors of its own."""
+    if error["type"] != "too_short":
+        return False
+    least: int = error["ctx"]["min_length"]
+    return len(value_at(document, error["loc"])) >= least
+
+
 def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
     """The section with those values of ``table`` that are valid, each for itself, at any depth.
 
@@ -95,7 +104,9 @@ def _valid_value(declared: Any, value: Any) -> Any:
     config = None if _is_section(_bare(declared)) else _STRICT
     try:
         return TypeAdapter(declared, config=config).validate_python(value)
-    except ValidationError:
+    except ValidationError as error:
+        if any(not item["loc"] and not only_follows(item, value) for item in error.errors()):
+            raise  # the whole is wrong, not something in it
         section = section_of(declared, value)
         if section is not None and isinstance(value, dict):
             return valid_part(section, value)

@@ -505,6 +505,16 @@ def test_whole_tables_missing_or_of_the_wrong_kind():
     }
 
 
+def test_arrays_without_entries():
+    text, _ = changed(LAVAL, ('{ name = "N", damping_ratio = 0.18, severity = "normal" },\n', "\n"))
+    start, end = text.index('  { name = "F1"'), text.index("]\n\n[[alarms]]")
+    (problem,) = problems_of(text[:start] + text[end:])
+    assert problem.key == "pipeline.rotor_bank.modes"
+    assert problem.message == "must have at least 2 entries"
+    start, end = text.index('  { name = "x"'), text.index("]\n\n[[sensors]]")
+    assert "streams.shaft.layout.channels" in {item.key for item in problems_of(text[:start] + text[end:])}
+
+
 def test_an_empty_file_names_all_that_is_missing():
     assert {problem.key for problem in problems_of("")} == {
         "schema_version",
