@@ -214,8 +214,8 @@ def _shown(path: KeyPath, source: str) -> str:
     """A value as the file has it, on one short line and without secrets."""
     if source and is_secret(path):
         return _MASK
-    if path[-2:] == ("mqtt", "url") and re.search(r"//[^/]*@", source):
-        return json.dumps(re.sub(r"//[^/]*@", "//***@", source.strip("\"'")))
+    if path == ("mqtt", "url") and "@" in source:
+        return json.dumps(re.sub(r"^(\w+://)?.*@", r"\1***@", source.strip("\"'")))
     line = " ".join(source.split())
     return line if len(line) <= _LONGEST_VALUE else f"{line[: _LONGEST_VALUE - 4]} ..."
 

@@ -117,6 +117,7 @@ class _UntypedSensor(BaseSensor, extra="ignore"):
         Literal["proximity", "accelerometer", "velocity", "keyphasor"],
         Field(description="what kind of sensor it is", examples=["proximity"]),
     ]
+    unit: Annotated[str, Field(description="unit of the samples", examples=["um"])]
 
 
 _KINDS: dict[str, type[BaseSensor]] = {

@@ -14,10 +14,7 @@ from daqsvc.settings.locate import locate
 
 LAVAL = Path(__file__).parents[2] / "config" / "machines" / "laval-rig.toml"
 TEXT = LAVAL.read_text(encoding="utf-8")
-LINES = TEXT.split("\n")
-LEAVES = sorted(
-    {spot.line: spot.source for path, spot in locate(TEXT).items() if spot.source and path[-1] != 0}.items()
-)
+EXAMPLES = sorted(LAVAL.parent.glob("*.toml"))
 JUNK = st.one_of(
     st.sampled_from(
         ["0", "-1", "nan", "1e400", '""', '"x y"', "true", "[]", "{}", "[{}]", "[[1]]", "07:32:00"]
@@ -46,10 +43,10 @@ FAULTS = [
 ]
 
 
-def outcome(text):
+def outcome(text, path=LAVAL):
     """The machine file, or the problems that were found."""
     try:
-        return parse_machine_file(text, LAVAL), ()
+        return parse_machine_file(text, path), ()
     except MachineFileError as error:
         return None, error.problems
 
@@ -84,25 +81,37 @@ def test_all_faults_of_a_file_are_named_at_once(indices):
     assert {FAULTS[index][2] for index in indices} <= keys_of_problems(text)
 
 
-@settings(deadline=None, max_examples=200)
-@given(st.lists(st.tuples(st.sampled_from(LEAVES), JUNK), min_size=1, max_size=3))
-def test_any_value_in_any_place(changes):
-    lines = list(LINES)
-    for (line, source), junk in changes:
+def leaves_of(text):
+    """Line and source of every value of a text that stands on one line."""
+    spots = [spot for spot in locate(text).values() if spot.source and "\n" not in spot.source]
+    return sorted({(spot.line, spot.source) for spot in spots})
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_any_value_in_any_place(path, data):
+    text = path.read_text(encoding="utf-8")
+    lines = text.split("\n")
+    changes = st.lists(st.tuples(st.sampled_from(leaves_of(text)), JUNK), min_size=1, max_size=3)
+    for (line, source), junk in data.draw(changes):
         lines[line - 1] = lines[line - 1].replace(source, junk, 1)
-    machine, problems = outcome("\n".join(lines))
+    machine, problems = outcome("\n".join(lines), path)
     assert bool(machine) != bool(problems)
     assert_well_put(problems, len(lines))
     assert machine is None or describe(machine)
 
 
-@settings(deadline=None, max_examples=200)
-@given(st.sets(st.integers(0, len(LINES) - 1), min_size=1, max_size=8))
-def test_any_lines_left_out(numbers):
-    text = "\n".join(line for number, line in enumerate(LINES) if number not in numbers)
-    machine, problems = outcome(text)
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@settings(deadline=None, max_examples=100)
+@given(data=st.data())
+def test_any_lines_left_out(path, data):
+    lines = path.read_text(encoding="utf-8").split("\n")
+    left_out = data.draw(st.sets(st.integers(0, len(lines) - 1), min_size=1, max_size=8))
+    text = "\n".join(line for number, line in enumerate(lines) if number not in left_out)
+    machine, problems = outcome(text, path)
     assert bool(machine) != bool(problems)
-    assert_well_put(problems, len(LINES))
+    assert_well_put(problems, len(lines))
     assert machine is None or describe(machine)
 
 

@@ -160,6 +160,11 @@ def test_a_layout_that_the_dbc_file_does_not_bear_out(old, new, key, message, re
     assert remedy in problem.remedy
 
 
+def test_a_sensor_of_no_type_beside_a_dbc_file():
+    (problem,) = problems_of(variant('type = "accelerometer"', "", TRIAXIAL))
+    assert problem.key == "sensors[0].type"
+
+
 def test_a_signed_counter_and_multiplexed_samples(tmp_path):
     dbc = (CONFIG / "devices" / "triaxial-accelerometer.dbc").read_text(encoding="utf-8")
     dbc = dbc.replace("Sequence : 0|8@1+", "Sequence : 0|8@1-")

@@ -570,6 +570,12 @@ def test_secrets_are_not_repeated():
     assert caught.value.__cause__ is None
 
 
+def test_a_password_in_an_address_that_is_none():
+    text, _ = changed(LAVAL, ("mqtts://broker", "daq:hunter2@broker"))
+    problem = next(item for item in problems_of(text) if item.key == "mqtt.url")
+    assert problem.value == '"***@broker.example:8883"'
+
+
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
