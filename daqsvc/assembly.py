@@ -250,4 +250,5 @@ def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
         password_file=None if given.password_file is None else machine.resolve(given.password_file),
         keepalive_s=given.keepalive_s,
         topic_root=given.topic_root,
+        protocol=given.protocol,
     )

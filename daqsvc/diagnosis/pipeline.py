@@ -62,7 +62,7 @@ class Pipeline:
         threads: int = 2,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
-        self._detectors = tuple(detectors)
+        self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
         self._report = report
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
@@ -75,14 +75,14 @@ class Pipeline:
     async def warm(self) -> None:
         """Compile every kernel before the first sample comes."""
         loop = asyncio.get_running_loop()
-        for detector in self._detectors:
+        for detector in self.detectors:
             await loop.run_in_executor(self._pool, detector.warm)
 
     async def run(self) -> None:
         """Process until every ring is closed and every whole block in it is processed."""
         try:
             async with asyncio.TaskGroup() as group:
-                for detector in self._detectors:
+                for detector in self.detectors:
                     group.create_task(self._follow(detector), name=f"detector {detector.name}")
         finally:
             # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.

@@ -158,6 +158,9 @@ class Mqtt(Section):
     keepalive_s: Annotated[int, Field(ge=1, le=65535)] = Field(
         default=30, description="how soon the broker notices that the box is gone"
     )
+    protocol: Literal["auto", "5", "3.1.1"] = Field(
+        default="auto", description="MQTT version; auto asks for 5 and takes 3.1.1 if that is refused"
+    )
     topic_root: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
         default="daqsvc", description="first part of every topic"
     )

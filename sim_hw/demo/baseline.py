@@ -1,0 +1,55 @@
+"""Setpoints from a recording of the healthy machine."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from sim_hw.demo.machines import Setpoints
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sim_hw.recordings import Recording
+
+WINDOW_S = 0.5
+ALERT = 1.5
+DANGER = 3.0
+"""Limits over the loudest window of the healthy machine."""
+
+MOST_RATIO = 1000
+
+
+def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
+    """Alert and danger limits of the RMS of each channel.
+
+    The healthy recording is first brought to the rate of the one it is compared with: at a higher rate
+    it would hold vibration that the other cannot.
+
+    Args:
+        healthy: recording of the healthy machine.
+        rate_hz: rate of the recording to come.
+
+    Raises:
+        ValueError: the recording is shorter than one window.
+    """
+    # Imported here: it takes over a second, and only --baseline needs it.
+    from scipy.signal import resample_poly  # noqa: PLC0415
+
+    ratio = Fraction(rate_hz / healthy.rate_hz).limit_denominator(MOST_RATIO)
+    found = Setpoints()
+    for column, name in enumerate(healthy.names):
+        samples: NDArray[np.float64] = healthy.samples[:, column]
+        if ratio != 1:
+            samples = resample_poly(samples - samples.mean(), ratio.numerator, ratio.denominator)
+        size = round(WINDOW_S * rate_hz)
+        count = len(samples) // size
+        if not count:
+            raise ValueError(
+                f"baseline {healthy.source} lasts {len(samples) / rate_hz:.2f} s; give at least {WINDOW_S} s"
+            )
+        windows = samples[: count * size].reshape(count, size)
+        loudest = float(windows.std(axis=1).max())
+        found[name] = (ALERT * loudest, DANGER * loudest)
+    return found

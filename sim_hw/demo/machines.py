@@ -1,0 +1,157 @@
+"""The machine files of the demo: the paper's rig, and one made to measure for a recording."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.settings import MachineFile, parse_machine_file
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from sim_hw.recordings import Recording
+    from sim_hw.scenario import Scenario
+
+CHANNEL = "daqsvc-demo"
+HEADROOM = 1.25
+"""Full scale of a recording's channel over its largest value."""
+
+PAYLOAD_BYTES = 64
+HEADER_BYTES = 2
+CRC_BYTES = 2
+SAMPLE_BYTES = 2
+MOST_CHANNELS = 8
+
+SENSOR_TYPES: Mapping[str, str] = {
+    "g": "accelerometer",
+    "m/s2": "accelerometer",
+    "mm/s": "velocity",
+    "um": "proximity",
+    "mm": "proximity",
+    "mil": "proximity",
+}
+
+
+class Setpoints(dict[str, tuple[float, float]]):
+    """Alert and danger limit of the RMS, by channel."""
+
+
+def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
+    """The rig of the paper, at the scenario's speed, rate, rotor and noise."""
+    text = resources.files(__package__).joinpath("machines", "laval-rig.toml").read_text("utf-8")
+    rig = parse_machine_file(text, Path("laval-rig.toml"))
+    assert rig.machine.rotor is not None  # noqa: S101 - the file next to this one has it
+    assert rig.pipeline.rotor_bank is not None  # noqa: S101
+    assert rig.mqtt is not None  # noqa: S101
+    plant, rotor = scenario.plant, scenario.plant.rotor
+    described = rig.machine.rotor.model_copy(
+        update={
+            "natural_frequency_hz": plant.speed_rpm / 60.0 / rotor.speed_ratio,
+            "damping_ratio": rotor.damping_ratio,
+            "eccentricity_um": rotor.eccentricity * plant.clearance_um,
+            "heavy_spot_deg": rotor.heavy_spot_deg,
+            "clearance_um": plant.clearance_um,
+            "static_sag_um": rotor.gravity / rotor.stiffness * plant.clearance_um,
+            "contact_stiffness": rotor.contact_stiffness,
+        }
+    )
+    bank = rig.pipeline.rotor_bank.model_copy(update={"noise_um": noise_um})
+    return rig.model_copy(
+        update={
+            "machine": rig.machine.model_copy(update={"speed_rpm": plant.speed_rpm, "rotor": described}),
+            "streams": {"shaft": rig.streams["shaft"].model_copy(update={"rate_hz": scenario.rate_hz})},
+            "pipeline": rig.pipeline.model_copy(update={"rotor_bank": bank}),
+            "mqtt": rig.mqtt.model_copy(update={"url": url}),
+        }
+    )
+
+
+def for_recording(recording: Recording, unit: str, setpoints: Setpoints, url: str) -> MachineFile:
+    """A machine with one sensor per channel of a recording, int16 samples over CAN FD.
+
+    Raises:
+        ValueError: more channels than a frame has room for.
+    """
+    names = recording.names
+    if len(names) > MOST_CHANNELS:
+        raise ValueError(
+            f"{recording.source} gives {len(names)} channels ({', '.join(names)}); "
+            f"choose at most {MOST_CHANNELS} of them with --map"
+        )
+    room = PAYLOAD_BYTES - HEADER_BYTES - CRC_BYTES
+    tables = [
+        f"""schema_version = 1
+site = "demo"
+box = "virtual"
+[machine]
+name = "recorded-machine"
+description = {json.dumps(str(recording.source))}
+speed_rpm = 1800.0
+[buses.can0]
+driver = "can"
+interface = "virtual"
+channel = "{CHANNEL}"
+fd = true
+[streams.recording]
+bus = "can0"
+rate_hz = {float(recording.rate_hz)!r}
+[streams.recording.layout]
+id = 0x201
+length = {PAYLOAD_BYTES}
+counter = {{ byte = 0, bits = 16, counts = "samples" }}
+first_byte = {HEADER_BYTES}
+samples_per_frame = {room // (SAMPLE_BYTES * len(names))}
+crc_byte = {PAYLOAD_BYTES - CRC_BYTES}
+[pipeline]
+ring_s = 10.0
+[pipeline.levels]
+window_s = 0.5
+velocity_band_hz = [10.0, {min(1000.0, 0.4 * recording.rate_hz)!r}]
+[mqtt]
+url = "{url}"
+insecure = true
+protocol = "3.1.1"
+"""
+    ]
+    for column, name in enumerate(names):
+        scale = _scale(recording.samples[:, column])
+        tables.append(
+            f"""[[streams.recording.layout.channels]]
+name = "{name}"
+type = "int16"
+scale = {scale!r}
+[[sensors]]
+name = "{name}"
+type = "{SENSOR_TYPES[unit]}"
+stream = "recording"
+channel = "{name}"
+unit = "{unit}"
+{"gap_ok_v = [-18.0, -2.0]" if SENSOR_TYPES[unit] == "proximity" else ""}
+"""
+        )
+        if name in setpoints:
+            alert, danger = setpoints[name]
+            tables.append(
+                f"""[[alarms]]
+name = "vibration-{name}"
+sensor = "{name}"
+measure = "rms"
+alert = {alert!r}
+danger = {danger!r}
+deadband = {0.05 * alert!r}
+"""
+            )
+    return parse_machine_file("".join(tables), Path("recorded-machine.toml"))
+
+
+def _scale(samples: NDArray[np.float64]) -> float:
+    """Worth of one count: a power of two, so that scaling is exact in binary."""
+    largest = float(np.nanmax(np.abs(samples))) or 1.0
+    return float(2.0 ** np.ceil(np.log2(largest * HEADROOM / 2**15)))

@@ -1,0 +1,254 @@
+"""One run of the demo: a simulated device, the whole service, a broker, and a consumer behind it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import can
+
+from daqsvc import assembly
+from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.service import Service
+from sim_hw.demo.broker import EmbeddedBroker
+from sim_hw.demo.listener import Listener
+from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.pacing import DrivenPacer, RealTimePacer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.settings import MachineFile
+    from sim_hw.demo.listener import Received
+    from sim_hw.link_faults import LinkFaults
+    from sim_hw.nodes.pacing import Pacer
+    from sim_hw.scenario import Onset
+
+LINK_UP_S = 20.0
+LAST_FRAMES_S = 5.0
+
+
+class DemoError(Exception):
+    """The demo cannot run, and why."""
+
+
+@dataclass(frozen=True)
+class Script:
+    """What to play, and to whom.
+
+    Attributes:
+        title: what a person reads.
+        machine: makes the machine file, given the address of the broker.
+        stream: name of the stream that is played.
+        samples: ``[n, channels]`` in the units of the stream's sensors.
+        rate_hz: samples per second.
+        onsets: what changes when; empty for a recording.
+        samples_per_rev: to count delays in revolutions; None if the shaft is not known.
+        faults: of the link.
+        seed: of everything random, to be told in the summary.
+    """
+
+    title: str
+    machine: Callable[[str], MachineFile]
+    stream: str
+    samples: NDArray[np.float64]
+    rate_hz: float
+    onsets: Sequence[Onset] = ()
+    samples_per_rev: float | None = None
+    faults: LinkFaults | None = None
+    seed: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasts in simulated time."""
+        return len(self.samples) / self.rate_hz
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of a run.
+
+    Attributes:
+        diagnoses: payloads of the diagnoses that changed a decision, in order of arrival.
+        figures: the service's last figures.
+        injected: what the link did to the frames, by fault.
+        frames_sent: frames that went onto the bus.
+        samples_sent: samples that were played.
+        messages: messages that the consumer got from the broker.
+        complete: whether the consumer heard the service say goodbye.
+        alarms: alarm events that it got.
+        real_s: how long the playing took.
+    """
+
+    diagnoses: list[dict[str, Any]] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+    injected: dict[str, int] = field(default_factory=dict)
+    frames_sent: int = 0
+    samples_sent: int = 0
+    messages: int = 0
+    complete: bool = False
+    alarms: int = 0
+    real_s: float = 0.0
+
+
+class Session:
+    """Plays a script.
+
+    Args:
+        script: what to play.
+        speed: simulated over real time; 1 for real time, on the real clock.
+        broker_url: an MQTT broker; None to start one inside the process.
+        hear: called with each message that came back from the broker.
+    """
+
+    def __init__(
+        self,
+        script: Script,
+        *,
+        speed: float,
+        broker_url: str | None,
+        hear: Callable[[Received], None],
+    ) -> None:
+        self.script = script
+        self.speed = speed
+        self.service: Service | None = None
+        self.node: CanNode | None = None
+        self.outcome = Outcome()
+        self._broker_url = broker_url
+        self._hear = hear
+
+    async def run(self) -> Outcome:
+        """Play it from the beginning to the end.
+
+        Raises:
+            DemoError: the broker cannot be reached, or the service failed.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            url = self._broker_url
+            if url is None:
+                url = (await stack.enter_async_context(EmbeddedBroker())).url
+            machine = self.script.machine(url)
+            store = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="daqsvc-demo-")))
+            listener = Listener(url, f"daqsvc/{machine.site}/{machine.box}", self._take)
+            listening = await stack.enter_async_context(_task(listener.run()))
+            await _first(listener.subscribed(), listening, f"the broker {url} does not answer")
+            await self._serve(machine, store)
+            self.outcome.complete = await listener.farewell()
+            self.outcome.messages = listener.messages
+        return self.outcome
+
+    async def _serve(self, machine: MachineFile, store: Path) -> None:
+        clock = SystemClock() if self.speed == 1 else DrivenClock()
+        service = self.service = Service(machine, store, clock)
+        stop = asyncio.Event()
+        async with _task(service.run(stop)) as running:
+            await _first(service.ready.wait(), running, "the service did not start")
+            await _first(_links_up(service), running, "bus and broker did not come up")
+            channel = machine.buses["can0"].model_dump()["channel"]
+            with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
+                await self._play(bus, service, clock)
+            await self._last_frames(service)
+            stop.set()
+            await running
+        self.outcome.figures = service.figures()
+
+    async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
+        script = self.script
+        layout = assembly.frame_layout(service.machine, script.stream)
+        node = self.node = CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults)
+        pacer: Pacer
+        if isinstance(clock, DrivenClock):
+            block = max((d.block for d in service.pipeline.detectors), default=0)
+            limit = 2 * block + round(0.1 * script.rate_hz)
+            pacer = DrivenPacer(clock, self.backlog, limit, speed=self.speed)
+        else:
+            pacer = RealTimePacer(clock)
+        begun_s = asyncio.get_running_loop().time()
+        await node.play(pacer)
+        self.outcome.real_s = asyncio.get_running_loop().time() - begun_s
+        self.outcome.frames_sent, self.outcome.samples_sent = node.frames_sent, node.samples_sent
+        done = node.injected
+        self.outcome.injected = {
+            "dropped": done.dropped,
+            "duplicated": done.duplicated,
+            "reordered": done.reordered,
+            "corrupted": done.corrupted,
+        }
+
+    def counters(self) -> StreamCounters | None:
+        """Counters of the stream that is played, once there is a service."""
+        if self.service is None:
+            return None
+        for driver in self.service.drivers:
+            if self.script.stream in driver.streams:
+                return driver.streams[self.script.stream][0]
+        return None
+
+    def backlog(self) -> int:
+        """Samples that have been sent and not yet been diagnosed."""
+        counters = self.counters()
+        if self.service is None or self.node is None or counters is None:
+            return 0
+        on_the_way = self.node.samples_sent - counters.samples_received - counters.samples_lost
+        return on_the_way + self.service.pipeline.behind_samples
+
+    async def _last_frames(self, service: Service) -> None:
+        """Let the frames that are still on the bus arrive."""
+        counters = self.counters()
+        assert counters is not None  # noqa: S101 - the script's stream is in its machine file
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LAST_FRAMES_S):
+                await _until(lambda: counters.frames_received >= self.outcome.frames_sent)
+                block = max((d.block for d in service.pipeline.detectors), default=0)
+                await _until(lambda: service.pipeline.behind_samples <= block)
+
+    def _take(self, message: Received) -> None:
+        if message.kind == "alarm":
+            self.outcome.alarms += 1
+        if message.kind == "diagnosis" and message.payload["changed"]:
+            self.outcome.diagnoses.append(message.payload)
+        self._hear(message)
+
+
+async def _links_up(service: Service) -> None:
+    publisher = service.publisher
+    await _until(lambda: all(driver.link.state == "up" for driver in service.drivers))
+    await _until(lambda: publisher is None or publisher.counters.connected)
+
+
+async def _until(true: Callable[[], bool]) -> None:
+    while not true():  # noqa: ASYNC110 - counters have no event to wait for
+        await asyncio.sleep(0.01)
+
+
+async def _first(wanted: Any, task: asyncio.Task[None], failure: str) -> None:
+    """Wait for ``wanted``, unless ``task`` fails before or it takes too long."""
+    waiting = asyncio.ensure_future(wanted)
+    try:
+        await asyncio.wait({waiting, task}, timeout=LINK_UP_S, return_when=asyncio.FIRST_COMPLETED)
+        if task.done() and not task.cancelled() and (error := task.exception()) is not None:
+            raise DemoError(f"{failure}: {error}") from error
+        if not waiting.done():
+            raise DemoError(f"{failure} within {LINK_UP_S:g} s")
+    finally:
+        waiting.cancel()
+
+
+@contextlib.asynccontextmanager
+async def _task(work: Any) -> AsyncIterator[asyncio.Task[None]]:
+    """A task that is cancelled at the end, if it still runs."""
+    task = asyncio.create_task(work)
+    try:
+        yield task
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task

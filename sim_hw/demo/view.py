@@ -1,0 +1,213 @@
+"""What a person sees of the demo: a live view in the terminal, lines in a pipe, and a summary."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from sim_hw.demo.summary import ROTOR_BANK
+
+if TYPE_CHECKING:
+    from types import TracebackType
+    from typing import Self
+
+    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Script
+
+LAST_ALARMS = 8
+BAR = 28
+PER_SECOND = 8
+COLOURS = {"normal": "green", "alert": "yellow", "danger": "red"}
+
+
+class View:
+    """Shows messages as they come: live in a terminal, else a line for each alarm.
+
+    Args:
+        script: what is played.
+        speed: at which speed.
+        console: where to.
+    """
+
+    def __init__(self, script: Script, speed: float, console: Console | None = None) -> None:
+        self._script = script
+        self._speed = speed
+        self._console = console or Console()
+        self._levels: dict[str, dict[str, Any]] = {}
+        self._bank: dict[str, Any] | None = None
+        self._alarms: deque[dict[str, Any]] = deque(maxlen=LAST_ALARMS)
+        self._status: dict[str, Any] | None = None
+        self._start_ns: int | None = None
+        self._now_ns = 0
+        self._live = Live(
+            console=self._console, refresh_per_second=PER_SECOND, get_renderable=self.picture, transient=True
+        )
+
+    def __enter__(self) -> Self:
+        self._console.print(Text(self._script.title, style="bold"))
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+            if exc is None:
+                self._console.print(self.picture())
+
+    def hear(self, message: Received) -> None:
+        """Take a message in."""
+        payload = message.payload
+        self._now_ns = max(self._now_ns, payload["monotonic_ns"])
+        if message.kind == "diagnosis":
+            if payload["detector"] == ROTOR_BANK:
+                self._bank = payload
+            else:
+                self._levels[payload["detector"].removeprefix("levels/")] = payload
+            if self._start_ns is None:
+                self._start_ns = payload["monotonic_ns"]
+        elif message.kind == "alarm":
+            self._alarms.append(payload)
+            if not self._console.is_terminal:
+                self._console.print(self._alarm_line(payload), soft_wrap=True)
+        elif message.kind == "status":
+            self._status = payload["figures"]
+
+    def picture(self) -> Group:
+        """The view as it is now."""
+        parts: list[Any] = [Panel(self._channels(), title="channels", title_align="left")]
+        if self._bank is not None:
+            title = f"rotor: {self._bank['decision']}"
+            parts.append(Panel(self._modes(self._bank), title=title, title_align="left"))
+        alarms = [self._alarm_line(alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
+        parts.append(Panel(Group(*alarms), title="alarms, as they came from the broker", title_align="left"))
+        parts.append(Panel(self._health(), title="link and loop", title_align="left"))
+        return Group(*parts)
+
+    def _seconds(self, t_ns: int) -> float:
+        return 0.0 if self._start_ns is None else (t_ns - self._start_ns) / 1e9
+
+    def _channels(self) -> Table:
+        table = Table(box=None, pad_edge=False, expand=True)
+        table.add_column("sensor")
+        for title in ("RMS", "peak", "crest", "velocity RMS", "gap"):
+            table.add_column(title, justify="right")
+        table.add_column("state")
+        for sensor, payload in sorted(self._levels.items()):
+            values = payload["statistics"]
+            unit = payload.get("units", {}).get("rms", "")
+            state = (
+                payload["decision"] if payload["quality"] == "good" else payload["quality"].replace("_", " ")
+            )
+            colour = COLOURS.get(payload["decision"], "dim") if payload["quality"] == "good" else "magenta"
+            table.add_row(
+                sensor,
+                _figure(values.get("rms"), unit),
+                _figure(values.get("peak"), unit),
+                _figure(values.get("crest_factor"), ""),
+                _figure(values.get("velocity_rms"), "mm/s"),
+                _figure(values.get("gap_voltage"), "V"),
+                Text(state, style=colour),
+            )
+        if not self._levels:
+            table.add_row(Text("waiting for the first window", style="dim"))
+        return table
+
+    def _modes(self, bank: dict[str, Any]) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for mode, probability in bank["probabilities"].items():
+            filled = round((probability or 0.0) * BAR)
+            declared = mode == bank["decision"]
+            colour = COLOURS[bank["severity"]] if declared else "blue"
+            bar = Text("█" * filled, style=colour) + Text("░" * (BAR - filled), style="dim")
+            table.add_row(
+                Text(mode, style="bold" if declared else ""),
+                bar,
+                f"{probability or 0.0:6.3f}",
+                Text("declared", style=f"bold {colour}") if declared else "",
+            )
+        turns = bank["revolutions"]
+        table.add_row("", Text("" if turns is None else f"revolution {turns:.0f}", style="dim"), "", "")
+        return table
+
+    def _alarm_line(self, alarm: dict[str, Any]) -> Text:
+        at = f"{self._seconds(alarm['cause']['monotonic_ns']):8.2f} s  "
+        line = Text(at, style="dim")
+        line.append(f"{alarm['level']:<7}", style=COLOURS[alarm["level"]])
+        line.append(f" {alarm['alarm']} {alarm['kind']}: {alarm['message']}")
+        return line
+
+    def _health(self) -> Table:
+        table = Table.grid(padding=(0, 3))
+        if self._status is None:
+            table.add_row(Text("waiting for the first status", style="dim"))
+            return table
+        for name, stream in self._status["streams"].items():
+            table.add_row(
+                f"stream {name}",
+                f"{stream['samples_received']:,} samples",
+                Text(f"{stream['samples_lost']:,} lost", style="red" if stream["samples_lost"] else "green"),
+                f"{stream['frames_duplicate']} repeated, {stream['frames_reordered']} overtaken, "
+                f"{stream['frames_corrupt']} corrupt",
+                f"jitter {stream['jitter_ms']:.2f} ms",
+            )
+        lag = self._status["loop_lag_ms"]
+        mqtt = self._status["mqtt"]
+        table.add_row(
+            "event loop",
+            f"lag p50 {lag['p50']:.2f} ms",
+            f"p99 {lag['p99']:.2f} ms",
+            f"MQTT {mqtt.get('acknowledged', 0)} acknowledged, {self._status['outbox']['depth']} waiting",
+            f"{self._seconds(self._now_ns):.1f} s of {self._script.duration_s:.1f} s, speed {self._speed:g}",
+        )
+        return table
+
+    def show_summary(self, summary: dict[str, Any]) -> None:
+        """Print the summary."""
+        if summary["onsets"]:
+            table = Table(title="what happened, and when it was said", title_justify="left")
+            for title in ("mode", "onset (rev)", "declared (rev)", "delay (rev)"):
+                table.add_column(title, justify="left" if title == "mode" else "right")
+            for row in summary["onsets"]:
+                table.add_row(
+                    row["mode"],
+                    f"{row['onset_rev']:.2f}",
+                    *(
+                        ("never", "-")
+                        if row["declared_rev"] is None
+                        else (f"{row['declared_rev']:.2f}", f"{row['delay_rev']:.2f}")
+                    ),
+                )
+            self._console.print(table)
+            self._console.print(f"wrong declarations: {summary['wrong_declarations']}")
+        samples, frames, lag = summary["samples"], summary["frames"], summary["loop_lag_ms"]
+        self._console.print(
+            f"samples: {samples['sent']:,} sent, {samples['received']:,} received, {samples['lost']:,} lost, "
+            f"{samples['skipped_by_detectors']:,} skipped"
+        )
+        if any(frames["injected"].values()):
+            for what in ("injected", "counted"):
+                told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())
+                self._console.print(f"link faults {what}: {told}")
+        self._console.print(
+            f"event loop lag: p50 {lag['p50']:.2f} ms, p99 {lag['p99']:.2f} ms, max {lag['max']:.2f} ms"
+        )
+        self._console.print(
+            f"{summary['alarm_events']} alarm events among {summary['messages']} messages "
+            f"through the broker; {summary['simulated_s']:.1f} s played in {summary['real_s']:.1f} s"
+        )
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{value:.3g} {unit}".rstrip()
