@@ -6,26 +6,18 @@ import sys
 from pathlib import Path
 
 import pytest
+from machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
-from daqsvc.settings import MachineFileError, describe, load_machine_file, parse_machine_file
+from daqsvc.settings import describe, load_machine_file, parse_machine_file
 from daqsvc.settings.models import DbcLayout, LevelAlarm, PlainLayout
 from daqsvc.settings.wire import frame_time
 
-CONFIG = Path(__file__).parents[2] / "config"
-EXAMPLES = sorted((CONFIG / "machines").glob("*.toml"))
-TRIAXIAL = CONFIG / "machines" / "dbc-triaxial.toml"
+CONFIG = MACHINES.parent
+EXAMPLES = sorted(MACHINES.glob("*.toml"))
 
 
-def variant(old, new, path=TRIAXIAL):
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    return text.replace(old, new, 1)
-
-
-def problems_of(text, path=TRIAXIAL):
-    with pytest.raises(MachineFileError) as caught:
-        parse_machine_file(text, path)
-    return caught.value.problems
+def variant(old, new):
+    return changed(TRIAXIAL, (old, new))[0]
 
 
 def test_there_are_examples_to_check():
@@ -63,7 +55,7 @@ def test_the_device_files_are_all_used():
 
 
 def test_the_laval_rig_as_it_is_read():
-    machine = load_machine_file(CONFIG / "machines" / "laval-rig.toml")
+    machine = load_machine_file(LAVAL)
     layout = machine.streams["shaft"].layout
     assert isinstance(layout, PlainLayout)
     assert layout.channel_names == ("x", "y", "kph")
@@ -154,14 +146,14 @@ def test_what_the_dbc_file_says():
     ],
 )
 def test_a_layout_that_the_dbc_file_does_not_bear_out(old, new, key, message, remedy):
-    found = {problem.key: problem for problem in problems_of(variant(old, new))}
+    found = {problem.key: problem for problem in problems_of(variant(old, new), TRIAXIAL)}
     problem = found[f"streams.housing.{key}"]
     assert message in problem.message
     assert remedy in problem.remedy
 
 
 def test_a_sensor_of_no_type_beside_a_dbc_file():
-    (problem,) = problems_of(variant('type = "accelerometer"', "", TRIAXIAL))
+    (problem,) = problems_of(variant('type = "accelerometer"', ""), TRIAXIAL)
     assert problem.key == "sensors[0].type"
 
 
@@ -195,7 +187,7 @@ def test_cantools_is_only_needed_for_dbc_files(monkeypatch):
     for path in EXAMPLES:
         if path != TRIAXIAL:
             load_machine_file(path)
-    (problem,) = problems_of(TRIAXIAL.read_text(encoding="utf-8"))
+    (problem,) = problems_of(TRIAXIAL.read_text(encoding="utf-8"), TRIAXIAL)
     assert problem.key == "streams.housing.layout.dbc"
     assert problem.remedy == "pip install 'daqsvc[dbc]'"
 
@@ -235,5 +227,5 @@ def test_frames_per_second_on_a_full_bus(length, bitrate, data_bitrate, fewest_p
 
 
 def test_bus_shares_add_up():
-    described = describe(load_machine_file(CONFIG / "machines" / "motor-accelerometer.toml"))
+    described = describe(load_machine_file(MOTOR))
     assert "load about 13 to 16 % of the bus" in described  # 400 frames/s of 2466 to 3003
