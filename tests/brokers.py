@@ -106,17 +106,15 @@ class Received:
 class Consumer:
     """An independent subscriber: paho on its own thread, with MQTT 3.1.1, QoS 1."""
 
-    def __init__(self, port: int, topic: str = "#", *, reconnects: bool = False) -> None:
+    def __init__(self, port: int, topic: str = "#") -> None:
         self.messages: list[Received] = []
         self._topic = topic
         self._subscribed = threading.Event()
         self._client = paho.Client(
             paho.CallbackAPIVersion.VERSION2,
             client_id=f"consumer-{time.monotonic_ns()}",
-            clean_session=not reconnects,
-            reconnect_on_failure=reconnects,
+            reconnect_on_failure=False,
         )
-        self._client.reconnect_delay_set(1, 1)
         self._client.on_connect = lambda client, *_: client.subscribe(self._topic, qos=1)
         self._client.on_subscribe = lambda *_: self._subscribed.set()
         self._client.on_message = self._take
@@ -127,15 +125,15 @@ class Consumer:
             Received(message.topic, json.loads(message.payload) if message.payload else {}, message.retain)
         )
 
-    def __enter__(self) -> Self:
-        self._client.connect(LOOPBACK, self._port)
+    async def __aenter__(self) -> Self:
+        await asyncio.to_thread(self._client.connect, LOOPBACK, self._port)
         self._client.loop_start()
-        assert self._subscribed.wait(PATIENCE_S), "the consumer could not subscribe"
+        assert await asyncio.to_thread(self._subscribed.wait, PATIENCE_S), "the consumer could not subscribe"
         return self
 
-    def __exit__(self, *_: object) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._client.disconnect()
-        self._client.loop_stop()
+        await asyncio.to_thread(self._client.loop_stop)
 
     def on(self, part: str) -> list[Received]:
         return [message for message in self.messages if part in message.topic]
@@ -151,12 +149,17 @@ async def eventually(condition: Callable[[], object], what: str) -> None:
 
 
 class TcpProxy:
-    """Stands between a client and a broker, and can go deaf or cut the wire."""
+    """Stands between a client and a broker.
+
+    While it is ``blocked`` it ends every new connection; while it is ``deaf`` it swallows what the
+    broker says; `cut` ends the connections that there are.
+    """
 
     def __init__(self, target_port: int) -> None:
         self._target_port = target_port
         self._server: Any = None
         self._writers: list[Any] = []
+        self.blocked = False
         self.deaf = False
 
     async def __aenter__(self) -> Self:
@@ -179,6 +182,9 @@ class TcpProxy:
         self._writers.clear()
 
     async def _connected(self, reader: Any, writer: Any) -> None:
+        if self.blocked:
+            writer.transport.abort()
+            return
         try:
             target_reader, target_writer = await asyncio.open_connection(LOOPBACK, self._target_port)
         except OSError:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import aiomqtt
 
 from daqsvc.publish.connection import Connection, NoConsentError
+from daqsvc.publish.delivery import IN_FLIGHT, Delivery
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.topics import Topics
 
@@ -21,17 +22,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.outbox.store import Outbox, OutboxMessage
+    from daqsvc.outbox.store import Outbox
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
-
-IN_FLIGHT = 20
-"""QoS 1 messages that may wait for their PUBACK at a time."""
-
-READ_AHEAD = 200
-"""Messages that are read from the outbox at a time."""
 
 STABLE_S = 10.0
 """A connection that lasted this long has earned a quick first retry."""
@@ -95,6 +90,14 @@ class PublishCounters:
     def reconnects(self) -> int:
         """Connections after the first."""
         return max(self.connections - 1, 0)
+
+    def count_published(self) -> None:
+        """One more was handed to the broker."""
+        self.published += 1
+
+    def count_acknowledged(self) -> None:
+        """One more PUBACK came."""
+        self.acknowledged += 1
 
 
 class Backoff:
@@ -252,7 +255,15 @@ class MqttPublisher:
     async def _serve(self, connection: Connection) -> None:
         """Publish over one connection until it is lost or the publisher stops."""
         since_s = asyncio.get_running_loop().time()
-        drain = asyncio.create_task(self._drain(connection), name="mqtt-outbox")
+        delivery = Delivery(
+            self._outbox,
+            connection,
+            self.topics.base,
+            self._stopping,
+            on_sent=self.counters.count_published,
+            on_acknowledged=self.counters.count_acknowledged,
+        )
+        drain = asyncio.create_task(delivery.run(), name="mqtt-outbox")
         telemetry = asyncio.create_task(self._send_telemetry(connection), name="mqtt-telemetry")
         lost = asyncio.create_task(connection.lost(), name="mqtt-lost")
         tasks = {drain, telemetry, lost}
@@ -279,48 +290,6 @@ class MqttPublisher:
             self._backoff.reset()
         await self._unless_stopping(asyncio.sleep(self._backoff.next_s()))
 
-    async def _drain(self, connection: Connection) -> None:
-        """Deliver the outbox in order; ends when the publisher stops and nothing is left.
-
-        A message counts as sent only when all before it are, so whatever goes wrong, the order in which
-        consumers see new messages is that of the outbox.
-        """
-        ready: deque[OutboxMessage] = deque(
-            message
-            for message in await self._outbox.retained()
-            if message.topic.startswith(f"{self.topics.base}/")  # a broker may have forgotten them
-        )
-        in_flight: deque[tuple[int, asyncio.Task[None]]] = deque()
-        after = 0
-        try:
-            while True:
-                if not ready:
-                    ready.extend(await self._outbox.pending(after, READ_AHEAD))
-                if not ready and not in_flight:
-                    if self._stopping.is_set():
-                        return
-                    ready.extend(
-                        await self._unless_stopping(self._outbox.next_pending(after, READ_AHEAD)) or ()
-                    )
-                while ready and len(in_flight) < IN_FLIGHT:
-                    message = ready.popleft()
-                    after = max(after, message.sequence)
-                    delivery = connection.deliver(message.topic, message.payload, retain=message.retain)
-                    in_flight.append((message.sequence, asyncio.create_task(delivery)))
-                    self.counters.published += 1
-                while in_flight:
-                    sequence, task = in_flight[0]
-                    await task
-                    in_flight.popleft()
-                    self.counters.acknowledged += 1
-                    self._outbox.mark_sent(sequence)
-                    if not in_flight or not in_flight[0][1].done():
-                        break
-        finally:
-            for _, task in in_flight:
-                task.cancel()
-            await asyncio.gather(*(task for _, task in in_flight), return_exceptions=True)
-
     async def _send_telemetry(self, connection: Connection) -> None:
         while True:
             while not self._telemetry:
@@ -335,15 +304,17 @@ class MqttPublisher:
             self.counters.telemetry_sent += 1
 
     async def _say_goodbye(self, connection: Connection) -> None:
+        """Publish that the box goes offline; if that fails, the last will says so."""
+        offline = self._availability("offline", "stopped")
         try:
             async with asyncio.timeout(max(self._left_s(), GOODBYE_S / 2)):
-                await connection.deliver(
-                    self.topics.availability, self._availability("offline", "stopped"), retain=True
-                )
-        except (aiomqtt.MqttError, TimeoutError) as error:
-            log.warning("MQTT broker %s was not told that the box goes offline: %s", self._name, error)
-            return  # without a goodbye the broker publishes the last will
-        await connection.close(max(self._left_s(), GOODBYE_S / 2))
+                await connection.deliver(self.topics.availability, offline, retain=True)
+        except TimeoutError:
+            log.warning("MQTT broker %s did not answer to the goodbye; the last will tells", self._name)
+        except aiomqtt.MqttError as error:
+            log.warning("MQTT broker %s did not take the goodbye: %s; the last will tells", self._name, error)
+        else:
+            await connection.close(max(self._left_s(), GOODBYE_S / 2))
 
     async def _unless_stopping(self, work: Coroutine[Any, Any, _T]) -> _T | None:
         """The result of ``work``; None if the publisher is told to stop before."""
