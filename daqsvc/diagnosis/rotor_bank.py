@@ -365,10 +365,13 @@ def _stands_still(probes: Floats) -> bool:
 def _at_an_extreme(signal: Floats) -> float | None:
     """The extreme value that a signal is clipped at, or None.
 
-    A coarse converter repeats its values everywhere, not only at the extremes; it does not count.
+    A coarse converter repeats its values between the extremes as well, and a sine only twice as often at
+    its top as elsewhere: a clipped signal repeats its extreme four times as often as any other value.
     """
-    n = len(signal)
-    for extreme in (float(signal.min()), float(signal.max())):
-        if np.count_nonzero(signal == extreme) >= max(3.0, _CLIPPED * n):
-            return extreme if len(np.unique(signal)) >= n / 3 else None
+    values, counts = np.unique(signal, return_counts=True)
+    usual = int(counts[1:-1].max(initial=0))
+    least = max(_CLIPPED * len(signal), 4.0 * usual, 3.0)
+    for extreme in (0, -1):
+        if counts[extreme] >= least:
+            return float(values[extreme])
     return None
