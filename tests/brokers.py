@@ -46,12 +46,17 @@ def free_port() -> int:
 class Mosquitto:
     """A Mosquitto process on a loopback port, without persistence: a restart forgets everything."""
 
-    def __init__(self, directory: Path, *, config: str = "", acl: str = "") -> None:
+    def __init__(self, directory: Path, *, config: str = "", acl: str = "", anonymous: bool = True) -> None:
         self.port = free_port()
         self._program = mosquitto_program()
         self._process: subprocess.Popen[bytes] | None = None
         self._config = directory / "mosquitto.conf"
-        lines = [f"listener {self.port} {LOOPBACK}", "allow_anonymous true", "persistence false", config]
+        lines = [
+            f"listener {self.port} {LOOPBACK}",
+            f"allow_anonymous {'true' if anonymous else 'false'}",
+            "persistence false",
+            config,
+        ]
         if acl:
             (directory / "acl").write_text(acl)
             lines.append(f"acl_file {directory / 'acl'}")
@@ -87,7 +92,7 @@ class Mosquitto:
 
 
 @contextlib.contextmanager
-def running_mosquitto(directory: Path, **options: str) -> Iterator[Mosquitto]:
+def running_mosquitto(directory: Path, **options: Any) -> Iterator[Mosquitto]:
     broker = Mosquitto(directory, **options)
     broker.start()
     try:

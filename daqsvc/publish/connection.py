@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import ssl
 import threading
 from typing import TYPE_CHECKING, Any
 
 import aiomqtt
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from paho.mqtt.client import Client, DisconnectFlags
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
@@ -29,6 +32,31 @@ class NoConsentError(aiomqtt.MqttError):
 
 class PublishRefusedError(aiomqtt.MqttError):
     """The broker has answered a publication with a reason why it will not take it (MQTT 5 only)."""
+
+
+def tls_context(ca_file: Path | None) -> ssl.SSLContext:
+    """A context that verifies the broker's certificate and host name; reads files.
+
+    Args:
+        ca_file: certificate authorities in PEM; None for those of the system.
+
+    Raises:
+        OSError: the file cannot be read, or holds no certificate.
+    """
+    context = ssl.create_default_context(cafile=ca_file)
+    context.sslsocket_class = _TidySocket
+    return context
+
+
+class _TidySocket(ssl.SSLSocket):
+    """Closes itself when the handshake fails; paho would leave it to the garbage collector."""
+
+    def do_handshake(self, block: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
+        try:
+            super().do_handshake(block)
+        except BaseException:
+            self.close()
+            raise
 
 
 class Connection(aiomqtt.Client):

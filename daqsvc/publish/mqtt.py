@@ -5,19 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-import ssl
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import aiomqtt
 
-from daqsvc.publish.connection import Connection, NoConsentError
+from daqsvc.publish.connection import Connection, NoConsentError, tls_context
 from daqsvc.publish.delivery import IN_FLIGHT, Delivery
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import Coroutine
     from pathlib import Path
 
@@ -239,12 +239,12 @@ class MqttPublisher:
     async def _options(self) -> dict[str, Any]:
         """What a connection needs; certificates and password as the files are now."""
         settings = self._settings
-        password, tls_context = await asyncio.to_thread(_read_credentials, settings)
+        password, context = await asyncio.to_thread(_read_credentials, settings)
         return {
             "identifier": settings.client_id,
             "username": settings.username,
             "password": password,
-            "tls_context": tls_context,
+            "tls_context": context,
             "keepalive": settings.keepalive_s,
             "protocol": self._protocol,
             "will": aiomqtt.Will(
@@ -364,5 +364,5 @@ def _read_credentials(settings: MqttSettings) -> tuple[str | None, ssl.SSLContex
     password = None
     if settings.password_file is not None:
         password = settings.password_file.read_text(encoding="utf-8").rstrip("\r\n")
-    context = ssl.create_default_context(cafile=settings.ca_file) if settings.tls else None
+    context = tls_context(settings.ca_file) if settings.tls else None
     return password, context

@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import json
 import logging
+import random
 
 import pytest
 from brokers import Consumer, TcpProxy, eventually, free_port, running_mosquitto
@@ -16,7 +17,7 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
+from daqsvc.publish.mqtt import Backoff, MqttPublisher, MqttSettings
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
 from daqsvc.publish.topics import Topics
 from sim_hw.demo.broker import EmbeddedBroker
@@ -27,7 +28,13 @@ CLOCK = SystemClock()
 MODES = [("F1", "alert"), ("F1L2", "alert"), ("F1L3", "danger"), ("N", "normal")]
 
 
-@pytest.fixture(params=["mosquitto-5", "mosquitto-3.1.1", "amqtt-3.1.1"])
+@pytest.fixture(
+    params=[
+        pytest.param("mosquitto-5", marks=pytest.mark.mosquitto),
+        pytest.param("mosquitto-3.1.1", marks=pytest.mark.mosquitto),
+        "amqtt-3.1.1",
+    ]
+)
 async def broker(request, tmp_path):
     """A broker's port and the protocol to speak with it."""
     name, protocol = request.param.split("-")
@@ -171,6 +178,7 @@ async def test_the_last_will_speaks_for_a_cut_connection(broker, outbox):
         assert publisher.counters.reconnects == 1
 
 
+@pytest.mark.mosquitto
 async def test_a_broker_that_forgets_everything_costs_nothing(tmp_path, outbox, caplog):
     caplog.set_level(logging.INFO, "daqsvc.publish")
     service, quiet = Service(outbox), Service(outbox, "quiet-alarm")
@@ -203,6 +211,7 @@ async def test_a_broker_that_forgets_everything_costs_nothing(tmp_path, outbox, 
     assert "is back" in back
 
 
+@pytest.mark.mosquitto
 async def test_lost_acknowledgements_only_repeat_ids(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         async with (
@@ -225,6 +234,7 @@ async def test_lost_acknowledgements_only_repeat_ids(tmp_path, outbox):
             assert [m.payload for m in received[:8]] == [m.payload for m in received[8:]]
 
 
+@pytest.mark.mosquitto
 async def test_restart_of_the_service_sends_what_was_left(tmp_path):
     outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
     await outbox.open()
@@ -240,6 +250,7 @@ async def test_restart_of_the_service_sends_what_was_left(tmp_path):
     await outbox.close()
 
 
+@pytest.mark.mosquitto
 async def test_stopping_hands_over_what_is_left(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         async with Consumer(mosquitto.port) as live:
@@ -283,6 +294,7 @@ async def test_a_silent_broker_does_not_hold_up_the_stop(outbox):
             await publisher.stop()
 
 
+@pytest.mark.mosquitto
 async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         async with TcpProxy(mosquitto.port) as wire, publishing(outbox, wire.port) as publisher:
@@ -294,6 +306,7 @@ async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox
     assert len(await outbox.pending(0, 10)) == 4
 
 
+@pytest.mark.mosquitto
 async def test_a_refused_alarm_stays_in_the_outbox(tmp_path, outbox, caplog):
     acl = "topic write daqsvc/lab/edge-1/availability\n"
     with running_mosquitto(tmp_path, acl=acl) as mosquitto:
@@ -311,6 +324,7 @@ async def test_an_old_broker_is_met_with_the_old_protocol(outbox, monkeypatch):
         await eventually(lambda: publisher.counters.connected, "connected by MQTT 3.1.1")
 
 
+@pytest.mark.mosquitto
 async def test_telemetry_without_a_broker_drops_the_oldest_and_counts(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         publisher = MqttPublisher(
@@ -325,3 +339,14 @@ async def test_telemetry_without_a_broker_drops_the_oldest_and_counts(tmp_path, 
             await publisher.stop()
             await running
     assert [message.payload["number"] for message in live.on("/status")] == [7, 8, 9]
+
+
+def test_back_off_grows_to_its_limit_with_full_jitter():
+    backoff = Backoff(first_s=0.8, most_s=30.0, draw=random.Random(1))
+    for limit_s in (0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 30.0, 30.0):
+        assert 0.0 <= backoff.next_s() <= limit_s
+    late = [backoff.next_s() for _ in range(1000)]
+    assert min(late) < 1.0
+    assert max(late) > 29.0
+    backoff.reset()
+    assert backoff.next_s() <= 0.8
