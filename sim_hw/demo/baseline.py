@@ -5,6 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+from sim_hw.demo.errors import DemoError
 from sim_hw.demo.machines import Setpoints
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
         rate_hz: rate of the recording to come.
 
     Raises:
-        ValueError: the recording is shorter than one window.
+        DemoError: the recording is shorter than one window.
     """
     # Imported here: it takes over a second, and only --baseline needs it.
     from scipy.signal import resample_poly  # noqa: PLC0415
@@ -46,7 +47,7 @@ def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
         size = round(WINDOW_S * rate_hz)
         count = len(samples) // size
         if not count:
-            raise ValueError(
+            raise DemoError(
                 f"baseline {healthy.source} lasts {len(samples) / rate_hz:.2f} s; give at least {WINDOW_S} s"
             )
         windows = samples[: count * size].reshape(count, size)

@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sim_hw.demo.errors import DemoError
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
@@ -106,8 +108,8 @@ class DemoCommand:
             logging.getLogger("daqsvc.service").setLevel(logging.ERROR)
         prepare_kernel_cache()
         try:
+            import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
             from daqsvc.settings import MachineFileError  # noqa: PLC0415
-            from sim_hw.demo.session import DemoError  # noqa: PLC0415
             from sim_hw.recordings import RecordingError  # noqa: PLC0415
             from sim_hw.scenario import ScenarioError  # noqa: PLC0415
         except ModuleNotFoundError as error:
@@ -115,7 +117,7 @@ class DemoCommand:
         try:
             script = _script(arguments)
             summary = _play(script, arguments)
-        except (DemoError, MachineFileError, RecordingError, ScenarioError, ValueError) as error:
+        except (DemoError, MachineFileError, RecordingError, ScenarioError) as error:
             return _fail(str(error))
         except KeyboardInterrupt:
             return _fail("interrupted")
@@ -203,7 +205,7 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
         )
         limits = setpoints(healthy, recording.rate_hz)
         if not set(limits) & set(recording.names):
-            raise ValueError(
+            raise DemoError(
                 f"baseline {healthy.source} gives {', '.join(limits)}, the recording "
                 f"{', '.join(recording.names)}; give both the same sensor names with --map and --baseline-map"
             )
@@ -218,7 +220,7 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
 
 def _playable(recording: Recording) -> Recording:
     if recording.nan_count:
-        raise ValueError(
+        raise DemoError(
             f"{recording.source} holds {recording.nan_count} NaN samples, which no device could send; "
             "cut them out or interpolate them"
         )

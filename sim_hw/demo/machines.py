@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.settings import MachineFile, parse_machine_file
+from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -77,11 +78,11 @@ def for_recording(recording: Recording, unit: str, setpoints: Setpoints, url: st
     """A machine with one sensor per channel of a recording, int16 samples over CAN FD.
 
     Raises:
-        ValueError: more channels than a frame has room for.
+        DemoError: more channels than a frame has room for.
     """
     names = recording.names
     if len(names) > MOST_CHANNELS:
-        raise ValueError(
+        raise DemoError(
             f"{recording.source} gives {len(names)} channels ({', '.join(names)}); "
             f"choose at most {MOST_CHANNELS} of them with --map"
         )

@@ -15,6 +15,7 @@ from daqsvc import assembly
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
+from sim_hw.demo.errors import DemoError
 from sim_hw.demo.listener import Listener
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import DrivenPacer, RealTimePacer
@@ -34,10 +35,6 @@ if TYPE_CHECKING:
 
 LINK_UP_S = 20.0
 LAST_FRAMES_S = 5.0
-
-
-class DemoError(Exception):
-    """The demo cannot run, and why."""
 
 
 @dataclass(frozen=True)

@@ -75,8 +75,8 @@ def _frames(outcome: Outcome) -> int:
 def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     per_rev = script.samples_per_rev or 1.0
-    ends = [onset.sample for onset in script.onsets[1:]] + [len(script.samples)]
-    for onset, end in zip(script.onsets, ends, strict=True):
+    for i, onset in enumerate(script.onsets):
+        end = script.onsets[i + 1].sample if i + 1 < len(script.onsets) else len(script.samples)
         at = next((at for mode, at in declared if mode == onset.mode and onset.sample <= at <= end), None)
         rows.append(
             {

@@ -76,7 +76,8 @@ class View:
             else:
                 self._levels[payload["detector"].removeprefix("levels/")] = payload
             if self._start_ns is None:
-                self._start_ns = payload["monotonic_ns"]
+                played_s = payload["window"]["end_index"] / self._script.rate_hz
+                self._start_ns = payload["monotonic_ns"] - round(1e9 * played_s)
         elif message.kind == "alarm":
             self._alarms.append(payload)
             if not self._console.is_terminal:
@@ -145,7 +146,7 @@ class View:
         at = f"{self._seconds(alarm['cause']['monotonic_ns']):8.2f} s  "
         line = Text(at, style="dim")
         line.append(f"{alarm['level']:<7}", style=COLOURS[alarm["level"]])
-        line.append(f" {alarm['alarm']} {alarm['kind']}: {alarm['message']}")
+        line.append(f" {alarm['kind']:<9} {alarm['message']}")
         return line
 
     def _health(self) -> Table:

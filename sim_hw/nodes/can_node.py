@@ -64,6 +64,8 @@ class CanNode:
             plan = faults.plan(frames.t_ns, layout.length)
             self._t_ns, self._payloads = plan.t_ns, frames.payloads[plan.frame] ^ plan.flips
             self._faults = plan.fault
+        # Asked for at every step of a paced run, so counted once.
+        self._frames_done = np.concatenate(([0], np.cumsum(self._faults != Fault.DUPLICATED))).tolist()
         self._played = 0
         self._retries = 0
 
@@ -81,7 +83,8 @@ class CanNode:
     @property
     def samples_sent(self) -> int:
         """Samples, per channel, that were played so far, whatever the link did to them."""
-        return self.injected.frames_in * self._layout.samples_per_frame
+        frames: int = self._frames_done[self._played]
+        return frames * self._layout.samples_per_frame
 
     @property
     def send_retries(self) -> int:

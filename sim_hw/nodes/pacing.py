@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 STEP_NS = 2_000_000
 HOLD_NS = 500_000
+SHORTEST_SLEEP_NS = 1_000_000
 
 
 class Pacer(Protocol):
@@ -134,7 +135,8 @@ class DrivenPacer:
             self._real_start_ns = self._real.monotonic_ns()
         due_ns = self._real_start_ns + int((next_ns - self._start_ns) / self._speed)
         ahead_ns = due_ns - self._real.monotonic_ns()
-        if ahead_ns > 0:
+        # A sleep lasts a millisecond at least: shorter ones are saved up, or they would set the pace.
+        if ahead_ns > SHORTEST_SLEEP_NS:
             await self._real.sleep_ns(ahead_ns)
 
     def _shift_real_start(self, held_since_ns: int) -> None:

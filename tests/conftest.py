@@ -1,0 +1,59 @@
+"""What every test is held to: no task and no thread outlives it. And where the recordings lie."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import os
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import pytest_asyncio
+from hypothesis import settings
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+# The machine that runs this may be slow and shared: what counts is what is right, not when.
+settings.register_profile("daqsvc", deadline=None, print_blob=True)
+settings.load_profile("daqsvc")
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()
+GRACE_S = 2.0
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of recordings; skips if there is none."""
+    if not DATA.is_dir():
+        pytest.skip(f"no recordings at {DATA}; set DAQSVC_DATA to where they are")
+    return DATA
+
+
+@pytest.fixture(autouse=True)
+def _no_leaked_threads() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    until = time.monotonic() + GRACE_S
+    while leaked := [t for t in set(threading.enumerate()) - before if not t.name.startswith("asyncio_")]:
+        if time.monotonic() > until:
+            pytest.fail(f"threads that outlive the test: {[t.name for t in leaked]}")
+        time.sleep(0.01)
+
+
+@pytest_asyncio.fixture
+async def _no_leaked_tasks() -> AsyncIterator[None]:
+    yield
+    leaked = [t for t in asyncio.all_tasks() if t is not asyncio.current_task() and not t.done()]
+    if leaked:
+        pytest.fail(f"tasks that outlive the test: {[t.get_name() for t in leaked]}")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
+            item.fixturenames.insert(0, "_no_leaked_tasks")
