@@ -225,8 +225,9 @@ def _numbers(figures: Mapping[str, Any]) -> dict[str, Any]:
 
 
 async def _cancel(tasks: list[asyncio.Task[Any]]) -> None:
-    for task in tasks:
+    running = [task for task in tasks if not task.done()]
+    for task in running:
         task.cancel()
-    for task, outcome in zip(tasks, await asyncio.gather(*tasks, return_exceptions=True), strict=True):
+    for task, outcome in zip(running, await asyncio.gather(*running, return_exceptions=True), strict=True):
         if isinstance(outcome, Exception):
             logger.error("%s failed while the service stopped", task.get_name(), exc_info=outcome)

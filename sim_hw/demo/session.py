@@ -154,7 +154,7 @@ class Session:
                 await self._play(bus, service, clock)
             await self._last_frames(service)
             stop.set()
-            await running
+            await asyncio.shield(running)
         self.outcome.figures = service.figures()
 
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
@@ -232,7 +232,7 @@ async def _first(wanted: Any, task: asyncio.Task[None], failure: str) -> None:
     try:
         await asyncio.wait({waiting, task}, timeout=LINK_UP_S, return_when=asyncio.FIRST_COMPLETED)
         if task.done() and not task.cancelled() and (error := task.exception()) is not None:
-            raise DemoError(f"{failure}: {error}") from error
+            raise DemoError(f"{failure} ({error})") from error
         if not waiting.done():
             raise DemoError(f"{failure} within {LINK_UP_S:g} s")
     finally:
@@ -241,11 +241,12 @@ async def _first(wanted: Any, task: asyncio.Task[None], failure: str) -> None:
 
 @contextlib.asynccontextmanager
 async def _task(work: Any) -> AsyncIterator[asyncio.Task[None]]:
-    """A task that is cancelled at the end, if it still runs."""
+    """A task that is cancelled at the end, if it still runs; whoever awaits it hears of its failure."""
     task = asyncio.create_task(work)
     try:
         yield task
     finally:
         task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        await asyncio.wait({task})
+        if not task.cancelled():
+            task.exception()

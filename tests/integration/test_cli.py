@@ -1,0 +1,104 @@
+"""The command line, run as a person or as systemd runs it."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from brokers import free_port
+
+CONFIG = Path(__file__).parents[2] / "config" / "machines"
+STOP_S = 2.0
+
+
+def daqsvc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "daqsvc", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("file", sorted(CONFIG.glob("*.toml")), ids=lambda path: path.stem)
+def test_check_says_what_it_understood(file: Path) -> None:
+    done = daqsvc("check", file)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert max(map(len, done.stdout.splitlines())) <= 110
+
+
+def test_check_tells_every_error_with_file_line_key_value_and_remedy(tmp_path: Path) -> None:
+    text = (CONFIG / "laval-rig.toml").read_text()
+    text = text.replace("damping_ratio = 0.18 ", 'damping_ratio = "lots" ', 1)
+    text = re.sub(r"^interface = ", "interfase = ", text, count=1, flags=re.MULTILINE)
+    text = re.sub(r'^stream = "shaft"', 'stream = "shaft2"', text, count=1, flags=re.MULTILINE)
+    bad = tmp_path / "bad.toml"
+    bad.write_text(text)
+    done = daqsvc("check", bad)
+    assert done.returncode == 2
+    for words in ('= "lots"', "interfase", "did you mean interface", '"shaft2"', "Remedy"):
+        assert words in done.stderr
+    lines = text.splitlines()
+    for key in ('interfase = "socketcan"', 'stream = "shaft2"'):
+        number = next(i for i, line in enumerate(lines, 1) if line.startswith(key))
+        assert f"{bad}:{number}:" in done.stderr
+    assert daqsvc("run", bad).returncode == 2
+
+
+def test_check_of_a_file_that_is_not_there_says_so(tmp_path: Path) -> None:
+    done = daqsvc("check", tmp_path / "none.toml")
+    assert done.returncode == 2
+    assert "none.toml" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("verb", [[], ["run"], ["check"], ["demo"]])
+def test_help_reads_well(verb: list[str]) -> None:
+    done = daqsvc(*verb, "--help")
+    assert done.returncode == 0
+    assert done.stdout.startswith("usage: daqsvc")
+    for line in done.stdout.splitlines():
+        assert len(line) <= 100
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_run_stops_within_two_seconds_even_if_the_broker_is_dead(number: int, tmp_path: Path) -> None:
+    text = (CONFIG / "laval-rig.toml").read_text()
+    text = text.replace('interface = "socketcan"', 'interface = "virtual"')
+    text = re.sub(r"^url = .*$", f'url = "mqtt://127.0.0.1:{free_port()}"', text, flags=re.MULTILINE)
+    text = re.sub(r"^(ca_file|username|password_file) = .*$", "", text, flags=re.MULTILINE)
+    if "insecure" not in text:
+        text = re.sub(r"^\[mqtt\]", "[mqtt]\ninsecure = true", text, flags=re.MULTILINE)
+    file = tmp_path / "rig.toml"
+    file.write_text(text)
+    command = [sys.executable, "-m", "daqsvc", "run", str(file), "--store", str(tmp_path / "store"), "-v"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as service:
+        assert service.stderr is not None
+        said: list[str] = []
+        for line in service.stderr:
+            said.append(line)
+            if "watching laval-rig" in line:
+                break
+        else:
+            pytest.fail("".join(said))
+        begun = time.monotonic()
+        service.send_signal(number)
+        # This time is a promise, not a measure of speed: systemd kills what does not keep it.
+        rest = service.stderr.read()
+        assert service.wait(STOP_S) == 0, rest
+        assert time.monotonic() - begun < STOP_S
+    assert "Traceback" not in rest
+    assert rest.strip().endswith("stopped")
+
+
+def test_run_says_which_device_is_absent_where_that_is_an_error(tmp_path: Path) -> None:
+    text = (CONFIG / "laval-rig.toml").read_text()
+    text = re.sub(r'^channel = "can0"', 'channel = "no-such-can"\nstart = "error"', text, flags=re.MULTILINE)
+    text = re.sub(r'^start = "retry".*$', "", text, flags=re.MULTILINE)
+    file = tmp_path / "rig.toml"
+    file.write_text(text)
+    done = daqsvc("run", file, "--store", tmp_path / "store")
+    assert done.returncode == 1
+    assert "CAN bus 'can0' (socketcan no-such-can) cannot be opened" in done.stderr
+    assert "Traceback" not in done.stderr
