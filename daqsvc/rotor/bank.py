@@ -10,7 +10,7 @@ import numpy as np
 
 from daqsvc.rotor import kernels
 from daqsvc.rotor.decision import DecisionRules, Declaration
-from daqsvc.rotor.discretise import ESCAPE_RADIUS, BankMode, at_speed, discretise
+from daqsvc.rotor.discretise import BankMode, at_speed, discretise
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -88,7 +88,7 @@ class ModelBank:
             raise ValueError("rotor bank: the speed is 0; the bank needs a shaft that turns")
         count = len(self.modes)
         self._duration = duration
-        self._usable_squared = (ESCAPE_RADIUS + 6.0 * noise) ** 2
+        self._usable_squared = (kernels.ESCAPE_RADIUS + 6.0 * noise) ** 2
         self._samples_per_rev = max(1, round(2.0 * math.pi / (speed * duration)))
         self._log_prior = self.rules.log_priors(names)
         self._thresholds = self.rules.thresholds(count)

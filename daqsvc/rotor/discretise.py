@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Observers = NDArray[np.void]
 
-ESCAPE_RADIUS = 3.0
-"""No disc gets this many clearances from the centre: beyond it an observer is lost, or a sample wrong."""
-
 _MIN_SUBSTEPS_PER_REV = 128
 _MAX_STEP_TIMES_CONTACT_FREQUENCY = 0.5
 

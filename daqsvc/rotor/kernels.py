@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-from daqsvc.rotor.discretise import ESCAPE_RADIUS
-
 if TYPE_CHECKING:
     from typing import Any
 
@@ -26,6 +24,8 @@ if TYPE_CHECKING:
     Observer = Any  # one element of it: numba makes a record of it
     State = tuple[float, float, float, float]
 
+ESCAPE_RADIUS = 3.0
+"""No disc gets this many clearances from the centre: beyond it an observer is lost, or a sample wrong."""
 _ESCAPE_SQUARED = ESCAPE_RADIUS * ESCAPE_RADIUS
 _PATIENCE = 1.5
 UNDETERMINED = -1
@@ -137,6 +137,57 @@ def change_orbits(before: Observers, after: Observers, cos: float, sin: float, s
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _run_linear(
+    xy: Floats, usable: Flags, cos: Floats, sin: Floats, observer: Observer, state: State, scores: Floats
+) -> State:
+    """A linear observer over a block; its state after it.
+
+    Update and prediction are one step of the closed loop, x+ = F (I - K C) x + F K z: it halves the chain
+    of operations from a state to the next, which is what the time goes into.
+    """
+    a, b, rest_x, rest_y = observer.a, observer.b, observer.rest_x, observer.rest_y
+    xx, xv, vx, vv = observer.xx, observer.xv, observer.vx, observer.vv
+    drive_x = xx * observer.gain_x + xv * observer.gain_v
+    drive_v = vx * observer.gain_x + vv * observer.gain_v
+    closed_xx, closed_vx = xx - drive_x, vx - drive_v
+    weight, log_norm = -0.5 * observer.precision, observer.log_norm
+    dx, du, dy, dv = state
+    for k in range(len(xy)):
+        if usable[k]:
+            zx = xy[k, 0] - (a * cos[k] - b * sin[k] + rest_x)
+            zy = xy[k, 1] - (a * sin[k] + b * cos[k] + rest_y)
+            ex, ey = zx - dx, zy - dy
+            scores[k] = weight * (ex * ex + ey * ey) - log_norm
+            dx, du = closed_xx * dx + (xv * du + drive_x * zx), closed_vx * dx + (vv * du + drive_v * zx)
+            dy, dv = closed_xx * dy + (xv * dv + drive_x * zy), closed_vx * dy + (vv * dv + drive_v * zy)
+        else:
+            scores[k] = 0.0
+            dx, du, dy, dv = _flow(xx, xv, vx, vv, (dx, du, dy, dv))
+    return dx, du, dy, dv
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run_rub(
+    xy: Floats,
+    usable: Flags,
+    cos: Floats,
+    sin: Floats,
+    observer: Observer,
+    healthy: Observer,
+    state: State,
+    scores: Floats,
+) -> State:
+    """A rub observer over a block; its state after it."""
+    for k in range(len(xy)):
+        state = _guarded(observer, healthy, cos[k], sin[k], state)
+        scores[k] = 0.0
+        if usable[k]:
+            state, scores[k] = _correct(observer, cos[k], sin[k], xy[k, 0], xy[k, 1], state)
+        state = _predict_rub(observer, cos[k], sin[k], state)
+    return state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def run_free(
     xy: Floats, usable: Flags, cos: Floats, sin: Floats, observers: Observers, states: Floats, scores: Floats
 ) -> None:
@@ -152,17 +203,11 @@ def run_free(
         scores: float64 ``[M, n]``, out: log-likelihood of every sample under every mode, nats.
     """
     for i in range(len(states)):
-        observer = observers[i]
-        rubs = observer.substeps > 0
         state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
-        for k in range(len(xy)):
-            if rubs:
-                state = _guarded(observer, observers[0], cos[k], sin[k], state)
-            score = 0.0
-            if usable[k]:
-                state, score = _correct(observer, cos[k], sin[k], xy[k, 0], xy[k, 1], state)
-            scores[i, k] = score
-            state = _predict(observer, cos[k], sin[k], state)
+        if observers[i].substeps > 0:
+            state = _run_rub(xy, usable, cos, sin, observers[i], observers[0], state, scores[i])
+        else:
+            state = _run_linear(xy, usable, cos, sin, observers[i], state, scores[i])
         states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
 
 

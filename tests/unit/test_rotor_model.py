@@ -138,13 +138,13 @@ def test_paper_sign_of_the_contact_throws_the_disc_out():
     observers, rub = rub_observers()
     assert np.abs(open_loop(observers, rub, 40)).max() < 1.3
     observers["impulse"] *= -1.0
-    assert np.abs(open_loop(observers, rub, 40)).max() > discretise.ESCAPE_RADIUS
+    assert np.abs(open_loop(observers, rub, 40)).max() > kernels.ESCAPE_RADIUS
 
 
 def test_friction_that_drives_the_whirl_runs_away():
     observers, rub = rub_observers()
     observers["mu"] *= -1.0
-    assert np.abs(open_loop(observers, rub, 60)).max() > discretise.ESCAPE_RADIUS
+    assert np.abs(open_loop(observers, rub, 60)).max() > kernels.ESCAPE_RADIUS
 
 
 def test_matched_observer_stays_on_the_rubbing_plant(monkeypatch):
