@@ -1,0 +1,123 @@
+"""The service as a whole: sensors that fail, brokers that are away, restarts."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+import can
+import numpy as np
+import pytest
+from brokers import Consumer, eventually, free_port
+
+from daqsvc import assembly
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.service import Service
+from sim_hw.demo.broker import EmbeddedBroker
+from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
+from sim_hw.demo.session import Script, Session
+from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.pacing import RealTimePacer
+from sim_hw.recordings import Recording
+from sim_hw.scenario import load_scenario
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from daqsvc.settings import MachineFile
+    from sim_hw.demo.listener import Received
+
+RATE_HZ = 2000.0
+
+
+def shaking(seconds: float) -> Recording:
+    """One loud channel, far over its limits."""
+    samples = np.random.default_rng(0).normal(size=(round(seconds * RATE_HZ), 1))
+    return Recording(("accel",), samples, RATE_HZ, __file__, 0)  # type: ignore[arg-type]
+
+
+@contextlib.asynccontextmanager
+async def running(machine: MachineFile, store: Path) -> AsyncIterator[Service]:
+    service = Service(machine, store)
+    stop = asyncio.Event()
+    task = asyncio.create_task(service.run(stop))
+    try:
+        await service.ready.wait()
+        yield service
+    finally:
+        stop.set()
+        await task
+
+
+async def shake(service: Service, seconds: float) -> None:
+    """Play on the virtual bus that the service reads."""
+    layout = assembly.frame_layout(service.machine, "recording")
+    channel = service.machine.buses["can0"].model_dump()["channel"]
+    await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
+    with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
+        node = CanNode(bus, layout, shaking(seconds).samples, RATE_HZ)
+        await node.play(RealTimePacer(SystemClock()))
+
+
+async def test_alarms_raised_without_a_broker_go_out_after_a_restart(tmp_path: Path) -> None:
+    port = free_port()
+    machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{port}")
+    async with running(machine, tmp_path) as service:
+        await shake(service, 1.0)
+        await eventually(lambda: service.outbox.counters.appended == 1, "the alarm is on disk")
+    async with EmbeddedBroker(port) as broker, Consumer(broker.port) as consumer:
+        async with running(machine, tmp_path) as service:
+            await eventually(lambda: consumer.on("/alarms/"), "the alarm arrives")
+            await eventually(lambda: service.outbox.counters.depth == 0, "the broker has acknowledged it")
+        async with running(machine, tmp_path):
+            pass
+        alarms = consumer.on("/alarms/vibration-accel")
+    assert alarms[0].payload["kind"] == "raised"
+    assert alarms[0].payload["cause"]["statistics"]["rms"] == pytest.approx(1.0, rel=0.2)
+    assert {alarm.payload["id"] for alarm in alarms} == {alarms[0].payload["id"]}, "repeats keep their id"
+
+
+async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -> None:
+    scenario = load_scenario("healthy")
+    machine = scenario.simulate(0)
+    samples = np.column_stack([machine.channels[name] for name in ("x_um", "y_um", "keyphasor_v")])
+    samples = samples[: 30 * 64]
+    third = len(samples) // 3
+    # The cable comes loose: the gap voltage leaves its limits, and the reading shakes enough for an alarm.
+    loose = slice(third, 2 * third)
+    samples[loose, 0] = 800.0 + 200.0 * np.random.default_rng(1).normal(size=third)
+    heard: list[Received] = []
+    script = Script(
+        title="loose cable",
+        machine=lambda url: laval_rig(scenario, machine.noise_um, url),
+        stream="shaft",
+        samples=samples,
+        rate_hz=machine.rate_hz,
+        samples_per_rev=64,
+    )
+    outcome = await Session(script, speed=1000, broker_url=None, hear=heard.append).run()
+    assert outcome.complete
+    alarms = [(m.payload["alarm"], m.payload["kind"]) for m in heard if m.kind == "alarm"]
+    assert ("sensor-ok/probe-x", "raised") in alarms
+    assert ("sensor-ok/probe-x", "returned") in alarms
+    assert ("shaft-vibration-x", "suppressed") in alarms
+    assert ("shaft-vibration-x", "unsuppressed") in alarms
+    assert ("shaft-vibration-x", "raised") not in alarms
+    assert not [name for name, _ in alarms if name.startswith("shaft-vibration-y")]
+    told = next(m.payload for m in heard if m.kind == "alarm" and m.payload["alarm"] == "sensor-ok/probe-x")
+    assert "outside its OK limits -14 to -6 V" in told["message"]
+    assert told["cause"]["quality"] == "not_ok"
+
+
+async def test_a_bus_that_falls_silent_holds_the_alarm(tmp_path: Path) -> None:
+    async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
+        machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), broker.url)
+        async with running(machine, tmp_path) as service:
+            await eventually(lambda: consumer.on("/availability"), "the box is online")
+            await shake(service, 1.0)
+            await eventually(lambda: consumer.on("/alarms/vibration-accel"), "the alarm is raised")
+            await asyncio.sleep(1.5)
+            assert service.alarms.alarms["vibration-accel"].level.label == "alert"
+        assert [m.payload["kind"] for m in consumer.on("/alarms/vibration-accel")] == ["raised"]
