@@ -123,7 +123,7 @@ def main() -> None:
         # With this damping the orbit is wider than the clearance: contact all the time.
         contact = compiled([*linear, rub], n, 0.047) - compiled(linear, n, 0.047)
         print(
-            f"blocks of {n:4} {step:6.1f} ns per linear filter-step ({loop / step:.0f} times the loop's speed), "
+            f"blocks of {n:4} {step:6.1f} ns per linear filter-step ({loop / step:.0f} times the loop), "
             f"{contact:.0f} ns per rub filter-step"
         )
     subject, block = bank(), orbit(PER_REV // 4)
