@@ -89,7 +89,7 @@ class Service:
         detectors = assembly.detectors(machine)
         self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
         self.drivers: list[Driver] = assembly.drivers(machine, self.clock, self._deliver)
-        self.pipeline = Pipeline(self.rings, detectors, self._report)
+        self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
         self.alarms = AlarmManager(self._identity, assembly.alarm_rules(machine), self.clock)
         self.outbox = Outbox(store / "outbox.sqlite", self.clock)
         mqtt = assembly.mqtt_settings(machine)

@@ -56,3 +56,14 @@ class Detector(Protocol):
         `Diagnosis` whose ``quality`` is not good, and holds its decision.
         """
         ...
+
+    def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+        """What to say when the stream has been silent: decisions held, quality ``"missing"``.
+
+        Called on the event loop, once per silence; changes nothing.
+
+        Args:
+            silence_s: how long nothing has come.
+            t_ns: monotonic time now.
+        """
+        ...

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import Severity
+    from daqsvc.diagnosis.record import DataQuality, Severity
 
 MIN_PRESENT = 0.5
 """Share of a window's samples that must be there for its levels to be given."""
@@ -107,6 +107,7 @@ class LevelDetector:
         self._channels = tuple(channels)
         self._band_hz = velocity_band_hz
         self._decided: dict[str, Severity] = {}
+        self._next_index = 0
 
     def warm(self) -> None:
         """Make the taper and the band's weights; there is nothing to compile."""
@@ -116,6 +117,7 @@ class LevelDetector:
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
         said: list[Diagnosis] = []
+        self._next_index = window.first_index + len(window.samples)
         for start in range(0, len(window.samples), self.block):
             part = window.samples[start : start + self.block]
             after = len(window.samples) - start - len(part)
@@ -125,24 +127,41 @@ class LevelDetector:
             ]
         return said
 
+    def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
+        """See `daqsvc.diagnosis.detector.Detector.silent`."""
+        reason = silence_reason(self.stream, silence_s)
+        return [
+            self._statement(c, {}, self._next_index, self._next_index, t_ns, "missing", reason)
+            for c in self._channels
+        ]
+
     def _judge(
         self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int
     ) -> Diagnosis:
-        before = self._decided.get(channel.sensor)
         present = np.isfinite(samples)
         count = int(present.sum())
-        quality: Literal["good", "missing", "not_ok"] = "good"
-        reason = ""
-        statistics: dict[str, float] = {}
+        end_index = first_index + len(samples)
         if count < MIN_PRESENT * len(samples):
-            quality = "missing"
             reason = (
                 f"only {count} of {len(samples)} samples of {channel.sensor} arrived; check bus and device"
             )
-        else:
-            statistics = self._measure(channel, samples)
-            reason = _why_not_ok(channel, statistics, samples[present])
-            quality = "not_ok" if reason else "good"
+            return self._statement(channel, {}, first_index, end_index, t_ns, "missing", reason)
+        statistics = self._measure(channel, samples)
+        reason = _why_not_ok(channel, statistics, samples[present])
+        quality: DataQuality = "not_ok" if reason else "good"
+        return self._statement(channel, statistics, first_index, end_index, t_ns, quality, reason)
+
+    def _statement(
+        self,
+        channel: LevelChannel,
+        statistics: dict[str, float],
+        first_index: int,
+        end_index: int,
+        t_ns: int,
+        quality: DataQuality,
+        reason: str,
+    ) -> Diagnosis:
+        before = self._decided.get(channel.sensor)
         severity = before or "normal"
         if quality == "good":
             severity = max(
@@ -157,7 +176,7 @@ class LevelDetector:
             t_ns=t_ns,
             stream=self.stream,
             first_index=first_index,
-            end_index=first_index + len(samples),
+            end_index=end_index,
             decision=severity if quality == "good" or before else "undetermined",
             changed=quality == "good" and before not in {None, severity},
             severity=severity,

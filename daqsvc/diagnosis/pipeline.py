@@ -9,12 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import Chunk, SampleRing
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
@@ -23,6 +25,10 @@ logger = logging.getLogger(__name__)
 
 MOST_BLOCKS = 64
 """Blocks in one window at most: a detector that is behind catches up in long strides."""
+
+LOOK_NS = NS_PER_S // 2
+SILENCE_NS = 2 * NS_PER_S
+"""A stream from which nothing has come for so long is silent."""
 
 
 @dataclass(slots=True)
@@ -51,6 +57,7 @@ class Pipeline:
         rings: by stream name.
         detectors: each names its stream.
         report: called on the event loop with each diagnosis, per detector in order.
+        clock: tells how long a stream has been silent.
         threads: kernels that may run at a time.
     """
 
@@ -59,12 +66,15 @@ class Pipeline:
         rings: Mapping[str, SampleRing],
         detectors: Sequence[Detector],
         report: Callable[[Diagnosis], None],
+        clock: Clock,
         threads: int = 2,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
+        self._rings = rings
         self._report = report
+        self._clock = clock
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
 
     @property
@@ -80,13 +90,35 @@ class Pipeline:
 
     async def run(self) -> None:
         """Process until every ring is closed and every whole block in it is processed."""
+        listening = asyncio.create_task(self._listen_for_silence(), name="silence")
         try:
             async with asyncio.TaskGroup() as group:
                 for detector in self.detectors:
                     group.create_task(self._follow(detector), name=f"detector {detector.name}")
         finally:
+            listening.cancel()
             # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.
             await asyncio.shield(asyncio.to_thread(self._pool.shutdown))
+
+    async def _listen_for_silence(self) -> None:
+        """Have detectors say, once, that their stream has fallen silent: a window never comes to say it."""
+        ends = {name: ring.end_index for name, ring in self._rings.items()}
+        since_ns = dict.fromkeys(self._rings, self._clock.monotonic_ns())
+        said: set[str] = set()
+        while True:
+            await self._clock.sleep_ns(LOOK_NS)
+            now_ns = self._clock.monotonic_ns()
+            for name, ring in self._rings.items():
+                if ring.end_index != ends[name]:
+                    ends[name], since_ns[name] = ring.end_index, now_ns
+                    said.discard(name)
+                elif name not in said and now_ns - since_ns[name] >= SILENCE_NS:
+                    said.add(name)
+                    silence_s = (now_ns - since_ns[name]) / NS_PER_S
+                    for detector in self.detectors:
+                        if detector.stream == name:
+                            for diagnosis in detector.silent(silence_s, now_ns):
+                                self._report(diagnosis)
 
     async def _follow(self, detector: Detector) -> None:
         reader, counters = self._readers[detector.name], self.counters[detector.name]

@@ -62,3 +62,8 @@ class Diagnosis:
     reason: str = ""
     sensors: tuple[str, ...] = ()
     model: str = ""
+
+
+def silence_reason(stream: str, silence_s: float) -> str:
+    """Why a statement about a silent stream is not good."""
+    return f"no samples of {stream} for {silence_s:.1f} s; check bus and device"

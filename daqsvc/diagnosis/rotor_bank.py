@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
+from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity, silence_reason
 from daqsvc.dsp.keyphasor import Edge, KeyphasorTracker
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
@@ -100,7 +100,10 @@ class _Verdict:
 class RotorBankDetector:
     """Diagnoses a rotor by the bank of the paper; see `Detector`.
 
-    Says one `Diagnosis` a revolution, and one at once for every change of the declared mode. Their
+    Says one `Diagnosis` a revolution, and one at once for every change of the declared mode. The
+    probabilities in it are those of the rule that decides: under ``cusum`` the posterior odds of the
+    evidence ``lead_M``; under ``paper``, and while nothing is declared yet, the paper's conditional
+    probabilities, which are always there as statistics ``paper.M`` too. The
     evidence, in nats: ``lead.M``, of the declared mode over mode M, and ``cusum.M``, of M against the
     declared one since the onset of its evidence. Under the paper's rule every severity is normal: a
     posterior of 0.9 is no ground for an alarm.
@@ -227,6 +230,29 @@ class RotorBankDetector:
             said += self._step(part, last_index + 1 - len(part), t_ns, window.period_ns)
         return said
 
+    def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+        """See `Detector.silent`."""
+        names = [mode.name for mode in self._modes]
+        index = self._next_index or 0
+        known = self._decision in names and self._rules.rule == "cusum"
+        return [
+            Diagnosis(
+                machine=self._machine,
+                detector=self.name,
+                t_ns=t_ns,
+                stream=self.stream,
+                first_index=index,
+                end_index=index,
+                decision=self._decision,
+                severity=self._modes[names.index(self._decision)].severity if known else "normal",
+                revolutions=self._revolutions,
+                quality="missing",
+                reason=silence_reason(self.stream, silence_s),
+                sensors=self._sensors,
+                model=MODEL,
+            )
+        ]
+
     @property
     def _columns(self) -> list[int]:
         return [self._probes[0].column, self._probes[1].column, self._keyphasor.column]
@@ -325,10 +351,16 @@ class RotorBankDetector:
         names = [mode.name for mode in self._modes]
         known = decision != UNDETERMINED
         evidence = {}
+        probabilities = conditional = report.probabilities
         if known and self._rules.rule == "cusum":
             others = [i for i in range(len(names)) if i != report.decision]
             evidence = {f"lead.{names[i]}": float(report.lead_nats[i]) for i in others}
             evidence |= {f"cusum.{names[i]}": float(report.cusum_nats[i]) for i in others}
+            odds = np.exp(-report.lead_nats)  # the decision leads itself by infinity in the report
+            odds[report.decision] = 1.0
+            probabilities = odds / odds.sum()
+        statistics = {"speed": 60.0 * self._rate_hz / self._tracker.period_samples}
+        statistics |= {f"paper.{name}": float(p) for name, p in zip(names, conditional, strict=True)}
         return Diagnosis(
             machine=self._machine,
             detector=self.name,
@@ -339,9 +371,9 @@ class RotorBankDetector:
             decision=self._decision,
             changed=changed,
             severity=self._modes[decision].severity if known and self._rules.rule == "cusum" else "normal",
-            probabilities=dict(zip(names, report.probabilities.tolist(), strict=True)),
+            probabilities=dict(zip(names, probabilities.tolist(), strict=True)),
             group=tuple(names[i] for i in report.group),
-            statistics={"speed": 60.0 * self._rate_hz / self._tracker.period_samples},
+            statistics=statistics,
             units={"speed": "rpm"},
             thresholds={
                 "cusum": self._rules.threshold_nats,

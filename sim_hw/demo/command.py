@@ -115,7 +115,7 @@ class DemoCommand:
         except ModuleNotFoundError as error:
             return _fail(f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'")
         try:
-            script = _script(arguments)
+            script = script_of(arguments)
             summary = _play(script, arguments)
         except (DemoError, MachineFileError, RecordingError, ScenarioError) as error:
             return _fail(str(error))
@@ -163,7 +163,12 @@ def _print_json(content: Mapping[str, Any]) -> None:
     print(json.dumps(content), flush=True)  # noqa: T201 - this is the output
 
 
-def _script(arguments: argparse.Namespace) -> Script:
+def script_of(arguments: argparse.Namespace) -> Script:
+    """What the arguments ask to play.
+
+    Raises:
+        DemoError, RecordingError, ScenarioError: it cannot be played.
+    """
     return _from_scenario(arguments) if arguments.recording is None else _from_recording(arguments)
 
 

@@ -174,8 +174,9 @@ class View:
         )
         return table
 
-    def show_summary(self, summary: dict[str, Any]) -> None:
-        """Print the summary."""
+    def show_summary(self, summary: dict[str, Any], console: Console | None = None) -> None:
+        """Print the summary, to another console if one is given."""
+        console = console or self._console
         if summary["onsets"]:
             table = Table(title="what happened, and when it was said", title_justify="left")
             for title in ("mode", "onset (rev)", "declared (rev)", "delay (rev)"):
@@ -190,21 +191,21 @@ class View:
                         else (f"{row['declared_rev']:.2f}", f"{row['delay_rev']:.2f}")
                     ),
                 )
-            self._console.print(table)
-            self._console.print(f"wrong declarations: {summary['wrong_declarations']}")
+            console.print(table)
+            console.print(f"wrong declarations: {summary['wrong_declarations']}")
         samples, frames, lag = summary["samples"], summary["frames"], summary["loop_lag_ms"]
-        self._console.print(
+        console.print(
             f"samples: {samples['sent']:,} sent, {samples['received']:,} received, {samples['lost']:,} lost, "
             f"{samples['skipped_by_detectors']:,} skipped"
         )
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):
                 told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())
-                self._console.print(f"link faults {what}: {told}")
-        self._console.print(
+                console.print(f"link faults {what}: {told}")
+        console.print(
             f"event loop lag: p50 {lag['p50']:.2f} ms, p99 {lag['p99']:.2f} ms, max {lag['max']:.2f} ms"
         )
-        self._console.print(
+        console.print(
             f"{summary['alarm_events']} alarm events among {summary['messages']} messages "
             f"through the broker; {summary['simulated_s']:.1f} s played in {summary['real_s']:.1f} s"
         )

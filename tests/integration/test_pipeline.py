@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.diagnosis.pipeline import Pipeline
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     import pytest
 
     from daqsvc.diagnosis.detector import Window
+
+CLOCK = SystemClock()
 
 
 class Listener:
@@ -43,6 +46,9 @@ class Listener:
         end = window.first_index + len(window.samples)
         return [Diagnosis("m", self.name, window.t_end_ns, "s", window.first_index, end, "N")]
 
+    def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
+        return [Diagnosis("m", self.name, t_ns, "s", 0, 0, "N", quality="missing", reason=f"{silence_s:g} s")]
+
 
 def write(ring: SampleRing, n: int) -> None:
     first = ring.end_index
@@ -54,7 +60,7 @@ async def test_every_detector_sees_every_sample_in_order_off_the_loop() -> None:
     ring = SampleRing("s", ("a",), 1000)
     detectors = [Listener("one", 7), Listener("two", 16)]
     said: list[Diagnosis] = []
-    pipeline = Pipeline({"s": ring}, detectors, said.append)
+    pipeline = Pipeline({"s": ring}, detectors, said.append, CLOCK)
     await pipeline.warm()
     assert all(d.warmed for d in detectors)
     running = asyncio.create_task(pipeline.run())
@@ -78,7 +84,7 @@ async def test_every_detector_sees_every_sample_in_order_off_the_loop() -> None:
 async def test_a_detector_that_is_too_slow_learns_exactly_what_it_missed() -> None:
     ring = SampleRing("s", ("a",), 50)
     slow = Listener("slow", 10)
-    pipeline = Pipeline({"s": ring}, [slow], lambda _: None)
+    pipeline = Pipeline({"s": ring}, [slow], lambda _: None, CLOCK)
     running = asyncio.create_task(pipeline.run())
     slow.go_on.clear()
     write(ring, 10)
@@ -96,7 +102,7 @@ async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.L
     ring = SampleRing("s", ("a",), 50)
     broken = Listener("broken", 10, fail_at=0)
     said: list[Diagnosis] = []
-    pipeline = Pipeline({"s": ring}, [broken], said.append)
+    pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK)
     running = asyncio.create_task(pipeline.run())
     for _ in range(3):
         write(ring, 10)
@@ -106,3 +112,24 @@ async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.L
     assert pipeline.counters["broken"].failures == 1
     assert [d.first_index for d in said] == [10, 20]
     assert sum("detector broken failed on samples 0 to 10" in r.message for r in caplog.records) == 1
+
+
+async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [Listener("one", 10)], said.append, clock)
+    running = asyncio.create_task(pipeline.run())
+    silences = []
+    for second in range(1, 16):
+        if second in {1, 2, 8}:
+            write(ring, 10)
+        for _ in range(4):
+            await asyncio.sleep(0.005)
+            clock.advance_to(clock.monotonic_ns() + 250_000_000)
+        silences.append(sum(d.quality == "missing" for d in said))
+    assert silences[:3] == [0, 0, 0]
+    assert silences[4:7] == [1, 1, 1]
+    assert silences[7:9] == [1, 1]
+    assert silences[11:] == [2, 2, 2, 2]
+    ring.close()
+    await running

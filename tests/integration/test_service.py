@@ -111,13 +111,21 @@ async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -
     assert told["cause"]["quality"] == "not_ok"
 
 
-async def test_a_bus_that_falls_silent_holds_the_alarm(tmp_path: Path) -> None:
+async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Path) -> None:
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
         machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), broker.url)
         async with running(machine, tmp_path) as service:
             await eventually(lambda: consumer.on("/availability"), "the box is online")
             await shake(service, 1.0)
             await eventually(lambda: consumer.on("/alarms/vibration-accel"), "the alarm is raised")
-            await asyncio.sleep(1.5)
+            await eventually(lambda: consumer.on("/alarms/sensor-ok/accel"), "the silence is told")
             assert service.alarms.alarms["vibration-accel"].level.label == "alert"
+            told = consumer.on("/alarms/sensor-ok/accel")[0].payload
+            assert "no samples of recording for" in told["message"]
+            assert told["cause"]["decision"] == "alert"
+            await shake(service, 1.0)
+            await eventually(
+                lambda: consumer.on("/alarms/sensor-ok/accel")[-1].payload["kind"] == "returned",
+                "the samples are back",
+            )
         assert [m.payload["kind"] for m in consumer.on("/alarms/vibration-accel")] == ["raised"]

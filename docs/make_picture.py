@@ -1,0 +1,42 @@
+"""Make docs/demo.svg, the picture in the README, from a run of the demo: ``python docs/make_picture.py``."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import io
+import re
+from pathlib import Path
+
+from rich.console import Console
+
+from daqsvc.cli import prepare_kernel_cache
+from sim_hw.demo.command import DemoCommand, script_of
+from sim_hw.demo.session import Session
+from sim_hw.demo.summary import summarise
+from sim_hw.demo.view import View
+
+WIDTH = 110
+PICTURE = Path(__file__).with_name("demo.svg")
+
+
+def main() -> None:
+    """Play the paper's scenario in real time and save the last view and the summary."""
+    prepare_kernel_cache()
+    parser = argparse.ArgumentParser()
+    DemoCommand().add_arguments(parser)
+    arguments = parser.parse_args()
+    script = script_of(arguments)
+    console = Console(record=True, width=WIDTH, file=io.StringIO())
+    view = View(script, arguments.speed, Console(file=io.StringIO()))
+    session = Session(script, speed=arguments.speed, broker_url=arguments.broker, hear=view.hear)
+    outcome = asyncio.run(session.run())
+    console.print(view.picture())
+    view.show_summary(summarise(script, outcome, speed=arguments.speed), console)
+    svg = console.export_svg(title="make demo")
+    # The fonts would be fetched from the web by whoever looks at it.
+    PICTURE.write_text(re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL), "utf-8")
+
+
+if __name__ == "__main__":
+    main()
