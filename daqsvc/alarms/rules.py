@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+SURE = 0.999
+"""More digits than this no model of a machine deserves."""
+
 UNDETERMINED = "undetermined"
 """The decision of a detector that cannot say yet."""
 
@@ -154,7 +157,7 @@ class _DecisionWatch:
         sentence = f"{diagnosis.detector} finds {diagnosis.decision}"
         probability = diagnosis.probabilities.get(diagnosis.decision)
         if probability is not None:
-            sentence += f", p = {probability:.3g}"
+            sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         others = [mode for mode in diagnosis.group if mode != diagnosis.decision]
         if others:
             sentence += f", not told apart from {', '.join(others)}"

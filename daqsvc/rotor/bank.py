@@ -244,7 +244,7 @@ class ModelBank:
         decision = self._cusum_decision
         if decision != UNDETERMINED:
             lead[decision] = math.inf
-            close = np.flatnonzero(lead < self.rules.threshold_nats).tolist()
+            close = np.flatnonzero(lead < self.rules.group_nats).tolist()
             if close and decision == self.decision:
                 group = tuple(sorted((decision, *close)))
         probabilities = np.exp(self._log_probability)

@@ -36,6 +36,7 @@ class DecisionRules:
         threshold_nats: evidence that changes the decision to a worse mode.
         back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
         identity_nats: lead over the other candidates that a change of the decision takes: odds of 20 to 1.
+        group_nats: lead below which two modes are not told apart: odds of 150 to 1.
         probability_threshold: conditional probability that declares under the paper's rule.
         priors: probabilities that the paper's rule starts and resets to; equal if not given.
     """
@@ -44,13 +45,14 @@ class DecisionRules:
     threshold_nats: float = 16.0
     back_threshold_nats: float = 25.0
     identity_nats: float = 3.0
+    group_nats: float = 5.0
     probability_threshold: float = 0.9
     priors: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.rule not in ("cusum", "paper"):
             raise ValueError(f"decision rule {self.rule!r} is unknown; use 'cusum' or 'paper'")
-        for name in ("threshold_nats", "back_threshold_nats", "identity_nats"):
+        for name in ("threshold_nats", "back_threshold_nats", "identity_nats", "group_nats"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"decision rule: {name} is {value}; evidence is a finite number above 0")

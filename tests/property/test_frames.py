@@ -140,7 +140,7 @@ def test_units_are_folded_into_the_scale() -> None:
 
 @pytest.mark.parametrize("value", [20_000.0, float("nan"), float("inf")])
 def test_a_value_that_does_not_fit_is_refused_by_name(value: float) -> None:
-    with pytest.raises(LayoutError, match="channel 'x'.*does not fit"):
+    with pytest.raises(LayoutError, match=r"channel 'x'.*does not fit"):
         three_channels().encode(np.array([0]), np.full((1, 10, 3), value))
 
 
@@ -153,5 +153,5 @@ def test_clipping_saturates_as_an_analogue_input_does() -> None:
     "changes", [{"samples_per_frame": 11}, {"crc_byte": 63}, {"crc_byte": 0}, {"first_byte": 1}]
 )
 def test_a_layout_that_does_not_fit_says_so(changes: dict[str, object]) -> None:
-    with pytest.raises(LayoutError, match="reaches past|overlaps"):
+    with pytest.raises(LayoutError, match=r"reaches past|overlaps"):
         three_channels(**changes)

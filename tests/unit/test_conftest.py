@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-LEAKY = '''
+LEAKY = """
 import asyncio, threading
 
 async def test_task():
@@ -15,7 +15,7 @@ def test_thread():
 
 async def test_clean():
     await asyncio.gather(asyncio.sleep(0), asyncio.to_thread(int))
-'''
+"""
 
 
 def test_leaks_fail_the_test_that_leaves_them(tmp_path: Path) -> None:
@@ -23,7 +23,8 @@ def test_leaks_fail_the_test_that_leaves_them(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text((here / "conftest.py").read_text())
     (tmp_path / "test_leaky.py").write_text(LEAKY)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_mode=auto"]
-    done = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, cwd=tmp_path, check=False)
+    command.append(str(tmp_path))
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert "1 failed" in done.stdout or "errors" in done.stdout
     assert "tasks that outlive the test: ['left-behind']" in done.stdout
     assert "threads that outlive the test: ['still-there']" in done.stdout
