@@ -188,7 +188,11 @@ def commands() -> dict[str, Command]:
     """Every verb there is, by name."""
     known: dict[str, Command] = {"run": RunCommand(), "check": CheckCommand()}
     for point in entry_points(group=COMMANDS):
-        known[point.name] = point.load()()
+        try:
+            known[point.name] = point.load()()
+        except ImportError as error:
+            # A broken extra must not keep the service from running.
+            print(f"daqsvc: verb {point.name!r} is left out: {error}", file=sys.stderr)  # noqa: T201
     return known
 
 

@@ -90,6 +90,8 @@ class View:
         parts: list[Any] = [Panel(self._channels(), title="channels", title_align="left")]
         if self._bank is not None:
             title = f"rotor: {self._bank['decision']}"
+            if others := [mode for mode in self._bank["group"] if mode != self._bank["decision"]]:
+                title += f", not told apart from {', '.join(others)}"
             parts.append(Panel(self._modes(self._bank), title=title, title_align="left"))
         alarms = [self._alarm_line(alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
         parts.append(Panel(Group(*alarms), title="alarms, as they came from the broker", title_align="left"))
@@ -144,7 +146,8 @@ class View:
 
     def _alarm_line(self, alarm: dict[str, Any]) -> Text:
         at = f"{self._seconds(alarm['cause']['monotonic_ns']):8.2f} s  "
-        line = Text(at, style="dim")
+        line = Text()
+        line.append(at, style="dim")
         line.append(f"{alarm['level']:<7}", style=COLOURS[alarm["level"]])
         line.append(f" {alarm['kind']:<9} {alarm['message']}")
         return line
@@ -159,10 +162,11 @@ class View:
                 f"stream {name}",
                 f"{stream['samples_received']:,} samples",
                 Text(f"{stream['samples_lost']:,} lost", style="red" if stream["samples_lost"] else "green"),
-                f"{stream['frames_duplicate']} repeated, {stream['frames_reordered']} overtaken, "
+                f"{stream['frames_duplicate']} twice, {stream['frames_reordered']} overtaken, "
                 f"{stream['frames_corrupt']} corrupt",
                 f"jitter {stream['jitter_ms']:.2f} ms",
             )
+        played_s = min(self._seconds(self._now_ns), self._script.duration_s)
         lag = self._status["loop_lag_ms"]
         mqtt = self._status["mqtt"]
         table.add_row(
@@ -170,7 +174,7 @@ class View:
             f"lag p50 {lag['p50']:.2f} ms",
             f"p99 {lag['p99']:.2f} ms",
             f"MQTT {mqtt.get('acknowledged', 0)} acknowledged, {self._status['outbox']['depth']} waiting",
-            f"{self._seconds(self._now_ns):.1f} s of {self._script.duration_s:.1f} s, speed {self._speed:g}",
+            f"{played_s:.1f} of {self._script.duration_s:.1f} s, speed {self._speed:g}",
         )
         return table
 
