@@ -34,7 +34,7 @@ class Backoff:
 
     def next_ns(self) -> int:
         """How long to wait before the next try."""
-        wait_ns = self._rng.randint(self._first_ns // 10, self._ceiling_ns)
+        wait_ns = self._rng.randint(0, self._ceiling_ns)
         self._ceiling_ns = min(2 * self._ceiling_ns, self._most_ns)
         return wait_ns
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import aiomqtt
 
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.publish.connection import Connection, NoConsentError, tls_context
 from daqsvc.publish.delivery import IN_FLIGHT, Delivery
 from daqsvc.publish.payloads import availability_payload
@@ -30,6 +31,9 @@ _T = TypeVar("_T")
 
 STABLE_S = 10.0
 """A connection that lasted this long has earned a quick first retry."""
+
+FIRST_RETRY_NS = 800_000_000
+"""Ceiling of the first wait after a loss."""
 
 GOODBYE_S = 0.3
 """What saying goodbye may take of the time to stop."""
@@ -100,32 +104,6 @@ class PublishCounters:
         self.acknowledged += 1
 
 
-class Backoff:
-    """Exponential back-off with full jitter: uniformly between zero and a limit that doubles.
-
-    Args:
-        first_s: the first limit.
-        most_s: the last limit.
-        draw: source of the jitter.
-    """
-
-    def __init__(self, first_s: float = 0.8, most_s: float = 30.0, draw: random.Random | None = None) -> None:
-        self._first_s = first_s
-        self._most_s = most_s
-        self._limit_s = first_s
-        self._draw = draw or random.Random()  # noqa: S311  jitter, not a secret
-
-    def next_s(self) -> float:
-        """How long to wait before the next attempt."""
-        limit_s = self._limit_s
-        self._limit_s = min(2 * limit_s, self._most_s)
-        return self._draw.uniform(0.0, limit_s)
-
-    def reset(self) -> None:
-        """An attempt has succeeded."""
-        self._limit_s = self._first_s
-
-
 class MqttPublisher:
     """Publishes the outbox and telemetry to one broker, through its outages.
 
@@ -159,7 +137,7 @@ class MqttPublisher:
         self._telemetry: deque[tuple[str, bytes]] = deque()
         self._telemetry_limit = telemetry_limit
         self._telemetry_arrived = asyncio.Event()
-        self._backoff = Backoff()
+        self._backoff = Backoff(FIRST_RETRY_NS)
         self._outage_reported = False
         self._protocol = (
             aiomqtt.ProtocolVersion.V311 if settings.protocol == "3.1.1" else aiomqtt.ProtocolVersion.V5
@@ -188,7 +166,7 @@ class MqttPublisher:
             while not self._stopping.is_set():
                 connection = await self._unless_stopping(self._connect())
                 if connection is None:
-                    await self._unless_stopping(asyncio.sleep(self._backoff.next_s()))
+                    await self._unless_stopping(asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
                     continue
                 try:
                     await self._serve(connection)
@@ -288,7 +266,7 @@ class MqttPublisher:
         self._report_outage(reason)
         if asyncio.get_running_loop().time() - since_s > STABLE_S:
             self._backoff.reset()
-        await self._unless_stopping(asyncio.sleep(self._backoff.next_s()))
+        await self._unless_stopping(asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
 
     async def _send_telemetry(self, connection: Connection) -> None:
         while True:

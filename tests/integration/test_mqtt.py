@@ -7,7 +7,6 @@ import contextlib
 import itertools
 import json
 import logging
-import random
 
 import pytest
 from brokers import Consumer, TcpProxy, eventually, free_port, running_mosquitto
@@ -17,7 +16,7 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.mqtt import Backoff, MqttPublisher, MqttSettings
+from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
 from daqsvc.publish.topics import Topics
 from sim_hw.demo.broker import EmbeddedBroker
@@ -339,14 +338,3 @@ async def test_telemetry_without_a_broker_drops_the_oldest_and_counts(tmp_path, 
             await publisher.stop()
             await running
     assert [message.payload["number"] for message in live.on("/status")] == [7, 8, 9]
-
-
-def test_back_off_grows_to_its_limit_with_full_jitter():
-    backoff = Backoff(first_s=0.8, most_s=30.0, draw=random.Random(1))
-    for limit_s in (0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 30.0, 30.0):
-        assert 0.0 <= backoff.next_s() <= limit_s
-    late = [backoff.next_s() for _ in range(1000)]
-    assert min(late) < 1.0
-    assert max(late) > 29.0
-    backoff.reset()
-    assert backoff.next_s() <= 0.8
