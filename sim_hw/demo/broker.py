@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 from typing import TYPE_CHECKING, Self
@@ -18,6 +19,30 @@ _LOOPBACK = "127.0.0.1"
 _NOISY_LOGGERS = ("amqtt", "transitions")
 
 
+class _TidyBroker(Broker):  # type: ignore[misc, unused-ignore]
+    """A broker that knows its connections: amqtt lets go of one whose closing is cancelled half-way."""
+
+    def __init__(self, config: BrokerConfig) -> None:
+        super().__init__(config)
+        self.writers: set[asyncio.StreamWriter] = set()
+
+    async def stream_connected(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
+    ) -> None:
+        self.writers.add(writer)
+        try:
+            await super().stream_connected(reader, writer, listener_name)
+        finally:
+            self.writers.discard(writer)
+            writer.close()
+
+    async def shutdown(self) -> None:
+        await super().shutdown()
+        for writer in self.writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)  # a transport closes its socket on the next turn of the loop
+
+
 class EmbeddedBroker:
     """An anonymous amqtt broker (MQTT 3.1.1) on a loopback port; use it with ``async with``.
 
@@ -28,7 +53,7 @@ class EmbeddedBroker:
     def __init__(self, port: int = 0) -> None:
         self._wanted_port = port
         self._port: int | None = None
-        self._broker: Broker | None = None
+        self._broker: _TidyBroker | None = None
 
     @property
     def port(self) -> int:
@@ -54,7 +79,7 @@ class EmbeddedBroker:
             listeners={"default": ListenerConfig(bind=f"{_LOOPBACK}:{port}")},
             plugins={"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
         )
-        self._broker = Broker(config)
+        self._broker = _TidyBroker(config)
         await self._broker.start()
         self._port = port
         return self
