@@ -38,10 +38,14 @@ logger = logging.getLogger(__name__)
 STATUS_EVERY_NS = NS_PER_S
 LAG_EVERY_S = 0.01
 LAG_REMEMBERED = 6000
-DRAIN_S = 0.5
-GOODBYE_S = 0.6
-CLOSE_S = 0.4
-"""Together they stay below the two seconds in which the service promises to stop."""
+RELEASE_S = 0.6
+"""What drivers may take to let go of their buses."""
+DRAIN_S = 0.3
+"""What the pipeline may take to finish, and again what the disk may take for the events of it."""
+GOODBYE_S = 0.5
+"""What the broker may take to get the rest."""
+CLOSE_S = 0.3
+"""What the journal may take to close. All together: the two seconds in which the service promises to stop."""
 
 
 class LoopLag:
@@ -125,7 +129,7 @@ class Service:
             self.ready.set()
             await self._until_stopped(stopped, everything)
         finally:
-            await _cancel(reading)
+            await _cancel(reading, RELEASE_S)
             for ring in self.rings.values():
                 ring.close()
             await asyncio.wait([pipeline], timeout=DRAIN_S)
@@ -133,7 +137,7 @@ class Service:
             if self.publisher is not None and publishing is not None:
                 self._publish_status()
                 await self.publisher.stop(GOODBYE_S)
-            await _cancel(everything)
+            await _cancel(everything, DRAIN_S)
 
     async def _until_stopped(self, stopped: asyncio.Task[Any], tasks: list[asyncio.Task[Any]]) -> None:
         waiting = set(tasks)
@@ -224,10 +228,15 @@ def _numbers(figures: Mapping[str, Any]) -> dict[str, Any]:
     return {name: int(value) if isinstance(value, bool) else value for name, value in figures.items()}
 
 
-async def _cancel(tasks: list[asyncio.Task[Any]]) -> None:
-    running = [task for task in tasks if not task.done()]
+async def _cancel(tasks: list[asyncio.Task[Any]], patience_s: float) -> None:
+    running = {task for task in tasks if not task.done()}
+    if not running:
+        return
     for task in running:
         task.cancel()
-    for task, outcome in zip(running, await asyncio.gather(*running, return_exceptions=True), strict=True):
-        if isinstance(outcome, Exception):
-            logger.error("%s failed while the service stopped", task.get_name(), exc_info=outcome)
+    ended, hanging = await asyncio.wait(running, timeout=patience_s)
+    for task in ended:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logger.error("%s failed while the service stopped", task.get_name(), exc_info=error)
+    for task in hanging:
+        logger.error("%s does not stop within %g s and is left behind", task.get_name(), patience_s)

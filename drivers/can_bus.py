@@ -40,7 +40,7 @@ BATCH_S = 0.002
 BATCH_FRAMES = 2048
 BATCHES_UNDER_WAY = 32
 REMEMBERED_IDS = 64
-SHUTDOWN_S = 1.0
+SHUTDOWN_S = 0.5
 ERROR_CLASS_BUS_OFF = 0x40
 """Bit of an error frame's id (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
@@ -113,10 +113,12 @@ class CanDriver:
     async def _open(self) -> can.BusABC | None:
         opening = asyncio.ensure_future(asyncio.to_thread(_open_bus, self._port.options))
         try:
-            # Cancelled or not, a bus that did open must be closed again.
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(_discard)
+            # A bus that opens all the same must be closed again, or its next owner finds it taken.
+            await asyncio.wait({opening}, timeout=SHUTDOWN_S)
+            if opening.done() and opening.exception() is None:
+                await asyncio.to_thread(_shut_down, opening.result())
             raise
         except Exception as error:  # noqa: BLE001 - adapters raise what they like; the driver must live on
             self.counters.open_failures += 1
@@ -264,7 +266,7 @@ class _Reader(threading.Thread):
         self._post(self._end, reason)
 
     def close(self) -> None:
-        """Stop reading and close the bus; takes at most about a second."""
+        """Stop reading and close the bus; takes at most about half a second."""
         self._stopping.set()
         self.join(SHUTDOWN_S)
         if self.is_alive():
@@ -358,11 +360,6 @@ def _shut_down(bus: can.BusABC) -> None:
         bus.shutdown()
     except Exception as error:  # noqa: BLE001 - a lost adapter may fail to close in its own way
         logger.info("closing a CAN bus that is gone: %s", _words(error))
-
-
-def _discard(opening: asyncio.Future[can.BusABC]) -> None:
-    if not opening.cancelled() and opening.exception() is None:
-        _shut_down(opening.result())
 
 
 def _words(error: BaseException) -> str:
