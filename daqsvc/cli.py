@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import errno
 import logging
 import os
 import signal
@@ -214,11 +215,27 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
-    chosen = parser(commands()).parse_args(arguments)
-    command: Command = chosen.command
     try:
-        return command.run(chosen)
+        chosen = parser(commands()).parse_args(arguments)
+        command: Command = chosen.command
+        code = command.run(chosen)
+        sys.stdout.flush()
     except BrokenPipeError:
         # Whoever read our output has had enough, as `head` does.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_stdout()
         return EXIT_OK
+    except KeyboardInterrupt:
+        print("daqsvc: interrupted", file=sys.stderr)  # noqa: T201
+        return EXIT_FAILED
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        _give_up_stdout()
+        print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
+        return EXIT_FAILED
+    return code
+
+
+def _give_up_stdout() -> None:
+    """Let the interpreter's own flush at exit go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

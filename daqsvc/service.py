@@ -111,19 +111,27 @@ class Service:
             OutboxError: the journal's directory cannot be used.
             DeviceAbsentError: a device is absent whose bus has ``start = "error"``.
         """
-        await self.outbox.open()
+        starting = self._task(self._start(), "start")
+        stopped = self._task(stop.wait(), "stop")
         try:
-            await self.pipeline.warm()
-            await self._serve(stop)
+            # Opening a disk and compiling kernels may take long; a stop does not wait for them.
+            await asyncio.wait({starting, stopped}, return_when=asyncio.FIRST_COMPLETED)
+            if starting.done():
+                starting.result()
+                await self._serve(stopped)
         finally:
+            await _cancel([starting, stopped], DRAIN_S)
             await self.outbox.close(CLOSE_S)
 
-    async def _serve(self, stop: asyncio.Event) -> None:
+    async def _start(self) -> None:
+        await self.outbox.open()
+        await self.pipeline.warm()
+
+    async def _serve(self, stopped: asyncio.Task[Any]) -> None:
         helpers = [self._task(self.lag.watch(), "loop lag"), self._task(self._tell_status(), "status")]
         publishing = None if self.publisher is None else self._task(self.publisher.run(), "mqtt")
         pipeline = self._task(self.pipeline.run(), "pipeline")
         reading = [self._task(driver.run(), f"driver {driver.name}") for driver in self.drivers]
-        stopped = self._task(stop.wait(), "stop")
         everything = [*helpers, *reading, pipeline, stopped, *([publishing] if publishing else [])]
         try:
             self.ready.set()
@@ -170,7 +178,12 @@ class Service:
             retain=True,
         )
         self._under_way.add(committed)
-        committed.add_done_callback(self._under_way.discard)
+        committed.add_done_callback(self._committed)
+
+    def _committed(self, committed: asyncio.Future[int]) -> None:
+        self._under_way.discard(committed)
+        if not committed.cancelled() and (error := committed.exception()) is not None:
+            logger.error("an alarm event never reached the disk: %s", error)
 
     async def _settle(self) -> None:
         """Wait until the events that are under way are on disk, for as long as the drain may take."""
@@ -193,9 +206,8 @@ class Service:
         buses: dict[str, Mapping[str, Any]] = {}
         for driver in self.drivers:
             counted = asdict(driver.counters)
-            unknown = {f"{frame_id:#x}": n for frame_id, n in counted.pop("unknown_ids").items()}
             up = int(driver.link.state == "up")
-            buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted, "unknown_ids": unknown}
+            buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted}
             for name, (counters, base) in driver.streams.items():
                 ring = self.rings[name]
                 streams[name] = {

@@ -76,7 +76,7 @@ class BusCounters:
         bus_off: how often the controller went bus-off.
         open_failures: how often the bus could not be opened.
         reader_failures: how often the reader gave up on an error that nobody had foreseen.
-        unknown_ids: frames per unknown id, for the first ids seen.
+        unknown_ids: frames per unknown id, e.g. ``"0x7ff (11 bit)"``, for the first ids seen.
     """
 
     frames_unknown: int = 0
@@ -85,7 +85,7 @@ class BusCounters:
     bus_off: int = 0
     open_failures: int = 0
     reader_failures: int = 0
-    unknown_ids: dict[int, int] = field(default_factory=dict)
+    unknown_ids: dict[str, int] = field(default_factory=dict)
 
 
 class Driver(Protocol):

@@ -138,8 +138,8 @@ class CanDriver:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""
         for name, count in found.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
-        for frame_id, count in found.unknown.items():
-            self._take_unknown(frame_id, count)
+        for name, count in found.unknown.items():
+            self._take_unknown(name, count)
         for stream, (count, length) in found.wrong_length.items():
             self._take_wrong_length(stream, count, length)
         for batch in found.batches:
@@ -150,16 +150,17 @@ class CanDriver:
             for assembler in self._assemblers.values():
                 assembler.tick(found.drained_ns)
 
-    def _take_unknown(self, frame_id: int, count: int) -> None:
+    def _take_unknown(self, name: str, count: int) -> None:
         ids = self.counters.unknown_ids
-        if frame_id in ids or len(ids) < REMEMBERED_IDS:
-            ids[frame_id] = ids.get(frame_id, 0) + count
-            self._say_once(
-                f"unknown id {frame_id:#x}",
-                "%s carries frames of id %#x, which no stream of the machine file has",
-                self.link.name,
-                frame_id,
-            )
+        if name in ids or len(ids) < REMEMBERED_IDS:
+            ids[name] = ids.get(name, 0) + count
+        self._say_once(
+            "unknown id",
+            "%s carries frames that no stream of the machine file has, id %s the first of them; "
+            "they are counted by id",
+            self.link.name,
+            name,
+        )
 
     def _take_wrong_length(self, stream: str, count: int, length: int) -> None:
         assembler = self._assemblers[stream]
@@ -196,7 +197,8 @@ class CanDriver:
             spec = self._specs.get((message.arbitration_id, message.is_extended_id))
             if spec is None:
                 found.note("frames_unknown")
-                found.unknown[message.arbitration_id] = found.unknown.get(message.arbitration_id, 0) + 1
+                name = f"{message.arbitration_id:#x} ({29 if message.is_extended_id else 11} bit)"
+                found.unknown[name] = found.unknown.get(name, 0) + 1
             elif len(message.data) != spec.layout.length:
                 count, _ = found.wrong_length.get(spec.name, (0, 0))
                 found.wrong_length[spec.name] = (count + 1, len(message.data))
@@ -219,7 +221,7 @@ class _Sorted:
     Attributes:
         batches: decoded frames by stream.
         notes: what to add to which of the bus's counters.
-        unknown: frames by unknown id.
+        unknown: frames by unknown id, in words.
         wrong_length: frames by stream, and the length of the last of them.
         bus_off: whether an error frame says that the controller went bus-off.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if the
@@ -228,7 +230,7 @@ class _Sorted:
 
     batches: list[_Batch] = field(default_factory=list)
     notes: dict[str, int] = field(default_factory=dict)
-    unknown: dict[int, int] = field(default_factory=dict)
+    unknown: dict[str, int] = field(default_factory=dict)
     wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
     bus_off: bool = False
     drained_ns: int | None = None

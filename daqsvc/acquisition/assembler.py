@@ -7,6 +7,7 @@ what is missing.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.samples import Samples
+
+logger = logging.getLogger(__name__)
 
 REMEMBERED_GAPS = 256
 
@@ -122,12 +125,27 @@ class StreamAssembler:
         """
         self.counters.frames_received += len(counter)
         if not intact.all():
+            if not self.counters.frames_corrupt:
+                logger.warning(
+                    "stream %r: a frame's CRC does not match; such frames are counted and left out. If it is "
+                    "every frame, compare the place of the CRC in the layout with the device's",
+                    self.stream,
+                )
             self.counters.frames_corrupt += int((~intact).sum())
             counter, samples, arrival_ns = counter[intact], samples[intact], arrival_ns[intact]
         if not len(counter):
             return
         placed = self._time.place(counter, arrival_ns)
-        self.counters.frames_rejected += int((~placed.kept).sum())
+        rejected = int((~placed.kept).sum())
+        if rejected and not self.counters.frames_rejected:
+            logger.warning(
+                "stream %r: a frame's counter fits neither the sequence nor a restart; "
+                "such frames are counted and left out",
+                self.stream,
+            )
+        self.counters.frames_rejected += rejected
+        for _ in placed.restarts:
+            logger.warning("stream %r: the device has restarted its counter", self.stream)
         start = 0
         for restart in [*placed.restarts, len(counter)]:
             part = slice(start, restart)
@@ -225,6 +243,13 @@ class StreamAssembler:
             quality |= Quality.AFTER_LOSS
             if self._after_restart:
                 quality |= Quality.LOSS_ESTIMATED
+            if not self.counters.gaps:
+                logger.warning(
+                    "stream %r: %d samples are missing before index %d; gaps are counted from now on",
+                    self.stream,
+                    lost,
+                    first,
+                )
             self.counters.gaps += 1
             self.counters.samples_lost += lost
             self._gaps.append((self._next, first))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -73,6 +75,7 @@ class Pipeline:
         self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
         self._rings = rings
+        self._silent_until_ns = dict.fromkeys(rings, -1)
         self._report = report
         self._clock = clock
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
@@ -83,10 +86,30 @@ class Pipeline:
         return max((reader.behind for reader in self._readers.values()), default=0)
 
     async def warm(self) -> None:
-        """Compile every kernel before the first sample comes."""
+        """Compile every kernel before the first sample comes.
+
+        May be cancelled at any time: compiling cannot be interrupted, but the process need not wait.
+        """
         loop = asyncio.get_running_loop()
-        for detector in self.detectors:
-            await loop.run_in_executor(self._pool, detector.warm)
+        warmed: asyncio.Future[None] = loop.create_future()
+
+        def settle(error: Exception | None) -> None:
+            if not warmed.done():
+                warmed.set_result(None) if error is None else warmed.set_exception(error)
+
+        def compile_all() -> None:
+            failure: Exception | None = None
+            try:
+                for detector in self.detectors:
+                    detector.warm()
+            except Exception as error:  # noqa: BLE001 - raised again where it is awaited
+                failure = error
+            # Whoever waited may be gone, and the loop with them.
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(settle, failure)
+
+        threading.Thread(target=compile_all, name="kernel-warming", daemon=True).start()
+        await warmed
 
     async def run(self) -> None:
         """Process until every ring is closed and every whole block in it is processed."""
@@ -114,6 +137,7 @@ class Pipeline:
                     said.discard(name)
                 elif name not in said and now_ns - since_ns[name] >= SILENCE_NS:
                     said.add(name)
+                    self._silent_until_ns[name] = now_ns
                     silence_s = (now_ns - since_ns[name]) / NS_PER_S
                     for detector in self.detectors:
                         if detector.stream == name:
@@ -140,7 +164,9 @@ class Pipeline:
             window = _window(reader.ring, chunk)
             said = await loop.run_in_executor(self._pool, _process, detector, window, counters)
             for diagnosis in said:
-                self._report(diagnosis)
+                # What lies before a silence that has been told is history: it must not speak after it.
+                if diagnosis.t_ns > self._silent_until_ns[detector.stream]:
+                    self._report(diagnosis)
 
 
 def _window(ring: SampleRing, chunk: Chunk) -> Window:

@@ -129,13 +129,15 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
             await until(lambda: driver.streams["shaft"][0].frames_received == len(strays) + 1)
     counters = driver.streams["shaft"][0]
     assert driver.counters.frames_unknown == 5
-    assert driver.counters.unknown_ids == {0x7FF: 3, 0x101: 2}
+    assert driver.counters.unknown_ids == {"0x7ff (11 bit)": 3, "0x101 (29 bit)": 2}
     assert counters.frames_wrong_length == 5
     assert counters.frames_corrupt == 1
     assert (driver.counters.frames_remote, driver.counters.frames_error) == (1, 1)
     assert (counters.samples_received, counters.samples_lost) == (len(strays) * PER_FRAME, 0)
     said = [r.message for r in caplog.records]
-    assert sum("0x7ff" in text for text in said) == 1
+    assert sum("0x7ff (11 bit) the first of them" in text for text in said) == 1
+    assert sum("CRC does not match" in text for text in said) == 1
+    assert len(said) == 3, "every kind is said once, however many there are"
     assert sum("bytes, its layout 64" in text for text in said) == 1
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 from typing import TYPE_CHECKING
 
 import can
@@ -128,4 +129,26 @@ async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Pat
                 lambda: consumer.on("/alarms/sensor-ok/accel")[-1].payload["kind"] == "returned",
                 "the samples are back",
             )
+            quality = [m.payload for m in consumer.on("/alarms/sensor-ok/accel")]
+            assert [payload["kind"] for payload in quality] == ["raised", "returned"], "one outage, one alarm"
+            times_ns = [payload["monotonic_ns"] for payload in quality]
+            assert times_ns == sorted(times_ns)
         assert [m.payload["kind"] for m in consumer.on("/alarms/vibration-accel")] == ["raised"]
+
+
+async def test_a_stop_does_not_wait_for_kernels_that_compile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = threading.Event()
+    machine = for_recording(shaking(1), "g", Setpoints(), f"mqtt://127.0.0.1:{free_port()}")
+    service = Service(machine, tmp_path)
+    monkeypatch.setattr(service.pipeline.detectors[0], "warm", lambda: compiled.wait(20))
+    stop = asyncio.Event()
+    task = asyncio.create_task(service.run(stop))
+    await asyncio.sleep(0.1)
+    assert not service.ready.is_set()
+    stop.set()
+    async with asyncio.timeout(2):
+        await task
+    assert not service.ready.is_set()
+    compiled.set()
