@@ -102,3 +102,23 @@ def test_run_says_which_device_is_absent_where_that_is_an_error(tmp_path: Path) 
     assert done.returncode == 1
     assert "CAN bus 'can0' (socketcan no-such-can) cannot be opened" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_output_that_cannot_be_written_is_said_in_one_line() -> None:
+    command = [sys.executable, "-m", "daqsvc", "check", str(CONFIG / "laval-rig.toml")]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "daqsvc: No space left on device: the output is not complete\n"
+
+
+def test_a_reader_that_has_had_enough_is_no_error() -> None:
+    command = [sys.executable, "-m", "daqsvc", "check", str(CONFIG / "laval-rig.toml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(60) == 0
