@@ -22,6 +22,7 @@ from daqsvc.settings.models import (
     VelocitySensor,
 )
 from drivers.base import BusPort, StreamSpec
+from drivers.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
     """
     given = machine.streams[stream].layout
     if isinstance(given, DbcLayout):
-        layout = FrameLayout.from_dbc(
+        layout = layout_from_dbc(
             machine.resolve(given.dbc),
             given.message,
             counter=given.counter.signal,

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.dbc import layout_from_dbc
 from drivers.frames import Field, FrameLayout, LayoutError
 
 LIMITS = {"signed": (-(2**15), 2**15 - 1), "unsigned": (0, 2**16 - 1)}
@@ -115,7 +116,7 @@ def dbc(*signals: str) -> str:
 def test_dbc_layout_has_the_messages_signals_as_samples(tmp_path: Path) -> None:
     path = tmp_path / "two.dbc"
     path.write_text(dbc("SG_ Seq : 0|8@1+", "SG_ A0 : 8|16@1-", "SG_ A1 : 31|16@0-"))
-    layout = FrameLayout.from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0", "A1"]})
+    layout = layout_from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0", "A1"]})
     assert (layout.frame_id, layout.length, layout.samples_per_frame) == (257, 8, 2)
     payload = layout.encode(np.array([2 * 300]), np.array([[[-5.0], [700.0]]]))
     assert payload.tobytes() == bytes([300 % 256]) + struct.pack("<h", -5) + struct.pack(">h", 700) + bytes(3)
@@ -126,9 +127,9 @@ def test_dbc_problems_name_the_file_and_what_it_has(tmp_path: Path) -> None:
     path = tmp_path / "two.dbc"
     path.write_text(dbc("SG_ Seq : 0|8@1+"))
     with pytest.raises(LayoutError, match=r"no signal 'A0'; it has \['Seq'\]"):
-        FrameLayout.from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0"]})
+        layout_from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0"]})
     with pytest.raises(LayoutError, match="message 'N'"):
-        FrameLayout.from_dbc(path, "N", counter="Seq", counts="frames", channels={})
+        layout_from_dbc(path, "N", counter="Seq", counts="frames", channels={})
 
 
 def test_units_are_folded_into_the_scale() -> None:
