@@ -16,6 +16,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
     from numpy.typing import NDArray
 
     Payloads: TypeAlias = NDArray[np.uint8]
@@ -316,17 +317,18 @@ class FrameLayout:
         """
         n = len(payloads)
         raw = np.empty((n, self.scale.size), np.float64)
-        for group in self._sample_groups:
-            raw[:, group.columns] = group.read(payloads)
-        samples = raw.reshape(n, *self.scale.shape) * self.scale + self.offset
+        # Floats on the wire may be anything: beyond float32 they become infinite, signalling NaNs quiet.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for group in self._sample_groups:
+                raw[:, group.columns] = group.read(payloads)
+            samples = (raw.reshape(n, *self.scale.shape) * self.scale + self.offset).astype(np.float32)
         counter = self._counter_group.read(payloads)[:, 0].astype(np.int64)
         if self.crc_byte is None:
             intact = np.ones(n, np.bool_)
         else:
             sent = payloads[:, self.crc_byte].astype(np.uint16) << 8 | payloads[:, self.crc_byte + 1]
             intact = sent == self._crc(payloads)
-        with np.errstate(over="ignore"):  # a float64 on the wire may exceed float32: it becomes infinite
-            return Decoded(counter, samples.astype(np.float32), intact)
+        return Decoded(counter, samples, intact)
 
     def encode(
         self,

@@ -95,6 +95,7 @@ class StreamAssembler:
         self._held_index = np.empty(0, np.int64)
         self._held: Samples | None = None
         self._waiting_since_ns = 0
+        self._arrival_ns = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_GAPS)
         self._after_restart = False
 
@@ -174,6 +175,7 @@ class StreamAssembler:
             samples = np.concatenate([self._held, samples])
         else:
             self._waiting_since_ns = arrival_ns
+        self._arrival_ns = arrival_ns
         if (np.diff(index) <= 0).any():
             index, first = np.unique(index, return_index=True)
             samples = samples[first]
@@ -254,6 +256,8 @@ class StreamAssembler:
             self.counters.samples_lost += lost
             self._gaps.append((self._next, first))
         self._after_restart = False
+        # Whatever is still held back waits for another frame than before.
+        self._waiting_since_ns = self._arrival_ns
         flat = np.ascontiguousarray(samples.reshape(-1, samples.shape[2]))
         self.counters.samples_received += len(flat)
         self._next = first + len(flat)

@@ -1,6 +1,7 @@
 """The assembler against a bus that drops, repeats, overtakes and corrupts frames on purpose."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -134,3 +135,25 @@ def test_a_restart_starts_a_new_run_with_its_loss_marked_as_estimated() -> None:
     after = next(b for b in blocks if b.quality & Quality.LOSS_ESTIMATED)
     assert after.lost_before == 91 * PER_FRAME  # the silence, and the frame that was not yet believed
     assert unit.counters.frames_rejected == 1
+
+
+def test_patience_starts_afresh_with_every_gap() -> None:
+    """Two frames are always under way: something is held back all the time, but never for long."""
+    blocks: list[SampleBlock] = []
+    unit = assembler(blocks)
+    for k in range(0, 200, 2):
+        for frame in [0, 2] if k == 0 else [k + 2, k - 1]:
+            feed(unit, [frame], t_ns=(k + 2) * FRAME_NS)
+            unit.tick((k + 2) * FRAME_NS)
+    assert unit.counters.frames_late == 0
+    assert unit.counters.samples_lost == 0
+    assert unit.counters.frames_reordered > 90
+
+
+def test_gaps_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    unit = assembler([])
+    feed(unit, [0, 1, 2, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15, 16])
+    assert unit.counters.gaps == 2
+    assert [r.message for r in caplog.records] == [
+        "stream 's': 4 samples are missing before index 16; gaps are counted from now on"
+    ]

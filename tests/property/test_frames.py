@@ -156,3 +156,12 @@ def test_clipping_saturates_as_an_analogue_input_does() -> None:
 def test_a_layout_that_does_not_fit_says_so(changes: dict[str, object]) -> None:
     with pytest.raises(LayoutError, match=r"reaches past|overlaps"):
         three_channels(**changes)
+
+
+@given(payload=st.binary(min_size=64, max_size=64), bits=st.sampled_from([32, 64]))
+def test_any_bytes_decode_as_floats_without_a_word(payload: bytes, bits: int) -> None:
+    layout = three_channels(
+        channels=[("a", bits, "float", 1e30, 5.0)], samples_per_frame=7, first_byte=4, crc_byte=None
+    )
+    decoded = layout.decode(np.frombuffer(payload, np.uint8)[None])
+    assert decoded.samples.shape == (1, 7, 1)
