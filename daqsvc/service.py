@@ -19,6 +19,7 @@ from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload, diagnosis_payload, status_payload
+from daqsvc.publish.recall import recall
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
@@ -126,6 +127,15 @@ class Service:
     async def _start(self) -> None:
         await self.outbox.open()
         await self.pipeline.warm()
+        await self._resume()
+
+    async def _resume(self) -> None:
+        """Take over from the journal how the alarms stood when the service ended."""
+        now_ns = self.clock.monotonic_ns()
+        said = [s for detector in self.pipeline.detectors for s in detector.silent(0.0, now_ns)]
+        told = recall(await self.outbox.latest(), self._topics)
+        for event in self.alarms.resume(told, {s.detector: s.sensors for s in said}):
+            self._post(event)
 
     async def _serve(self, stopped: asyncio.Task[Any]) -> None:
         helpers = [self._task(self.lag.watch(), "loop lag"), self._task(self._tell_status(), "status")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.events import AlarmEvent, EventKind
@@ -78,6 +79,28 @@ class Alarm:
     def is_held(self, hold: Hold) -> bool:
         """Whether ``hold`` covers the state."""
         return hold in self._holds
+
+    def resume(self, told: AlarmEvent, found: str, since: Instant) -> None:
+        """Stand as the last event before a restart said.
+
+        Args:
+            told: that event.
+            found: `Finding.identity` of what stood; empty if nobody knows.
+            since: when it was, by the clocks as they are now.
+        """
+        self._state, self._level = told.own_state, told.to_level
+        self._holds = {Hold.SUPPRESSED} if told.to_state is AlarmState.SUPPRESSED else set()
+        self._occurrence = None if self._state is AlarmState.NORMAL else told.occurrence
+        self._found, self._cause = found, told.cause
+        self._since, self._message = since, told.message
+
+    def withdraw(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
+        """Return to normal, from whatever state, because nobody will judge the alarm any more."""
+        before = self._shown
+        self._holds = set()
+        message = f"{self.name} returned to normal: {reason}"
+        returned = self._change(EventKind.RETURNED, AlarmState.NORMAL, Level.NORMAL, cause, at, message)
+        return replace(returned, from_state=before)
 
     def apply(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
         """Take in what the rule finds; None if that is nothing new."""

@@ -79,3 +79,11 @@ class AlarmEvent:
     cause: Diagnosis
     message: str
     by: str = ""
+
+    @property
+    def own_state(self) -> AlarmState:
+        """The alarm's own state after the event: under a suppression, the one that it covers.
+
+        While an alarm is suppressed nothing moves it, so the event before a suppression tells the rest.
+        """
+        return self.from_state if self.kind is EventKind.SUPPRESSED else self.to_state

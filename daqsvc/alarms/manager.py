@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from daqsvc.alarms.alarm import Alarm, Instant
 from daqsvc.alarms.events import AlarmEvent, Identity
 from daqsvc.alarms.rules import DiagnosisRule, Finding, LevelRule, Watch
-from daqsvc.alarms.states import Hold, Level
+from daqsvc.alarms.states import AlarmState, Hold, Level
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.alarm import AlarmStatus
@@ -95,6 +95,38 @@ class AlarmManager:
         at = self._instant(diagnosis.t_ns)
         return list(self._events(diagnosis, at))
 
+    def resume(self, told: Iterable[AlarmEvent], speakers: Mapping[str, Sequence[str]]) -> list[AlarmEvent]:
+        """Go on from where the alarms stood when the service ended; before the first diagnosis.
+
+        Every alarm takes over its state, level and occurrence, and holds them until a good diagnosis
+        comes, which continues the occurrence or returns it. A suppression holds until whoever asked for
+        it says good. Delays begin anew.
+
+        Args:
+            told: the last event of each alarm.
+            speakers: the detectors that will make statements, with the sensors that these rest on.
+
+        Returns:
+            The events by which alarms return to normal that nobody will judge any more: the machine file
+            no longer has them, or not what a quality alarm is about.
+        """
+        for ruled in self._ruled:
+            ruled.sensors = frozenset(speakers.get(ruled.detector, ruled.sensors))
+        ruled_by_name = {ruled.alarm.name: ruled for ruled in self._ruled}
+        quality = {_quality_alarm(detector, sensors)[0] for detector, sensors in speakers.items()}
+        withdrawn: list[AlarmEvent] = []
+        for event in told:
+            ours = event.identity == self._identity
+            if ours and event.alarm in ruled_by_name:
+                self._resume_ruled(ruled_by_name[event.alarm], event, speakers)
+            elif event.to_state is AlarmState.NORMAL:
+                continue
+            elif ours and event.alarm in quality:
+                self._resume_quality(event, speakers)
+            else:
+                withdrawn.append(self._withdraw(event))
+        return withdrawn
+
     def acknowledge(self, alarm: str, by: str = "") -> AlarmEvent:
         """A person has seen the alarm.
 
@@ -132,12 +164,7 @@ class AlarmManager:
 
     def _quality(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         """Raise, change or return the quality alarm of what the diagnosis rests on."""
-        if len(diagnosis.sensors) == 1:
-            subject = diagnosis.sensors[0]
-            name = f"sensor-ok/{subject}"
-        else:
-            subject = diagnosis.detector
-            name = f"detector-ok/{subject}"
+        name, subject = _quality_alarm(diagnosis.detector, diagnosis.sensors)
         doubts = self._doubts.setdefault(name, {})
         if diagnosis.quality == "good":
             doubts.pop(diagnosis.detector, None)
@@ -161,8 +188,7 @@ class AlarmManager:
     def _suppression(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         """Suppress what rests on a sensor that is not OK, and lift that when it is good again."""
         if diagnosis.quality == "not_ok":
-            sensors = frozenset(diagnosis.sensors)
-            self._not_ok[diagnosis.detector] = (sensors, diagnosis.reason or "a sensor is not OK")
+            self._blame(diagnosis)
         elif diagnosis.quality == "good":
             self._not_ok.pop(diagnosis.detector, None)
         for ruled in self._ruled:
@@ -181,6 +207,42 @@ class AlarmManager:
                 return reason
         return None
 
+    def _resume_ruled(self, ruled: _Ruled, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> None:
+        level = event.to_level if event.own_state.is_active else Level.NORMAL
+        found = ruled.watch.resume(level, event.cause)
+        ruled.alarm.resume(event, found, self._since(event.wall_ns))
+        if not ruled.alarm.is_held(Hold.SUPPRESSED):
+            return
+        if event.cause.detector in speakers:
+            self._blame(event.cause)
+        else:
+            # Whoever found the sensor bad is gone; then the alarm's own detector must find it good.
+            self._not_ok.setdefault(ruled.detector, (frozenset(), "a sensor was not OK before the restart"))
+
+    def _resume_quality(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> None:
+        cause = event.cause
+        alarm = self._add(event.alarm, latching=False)
+        alarm.resume(event, cause.quality, self._since(event.wall_ns))
+        if event.own_state.is_active and cause.quality != "good" and cause.detector in speakers:
+            self._doubts.setdefault(event.alarm, {})[cause.detector] = cause
+            if cause.quality == "not_ok":
+                self._blame(cause)
+
+    def _withdraw(self, event: AlarmEvent) -> AlarmEvent:
+        alarm = Alarm(event.identity, event.alarm, latching=False, new_occurrence=self._new_occurrence)
+        alarm.resume(event, "", self._since(event.wall_ns))
+        now = self._instant(self._clock.monotonic_ns())
+        return alarm.withdraw("the machine file no longer has it", event.cause, now)
+
+    def _since(self, wall_ns: int) -> Instant:
+        """An instant before the restart, by its label: the monotonic clock may have begun anew."""
+        return Instant(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
+
+    def _blame(self, diagnosis: Diagnosis) -> None:
+        """Remember who says what is not OK, and why."""
+        reason = diagnosis.reason or "a sensor is not OK"
+        self._not_ok[diagnosis.detector] = (frozenset(diagnosis.sensors), reason)
+
     def _add(self, name: str, *, latching: bool) -> Alarm:
         alarm = Alarm(self._identity, name, latching=latching, new_occurrence=self._new_occurrence)
         self._alarms[name] = alarm
@@ -196,3 +258,10 @@ class AlarmManager:
     def _instant(self, t_ns: int) -> Instant:
         """The wall-clock label of a monotonic time."""
         return Instant(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
+
+
+def _quality_alarm(detector: str, sensors: Sequence[str]) -> tuple[str, str]:
+    """The quality alarm that a statement bears on, and what it is about."""
+    if len(sensors) == 1:
+        return f"sensor-ok/{sensors[0]}", sensors[0]
+    return f"detector-ok/{detector}", detector

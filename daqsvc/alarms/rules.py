@@ -47,6 +47,18 @@ class Watch(Protocol):
         """A diagnosis was not good: what was known stays known."""
         ...
 
+    def resume(self, level: Level, cause: Diagnosis) -> str:
+        """Go on from before a restart.
+
+        Args:
+            level: the level that stood; normal if the condition was gone.
+            cause: the diagnosis behind the last event.
+
+        Returns:
+            `Finding.identity` of what stood; empty if ``cause`` does not tell.
+        """
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class LevelRule:
@@ -102,7 +114,7 @@ class DiagnosisRule:
 
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
-        return _DecisionWatch()
+        return _DecisionWatch(self)
 
 
 class _LevelWatch:
@@ -132,6 +144,10 @@ class _LevelWatch:
     def hold(self) -> None:
         self._monitor.hold()
 
+    def resume(self, level: Level, cause: Diagnosis) -> str:  # noqa: ARG002  a level has one cause only
+        self._monitor.resume(level)
+        return ""
+
     def _sentence(self, diagnosis: Diagnosis, value: float, level: Level) -> str:
         rule = self._rule
         unit = f" {diagnosis.units[rule.measure]}" if rule.measure in diagnosis.units else ""
@@ -144,6 +160,9 @@ class _LevelWatch:
 
 
 class _DecisionWatch:
+    def __init__(self, rule: DiagnosisRule) -> None:
+        self._detector = rule.detector
+
     def find(self, diagnosis: Diagnosis) -> Finding | None:
         if diagnosis.decision == UNDETERMINED:
             return None
@@ -151,6 +170,9 @@ class _DecisionWatch:
 
     def hold(self) -> None:
         """The detector itself holds its decision."""
+
+    def resume(self, level: Level, cause: Diagnosis) -> str:  # noqa: ARG002  it has no memory of levels
+        return cause.decision if cause.detector == self._detector else ""
 
     @staticmethod
     def _sentence(diagnosis: Diagnosis) -> str:

@@ -84,6 +84,11 @@ class SetpointMonitor:
             comparator.update(value, elapsed_ns)
         return self.level
 
+    def resume(self, level: Level) -> None:
+        """Go on from a level that was reached before a restart; the delays begin anew."""
+        for begins, comparator in self._comparators:
+            comparator.reached = level >= begins
+
     def hold(self) -> None:
         """A value is missing: the level stays and the delays stand still until the next one."""
         self._known_at_ns = None

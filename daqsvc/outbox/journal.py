@@ -41,6 +41,8 @@ CREATE INDEX unsent ON messages (sequence) WHERE NOT sent;
 CREATE INDEX retained ON messages (topic, sequence) WHERE retain;
 """
 
+_LATEST = "(SELECT max(sequence) FROM messages WHERE retain GROUP BY topic)"
+
 
 class OutboxError(Exception):
     """The outbox cannot do what it was asked to; the text names the file and the remedy."""
@@ -213,8 +215,11 @@ class Journal:
 
     def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, if it is sent, in order."""
-        latest = "(SELECT max(sequence) FROM messages WHERE retain GROUP BY topic)"
-        return self._select(f"WHERE sent AND sequence IN {latest} ORDER BY sequence")
+        return self._select(f"WHERE sent AND sequence IN {_LATEST} ORDER BY sequence")
+
+    def latest(self) -> list[OutboxMessage]:
+        """The latest retained message of each topic, sent or not, in order."""
+        return self._select(f"WHERE sequence IN {_LATEST} ORDER BY sequence")
 
     def unsent(self) -> int:
         """How many messages are not sent."""

@@ -155,6 +155,10 @@ class Outbox:
         """The latest retained message of each topic, where the broker has acknowledged it, in order."""
         return await self._read(self._journal.retained)
 
+    async def latest(self) -> list[OutboxMessage]:
+        """The latest retained message of each topic, whether it is sent or not, in order."""
+        return await self._read(self._journal.latest)
+
     async def next_pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Like `pending`, but waits until there is at least one."""
         while True:

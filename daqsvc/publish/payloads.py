@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 
 from daqsvc.acquisition.clock import iso_utc
-from daqsvc.alarms.events import EventKind  # noqa: TC001  pydantic reads annotations at run time
-from daqsvc.alarms.states import AlarmState  # noqa: TC001
-from daqsvc.diagnosis.record import DataQuality, Severity  # noqa: TC001
+from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
+from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.events import AlarmEvent, Identity
-    from daqsvc.diagnosis.record import Diagnosis
 
 
 def _finite_or_none(value: Any) -> Any:
@@ -157,6 +155,35 @@ def alarm_payload(event: AlarmEvent, sequence: int) -> AlarmPayload:
     )
 
 
+def alarm_event(payload: bytes) -> AlarmEvent:
+    """The event that an alarm payload tells of; what JSON could not say is NaN.
+
+    Raises:
+        ValueError: it is no alarm payload of this version, or one that no event of this program has.
+    """
+    told = AlarmPayload.model_validate_json(payload)
+    state, previous = AlarmState(told.state), AlarmState(told.previous.state)
+    kind = EventKind(told.kind)
+    unheard_of = {AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE}
+    if {state, previous} & unheard_of or (state is AlarmState.SUPPRESSED) != (kind is EventKind.SUPPRESSED):
+        raise ValueError(f"an event {kind} from {previous} to {state} is none of this program's")
+    return AlarmEvent(
+        identity=Identity(told.site, told.box, told.machine),
+        alarm=told.alarm,
+        occurrence=told.occurrence,
+        kind=kind,
+        from_state=previous,
+        to_state=state,
+        from_level=Level.of(told.previous.level),
+        to_level=Level.of(told.level),
+        t_ns=told.monotonic_ns,
+        wall_ns=told.wall_ns,
+        cause=_diagnosis(told.machine, told.cause),
+        message=told.message,
+        by=told.by,
+    )
+
+
 def diagnosis_payload(identity: Identity, diagnosis: Diagnosis, clock: Clock) -> DiagnosisPayload:
     """The payload of a diagnosis, stamped with the time of its last sample."""
     wall_ns = clock.wall_ns() - clock.monotonic_ns() + diagnosis.t_ns
@@ -237,3 +264,32 @@ def _statement(diagnosis: Diagnosis) -> dict[str, Any]:
         "sensors": diagnosis.sensors,
         "model": diagnosis.model,
     }
+
+
+def _diagnosis(machine: str, cause: CausePayload) -> Diagnosis:
+    return Diagnosis(
+        machine=machine,
+        detector=cause.detector,
+        t_ns=cause.monotonic_ns,
+        stream=cause.window.stream,
+        first_index=cause.window.first_index,
+        end_index=cause.window.end_index,
+        decision=cause.decision,
+        changed=cause.changed,
+        severity=cause.severity,
+        probabilities=_or_nan(cause.probabilities),
+        group=cause.group,
+        statistics=_or_nan(cause.statistics),
+        units=cause.units,
+        thresholds=_or_nan(cause.thresholds),
+        evidence=_or_nan(cause.evidence),
+        revolutions=cause.revolutions,
+        quality=cause.quality,
+        reason=cause.reason,
+        sensors=cause.sensors,
+        model=cause.model,
+    )
+
+
+def _or_nan(figures: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: math.nan if value is None else value for name, value in figures.items()}
