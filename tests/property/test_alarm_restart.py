@@ -1,0 +1,115 @@
+"""A manager that is restarted from the journal at any point does what one does that never was."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.events import EventKind, Identity
+from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.publish.payloads import alarm_event, alarm_payload
+
+RULES = [
+    LevelRule("level", "x", "rms", Setpoint(alert=4.0, danger=8.0, deadband=1.0)),
+    LevelRule("level-latching", "x", "rms", Setpoint(alert=4.0, danger=8.0, deadband=1.0), latching=True),
+    DiagnosisRule("mode", "bank"),
+    DiagnosisRule("mode-latching", "bank", latching=True),
+]
+SPEAKERS = {"levels/x": ("x",), "bank": ("x", "y")}
+MODES = {"N": "normal", "F1": "alert", "F2": "alert", "F3": "danger", "undetermined": "normal"}
+QUALITY = st.sampled_from(["good", "good", "good", "missing", "not_ok"])
+
+MEASURED = st.tuples(st.just("levels/x"), st.sampled_from([0.0, 3.5, 5.0, 7.5, 9.0, math.nan]), QUALITY)
+DIAGNOSED = st.tuples(st.just("bank"), st.sampled_from(sorted(MODES)), QUALITY)
+ASKED = st.tuples(
+    st.sampled_from(["acknowledge", "reset"]),
+    st.sampled_from([*(rule.alarm for rule in RULES), "sensor-ok/x", "detector-ok/bank"]),
+    st.just("good"),
+)
+STEPS = st.lists(st.tuples(st.booleans(), MEASURED | DIAGNOSED | ASKED), min_size=1, max_size=40)
+
+
+class Box:
+    """A manager, and a journal that holds the last event of each of its alarms, as bytes."""
+
+    def __init__(self):
+        self.clock = DrivenClock(start_ns=0, wall_start_ns=10**18)
+        self.journal = {}
+        self.numbers = itertools.count()
+        self.start()
+
+    def start(self):
+        self.manager = AlarmManager(
+            Identity("s", "b", "m"), RULES, self.clock, lambda: f"o-{next(self.numbers)}"
+        )
+        told = [alarm_event(payload) for payload in self.journal.values()]
+        assert self.manager.resume(told, SPEAKERS) == []
+
+    def do(self, what, which, quality):
+        """The events of a step, without those that only tell a cause afresh."""
+        events = []
+        if what in SPEAKERS:
+            said = {"statistics": {"rms": which}, "decision": "normal"}
+            if what == "bank":
+                said = {"decision": which, "severity": MODES[which]}
+            t_ns = self.clock.monotonic_ns()
+            sensors = SPEAKERS[what]
+            events = self.manager.take(
+                Diagnosis("m", what, t_ns, "s", 0, 1, quality=quality, sensors=sensors, **said)
+            )
+        else:
+            with contextlib.suppress(KeyError, RefusedError):
+                events = [getattr(self.manager, what)(which)]
+        for event in events:
+            self.journal[event.alarm] = alarm_payload(event, 1).to_json()
+        return [
+            (event.alarm, event.kind, event.from_state, event.to_state, event.to_level, event.occurrence)
+            for event in events
+            if event.kind is not EventKind.CHANGED
+        ]
+
+    def standing(self):
+        return {
+            name: (status.state, status.level, status.occurrence)
+            for name, status in self.manager.alarms.items()
+            if status.state is not AlarmState.NORMAL
+        }
+
+
+@given(STEPS)
+def test_a_restart_changes_nothing(steps):
+    steady, restarted = Box(), Box()
+    not_ok = set()
+    for restart, (what, which, quality) in steps:
+        # What was not OK and then went missing is not OK still; the last event only says that it is missing.
+        if quality == "missing" and what in not_ok:
+            continue
+        (not_ok.add if quality == "not_ok" else not_ok.discard)(what)
+        if restart:
+            restarted.start()
+            assert restarted.standing() == steady.standing()
+        assert restarted.do(what, which, quality) == steady.do(what, which, quality)
+        assert restarted.standing() == steady.standing()
+
+
+@given(STEPS)
+def test_what_nobody_judges_any_more_ends_normal(steps):
+    box = Box()
+    for _, step in steps:
+        box.do(*step)
+    standing = box.standing()
+    successor = AlarmManager(Identity("s", "b", "m"), [], box.clock)
+    events = successor.resume([alarm_event(payload) for payload in box.journal.values()], {})
+    assert {event.alarm for event in events} == set(standing)
+    for event in events:
+        assert (event.from_state, event.from_level, event.occurrence) == standing[event.alarm]
+        assert (event.to_state, event.to_level) == (AlarmState.NORMAL, Level.NORMAL)
+    assert dict(successor.alarms) == {}

@@ -1,0 +1,187 @@
+"""What alarms do with the last that was told of them before a restart."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+
+import pytest
+
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.events import EventKind, Identity
+from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.outbox.store import OutboxMessage
+from daqsvc.publish.payloads import alarm_event, alarm_payload
+from daqsvc.publish.recall import recall
+from daqsvc.publish.topics import Topics
+
+RIG = Identity("lab", "edge-1", "rig")
+LEVEL = LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0, danger=60.0, deadband=2.0))
+ROTOR = DiagnosisRule("rotor-fault", "rotor-bank")
+SENSORS = ("probe-x", "probe-y")
+SPEAKERS = {"levels/probe-x": ("probe-x",), "rotor-bank": SENSORS}
+S, K = AlarmState, EventKind
+
+
+def manager(*rules, identity=RIG, start_ns=0, wall_ns=10**18):
+    return AlarmManager(identity, rules, DrivenClock(start_ns=start_ns, wall_start_ns=wall_ns))
+
+
+def rms(value, quality="good", reason=""):
+    statistics = {"rms": value}
+    return Diagnosis(
+        "rig",
+        "levels/probe-x",
+        1_000,
+        "shaft",
+        0,
+        64,
+        "normal",
+        statistics=statistics,
+        quality=quality,
+        reason=reason,
+        sensors=("probe-x",),
+    )
+
+
+def mode(decision, severity, quality="good"):
+    return Diagnosis(
+        "rig",
+        "rotor-bank",
+        1_000,
+        "shaft",
+        0,
+        64,
+        decision,
+        severity=severity,
+        quality=quality,
+        sensors=SENSORS,
+    )
+
+
+def history(subject, *diagnoses):
+    """The last event of each alarm."""
+    last = {}
+    for diagnosis in diagnoses:
+        for event in subject.take(diagnosis):
+            last[event.alarm] = event
+    return list(last.values())
+
+
+def kinds(events):
+    return [(event.alarm, event.kind) for event in events]
+
+
+def test_a_condition_that_cleared_while_nobody_looked_returns_its_occurrence():
+    told = history(manager(ROTOR), mode("F1", "alert"))
+    after = manager(ROTOR)
+    assert after.resume(told, SPEAKERS) == []
+    assert after.take(mode("undetermined", "normal")) == []
+    (event,) = after.take(mode("N", "normal"))
+    assert event.kind is K.RETURNED
+    assert event.occurrence == told[0].occurrence
+    assert (event.from_state, event.to_state) == (S.ACTIVE_UNACKNOWLEDGED, S.RETURNED_UNACKNOWLEDGED)
+
+
+@pytest.mark.parametrize(
+    ("decision", "severity", "kind"),
+    [("F1", "alert", None), ("F2", "alert", K.CHANGED), ("F3", "danger", K.ESCALATED)],
+)
+def test_a_condition_that_stands_goes_on_with_its_occurrence(decision, severity, kind):
+    told = history(manager(ROTOR), mode("F1", "alert"))
+    after = manager(ROTOR)
+    after.resume(told, SPEAKERS)
+    events = after.take(mode(decision, severity))
+    assert [event.kind for event in events] == ([] if kind is None else [kind])
+    assert after.alarms["rotor-fault"].occurrence == told[0].occurrence
+
+
+@pytest.mark.parametrize(("value", "returns"), [(39.0, False), (37.0, True)])
+def test_the_deadband_outlives_a_restart(value, returns):
+    told = history(manager(LEVEL), rms(50.0))
+    after = manager(LEVEL)
+    after.resume(told, SPEAKERS)
+    assert kinds(after.take(rms(value))) == ([("vibration-x", K.RETURNED)] if returns else [])
+
+
+def test_a_limit_that_the_machine_file_has_raised_lowers_the_level():
+    told = history(manager(LEVEL), rms(70.0))
+    after = manager(dataclasses.replace(LEVEL, setpoint=Setpoint(alert=40.0)))
+    after.resume(told, SPEAKERS)
+    assert kinds(after.take(rms(70.0))) == [("vibration-x", K.LOWERED)]
+
+
+def test_a_suppression_holds_until_the_sensor_is_good_and_uncovers_what_it_covered():
+    told = history(manager(LEVEL, ROTOR), mode("F1", "alert"), rms(9.0, "not_ok", "gap voltage is -20 V"))
+    assert {event.alarm for event in told} == {"rotor-fault", "vibration-x", "sensor-ok/probe-x"}
+    after = manager(LEVEL, ROTOR)
+    after.resume(told, SPEAKERS)
+    assert after.take(mode("F1", "alert")) == []
+    assert kinds(after.take(rms(9.0, "missing"))) == [("sensor-ok/probe-x", K.CHANGED)]
+    events = after.take(rms(9.0))
+    assert kinds(events) == [
+        ("sensor-ok/probe-x", K.RETURNED),
+        ("vibration-x", K.UNSUPPRESSED),
+        ("rotor-fault", K.UNSUPPRESSED),
+    ]
+    assert events[1].to_state is S.NORMAL
+    assert events[2].to_state is S.ACTIVE_UNACKNOWLEDGED
+
+
+def test_a_suppression_by_a_sensor_that_is_gone_ends_with_the_alarms_own_good_statement():
+    told = history(manager(ROTOR), mode("F1", "alert"), rms(9.0, "not_ok"))
+    after = manager(ROTOR)
+    gone = after.resume(told, {"rotor-bank": SENSORS})
+    assert kinds(gone) == [("sensor-ok/probe-x", K.RETURNED)]
+    assert "the machine file no longer has it" in gone[0].message
+    assert "rotor-fault" not in {event.alarm for event in after.take(mode("F1", "alert", "missing"))}
+    assert ("rotor-fault", K.UNSUPPRESSED) in kinds(after.take(mode("F1", "alert")))
+
+
+def test_an_alarm_of_a_machine_that_was_renamed_is_returned_under_its_old_name():
+    told = history(manager(ROTOR), mode("F1", "alert"))
+    renamed = dataclasses.replace(RIG, machine="pump")
+    (event,) = manager(ROTOR, identity=renamed).resume(told, SPEAKERS)
+    assert (event.identity, event.alarm, event.kind) == (RIG, "rotor-fault", K.RETURNED)
+    assert (event.to_state, event.to_level, event.occurrence) == (
+        S.NORMAL,
+        Level.NORMAL,
+        told[0].occurrence,
+    )
+
+
+def test_when_it_was_is_told_by_the_wall_clock_after_a_reboot():
+    told = history(manager(ROTOR, start_ns=5_000_000, wall_ns=10**18), mode("F1", "alert"))
+    after = manager(ROTOR, start_ns=7, wall_ns=10**18 + 60_000_000_000)
+    after.resume(told, SPEAKERS)
+    since = after.alarms["rotor-fault"].since
+    assert since.wall_ns == told[0].wall_ns
+    assert 7 - since.t_ns == 10**18 + 60_000_000_000 - told[0].wall_ns
+
+
+def test_what_cannot_be_read_is_left_out_and_logged_once(caplog):
+    topics = Topics("daqsvc", "lab", "edge-1")
+    (event,) = history(manager(ROTOR), mode("F1", "alert"))
+    good = alarm_payload(event, 7).to_json()
+    shelved = json.dumps(json.loads(good) | {"state": "shelved"}).encode()
+    topic = topics.alarm("rig", "rotor-fault")
+    other_box = topic.replace("edge-1", "edge-2")
+    rows = [
+        (topic, good),
+        (topic, b"\xff"),
+        (topic, good.replace(b"daqsvc.alarm/1", b"daqsvc.alarm/9")),
+        (topic, shelved),
+        (topics.alarm("rig", "rotor"), good),
+        (other_box, b"not ours to read"),
+        (topics.availability, b"no alarm"),
+    ]
+    messages = [OutboxMessage(n, *row, retain=True) for n, row in enumerate(rows)]
+    with caplog.at_level(logging.WARNING):
+        assert recall(messages, topics) == [event]
+    (record,) = caplog.records
+    assert record.getMessage().startswith("4 alarm states of the journal cannot be read")
+    assert alarm_event(good) == event
