@@ -80,7 +80,8 @@ class PublishCounters:
         published: QoS 1 messages handed to the broker, repeats included.
         acknowledged: QoS 1 messages for which a PUBACK came.
         telemetry_sent: QoS 0 messages handed to the broker.
-        telemetry_dropped: QoS 0 messages dropped, the oldest first, because there was no broker.
+        telemetry_dropped: QoS 0 messages dropped: the oldest ones because there was no broker, or what
+            was left when the publisher stopped.
     """
 
     connected: bool = False
@@ -89,11 +90,6 @@ class PublishCounters:
     acknowledged: int = 0
     telemetry_sent: int = 0
     telemetry_dropped: int = 0
-
-    @property
-    def reconnects(self) -> int:
-        """Connections after the first."""
-        return max(self.connections - 1, 0)
 
     def count_published(self) -> None:
         """One more was handed to the broker."""
@@ -153,6 +149,9 @@ class MqttPublisher:
             topic: below the box, e.g. ``"status"`` or ``"laval-rig/diagnosis/rotor-bank"``.
             payload: the bytes.
         """
+        if self._running is not None and self._running.done():
+            self.counters.telemetry_dropped += 1
+            return
         if len(self._telemetry) >= self._telemetry_limit:
             self._telemetry.popleft()
             self.counters.telemetry_dropped += 1
@@ -174,6 +173,8 @@ class MqttPublisher:
                     self.counters.connected = False
                     connection.abandon()
         finally:
+            self.counters.telemetry_dropped += len(self._telemetry)
+            self._telemetry.clear()
             self._running.set_result(None)
 
     async def stop(self, deadline_s: float = 1.0) -> None:
@@ -184,6 +185,7 @@ class MqttPublisher:
         """
         self._stop_at_s = asyncio.get_running_loop().time() + deadline_s
         self._stopping.set()
+        self._telemetry_arrived.set()
         if self._running is not None:
             await asyncio.wait({self._running})
 
@@ -248,9 +250,7 @@ class MqttPublisher:
         try:
             await self._unless_stopping(asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED))
             if self._stopping.is_set() and not lost.done():
-                await asyncio.wait(
-                    {drain, lost}, timeout=self._left_s() - GOODBYE_S, return_when=asyncio.FIRST_COMPLETED
-                )
+                await self._hand_over({drain, telemetry}, lost)
                 await self._say_goodbye(connection)
                 return
         finally:
@@ -268,15 +268,24 @@ class MqttPublisher:
             self._backoff.reset()
         await self._unless_stopping(asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
 
+    async def _hand_over(self, left: set[asyncio.Task[None]], lost: asyncio.Task[None]) -> None:
+        """Let the tasks finish what is left, for as long as the connection lives and the time allows."""
+        while left and not lost.done() and (patience_s := self._left_s() - GOODBYE_S) > 0:
+            await asyncio.wait({*left, lost}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
+            left = {task for task in left if not task.done()}
+
     async def _send_telemetry(self, connection: Connection) -> None:
+        """Send telemetry as it comes, until the publisher stops and nothing is left."""
         while True:
             while not self._telemetry:
+                if self._stopping.is_set():
+                    return
                 self._telemetry_arrived.clear()
                 await self._telemetry_arrived.wait()
             topic, payload = self._telemetry.popleft()
             try:
                 await connection.publish(topic, payload, qos=0)
-            except aiomqtt.MqttError:
+            except (aiomqtt.MqttError, asyncio.CancelledError):
                 self.counters.telemetry_dropped += 1
                 raise
             self.counters.telemetry_sent += 1

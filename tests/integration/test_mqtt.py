@@ -158,6 +158,33 @@ async def test_telemetry_arrives_and_is_not_retained(broker, outbox):
             assert later.on("/status") == []
 
 
+async def test_a_publisher_that_stops_hands_over_the_telemetry_that_waits(broker, outbox):
+    port, protocol = broker
+    async with Consumer(port) as live:
+        async with publishing(outbox, port, protocol) as publisher:
+            await eventually(lambda: publisher.counters.connected, "connected")
+            for number in range(20):
+                publisher.telemetry("status", json.dumps({"number": number}).encode())
+        assert (publisher.counters.telemetry_sent, publisher.counters.telemetry_dropped) == (20, 0)
+        await eventually(lambda: len(live.on("/status")) == 20, "all of it arrives")
+        await eventually(lambda: live.on("/availability")[-1].payload["state"] == "offline", "the goodbye")
+
+
+async def test_telemetry_that_a_stopped_publisher_cannot_send_is_counted(outbox):
+    settings = MqttSettings("127.0.0.1", free_port(), "c")
+    publisher = MqttPublisher(settings, "lab", "edge-1", outbox, CLOCK)
+    running = asyncio.create_task(publisher.run())
+    publisher.telemetry("status", b"{}")
+    publisher.telemetry("status", b"{}")
+    await asyncio.sleep(0)
+    await publisher.stop()
+    await running
+    assert publisher.counters.telemetry_dropped == 2
+    publisher.telemetry("status", b"{}")
+    assert publisher.counters.telemetry_dropped == 3
+    assert publisher.counters.telemetry_sent == 0
+
+
 async def test_the_last_will_speaks_for_a_cut_connection(broker, outbox):
     port, protocol = broker
     async with (
@@ -175,7 +202,7 @@ async def test_the_last_will_speaks_for_a_cut_connection(broker, outbox):
             ("online", "connected"),
         ]
         # The consumer may hear of the new connection before the publisher has its PUBACK.
-        await eventually(lambda: publisher.counters.reconnects == 1, "the publisher is back too")
+        await eventually(lambda: publisher.counters.connections == 2, "the publisher is back too")
 
 
 @pytest.mark.mosquitto

@@ -142,6 +142,15 @@ def test_a_suppression_by_a_sensor_that_is_gone_ends_with_the_alarms_own_good_st
     assert ("rotor-fault", K.UNSUPPRESSED) in kinds(after.take(mode("F1", "alert")))
 
 
+def test_a_sensor_stays_in_doubt_until_the_detector_that_doubts_it_is_content():
+    told = history(manager(), rms(9.0, "missing"))
+    after = manager()
+    after.resume(told, {"levels/probe-x": ("probe-x",), "spectrum/probe-x": ("probe-x",)})
+    other = dataclasses.replace(rms(9.0), detector="spectrum/probe-x")
+    assert after.take(other) == []
+    assert kinds(after.take(rms(9.0))) == [("sensor-ok/probe-x", K.RETURNED)]
+
+
 def test_an_alarm_of_a_machine_that_was_renamed_is_returned_under_its_old_name():
     told = history(manager(ROTOR), mode("F1", "alert"))
     renamed = dataclasses.replace(RIG, machine="pump")
