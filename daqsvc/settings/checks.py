@@ -20,6 +20,7 @@ from daqsvc.settings.layout_checks import (
     check_dbc_unit,
     check_frame_length,
     check_ids,
+    check_interfaces,
     check_plain_layout,
     check_sensor_channel,
     check_stream_bus,
@@ -72,6 +73,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
                 yield check_channels(stream.layout, (*at, "layout"))
     yield check_ids(draft, messages)
     yield _unused_buses(draft)
+    yield check_interfaces(draft)
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
             at = ("sensors", index)
@@ -97,7 +99,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             if isinstance(alarm, LevelAlarm):
                 yield _setpoints(alarm, at)
                 yield _alarm_sensor(draft, alarm, at)
-                yield _alarm_levels(draft, at)
+                yield _alarm_levels(draft, alarm, at)
             elif isinstance(alarm, DiagnosisAlarm):
                 yield _alarm_detector(draft, alarm, at)
     with suppress(UnusableValueError):
@@ -293,7 +295,10 @@ def _alarm_sensor(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterato
         )
 
 
-def _alarm_levels(draft: MachineFile, at: KeyPath) -> Iterator[Finding]:
+def _alarm_levels(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
+    with suppress(UnusableValueError):
+        if alarm.sensor not in _named(draft):
+            return  # said already, about the same key
     if draft.pipeline.levels is None:
         yield Finding(
             (*at, "sensor"),
@@ -345,14 +350,15 @@ def _transport(mqtt: Mqtt) -> Iterator[Finding]:
 def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
     if mqtt.password_file is None:
         return
+    host = mqtt.host  # not usable if the user stands in the url: that has been said, with what to do
     if mqtt.username is None:
         yield Finding(
             ("mqtt", "password_file"), "is a password without a user", "add username to [mqtt], or remove it"
         )
-    if not mqtt.tls and not _is_this_host(mqtt.host):
+    if not mqtt.tls and not _is_this_host(host):
         yield Finding(
             ("mqtt", "password_file"),
-            f"the password would go to {mqtt.host} unencrypted",
+            f"the password would go to {host} unencrypted",
             "write mqtts:// in the url",
             fatal=False,
         )

@@ -132,6 +132,21 @@ def check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterato
         yield Finding((*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses))
 
 
+def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
+    """python-can, or a plugin of it, knows the interfaces of the CAN buses."""
+    # Imported here: it is slow, and nothing else in the settings needs it.
+    from can.interfaces import BACKENDS  # noqa: PLC0415
+
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if isinstance(bus, CanBus) and bus.interface not in BACKENDS:
+                yield Finding(
+                    ("buses", name, "interface"),
+                    "python-can knows no such interface",
+                    f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it",
+                )
+
+
 def check_frame_length(
     draft: MachineFile, stream: Stream, message: DbcMessage | None, at: KeyPath
 ) -> Iterator[Finding]:

@@ -58,7 +58,8 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     """
     text = text.removeprefix("\ufeff")
     try:
-        document = tomllib.loads(text)
+        # With its last line ended: else tomllib has no line number for a mistake there.
+        document = tomllib.loads(text if text.endswith("\n") else f"{text}\n")
     except (ValueError, RecursionError) as error:
         raise MachineFileError([_syntax_problem(path, text, error)]) from None
     reading = _Reading(document, locate(text), path)

@@ -330,6 +330,7 @@ def test_a_password_in_an_address_that_is_none():
     [
         ("a = 1\nb 2\n", 2, "column 3"),
         ("a = 1\na = 2\n", 2, "overwrite"),
+        ("a = 1\na = 2", 2, "overwrite a value, at column 6"),
         ("a = 1\nb = [1,\n", 2, "end of the file"),
         ("a = " + "[" * 100_000, None, "nested too deeply"),
         ("a = " + "9" * 5000, None, "not valid TOML"),

@@ -70,6 +70,20 @@ FITTING = [
         "earlier channel",
         "name of its own",
     ),
+    (
+        LAVAL,
+        [('interface = "socketcan"', 'interface = "nosuch"')],
+        "buses.can0.interface",
+        "knows no such interface",
+        "virtual; or install the python-can plugin that brings it",
+    ),
+    (
+        LAVAL,
+        [('interface = "socketcan"', 'interface = "socketcn"')],
+        "buses.can0.interface",
+        "knows no such interface",
+        'did you mean "socketcan"',
+    ),
     (LAVAL, [('bus = "can0"', 'bus = "can1"')], "streams.shaft.bus", "no such bus", 'did you mean "can0"'),
     (LAVAL, [('stream = "shaft"', 'stream = "shft"')], "sensors[0].stream", "no such stream", '"shaft"'),
     (
@@ -153,6 +167,17 @@ FITTING = [
     (LAVAL, [('sensor = "probe-x"', 'sensor = "probe-z"')], "alarms[0].sensor", "no such sensor", "probe-x"),
     (LAVAL, [('sensor = "probe-x"', 'sensor = "keyphasor"')], "alarms[0].sensor", "no vibration", "probe-x"),
     (
+        MOTOR,
+        [
+            ("[pipeline.levels]\nwindow_s = 0.5\nvelocity_band_hz = [10.0, 1000.0]", ""),
+            (MOTOR_PEAK_ALARM, ""),
+            ('sensor = "accel-de"', 'sensor = "q"'),
+        ],
+        "alarms[0].sensor",
+        "no such sensor",
+        "accel-de",
+    ),
+    (
         LAVAL,
         [('measure = "rms"', 'measure = "velocity_rms"')],
         "alarms[0].measure",
@@ -190,6 +215,13 @@ FITTING = [
         "mqtt.insecure",
         "contradicts",
         "remove it",
+    ),
+    (
+        LAVAL,
+        [("mqtts://", "mqtts://daq:secret@"), ('username = "daq"', "")],
+        "mqtt.url",
+        "must not hold a user name",
+        "write username and password_file",
     ),
     (LAVAL, [('username = "daq"', "")], "mqtt.password_file", "without a user", "add username"),
 ]
