@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -14,6 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from numpy.lib.npyio import NpzFile
     from numpy.typing import NDArray
 
     Floats: TypeAlias = NDArray[np.float64]
@@ -27,6 +28,10 @@ DELIMITERS = ("\t", ";", "|", ",", " ")
 """Between the columns of a CSV file, tried in this order (a comma may also be a decimal point)."""
 
 SNIFFED_LINES = 20
+
+LEAST_RATE_HZ = 1.0
+MOST_RATE_HZ = 10e6
+"""Sampling rates outside of these are mistakes: a rate in kHz, or a period in its place."""
 
 DAMAGED = (
     OSError,
@@ -55,6 +60,8 @@ class Recording:
         rate_hz: samples per second.
         source: the file.
         nan_count: how many of the samples are NaN.
+        infinity_count: how many are infinite.
+        left_out: channels of another length that were not asked for by name, with their lengths.
     """
 
     names: tuple[str, ...]
@@ -62,6 +69,8 @@ class Recording:
     rate_hz: float
     source: Path
     nan_count: int
+    infinity_count: int = 0
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 def load_recording(
@@ -80,16 +89,19 @@ def load_recording(
 
     Raises:
         RecordingError: the file cannot be read, a channel is not there, not numeric or empty, the
-            channels have different lengths, or the rate is not known.
+            channels have different lengths, or the rate is not known or outside of `LEAST_RATE_HZ` to
+            `MOST_RATE_HZ`.
     """
     path = Path(path)
     found = _read(path)
+    left_out: dict[str, int] = {}
     if not channels:
         lengths = {name: len(values) for name, values in _vectors(found).items()}
         longest = max(lengths.values(), default=0)
         channels = {name: name for name, length in lengths.items() if length == longest and length > 1}
+        left_out = {name: length for name, length in lengths.items() if 1 < length < longest}
         if not channels:
-            raise RecordingError(f"{path} holds no numeric channel; it holds {_listing(found)}")
+            raise RecordingError(f"{path} {_nothing_to_play(found)}; it holds {_listing(found)}")
     columns = {name: _channel(path, found, variable) for name, variable in channels.items()}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -97,11 +109,17 @@ def load_recording(
         raise RecordingError(
             f"the channels of {path} have different lengths: {stated}; map only channels taken together"
         )
+    if any(length < 2 for length in lengths.values()):
+        raise RecordingError(f"{path} is too short: it holds one sample a channel; give a longer recording")
     rate_hz = _stated_rate(path, found) if rate_hz is None else rate_hz
-    if not (rate_hz > 0 and np.isfinite(rate_hz)):
-        raise RecordingError(f"the sampling rate of {path} is {rate_hz} Hz; give a positive one with --fs")
+    if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
+        raise RecordingError(
+            f"the sampling rate of {path} is said to be {rate_hz:g} Hz; give one from {LEAST_RATE_HZ:g} to "
+            f"{MOST_RATE_HZ:,.0f} Hz with --fs"
+        )
     samples = np.column_stack(list(columns.values()))
-    return Recording(tuple(columns), samples, float(rate_hz), path, int(np.isnan(samples).sum()))
+    nans, infinities = int(np.isnan(samples).sum()), int(np.isinf(samples).sum())
+    return Recording(tuple(columns), samples, float(rate_hz), path, nans, infinities, left_out)
 
 
 def list_channels(path: Path | str) -> dict[str, int]:
@@ -125,6 +143,10 @@ def _read(path: Path) -> dict[str, NDArray[np.generic]]:
         return dict(reader(path))
     except RecordingError:
         raise
+    except FileNotFoundError:
+        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path") from None
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
     except DAMAGED as error:
         raise RecordingError(f"{path} cannot be read: {error}") from error
 
@@ -147,9 +169,25 @@ def _read_mat(path: Path) -> Iterator[tuple[str, NDArray[np.generic]]]:
 
 
 def _read_npz(path: Path) -> Iterator[tuple[str, NDArray[np.generic]]]:
-    with np.load(path, allow_pickle=False) as archive:
-        for name in archive.files:
-            yield from _flattened(name, archive[name])
+    with path.open("rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise RecordingError(
+                f"{path} cannot be read: it is not a zip archive, as numpy.savez writes; "
+                "save it anew, or give it the suffix of what it is"
+            )
+        with np.load(file, allow_pickle=False) as archive:
+            for name in archive.files:
+                yield from _flattened(name, _unless_objects(archive, name))
+
+
+def _unless_objects(archive: NpzFile, name: str) -> NDArray[np.generic]:
+    """An array of the archive; Python objects stay unread, they could run code."""
+    try:
+        return np.asarray(archive[name])
+    except ValueError as error:
+        if "pickle" not in str(error):
+            raise
+        return np.empty(0, dtype=object)
 
 
 def _flattened(name: str, value: object) -> Iterator[tuple[str, NDArray[np.generic]]]:
@@ -268,6 +306,12 @@ def _parse_line(path: Path, number: int, cells: list[str], columns: Sequence[int
 
 def _vectors(found: Mapping[str, NDArray[np.generic]]) -> dict[str, NDArray[np.generic]]:
     return {name: values for name, values in found.items() if values.ndim == 1 and values.dtype.kind in "iuf"}
+
+
+def _nothing_to_play(found: Mapping[str, NDArray[np.generic]]) -> str:
+    """Why no channel of a file can be played."""
+    numeric = [values for values in found.values() if values.dtype.kind in "iuf"]
+    return "is too short: no channel has two samples" if numeric else "holds no numeric channel"
 
 
 def _channel(path: Path, found: Mapping[str, NDArray[np.generic]], variable: str) -> Floats:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from sim_hw.demo.errors import DemoError
 from sim_hw.demo.machines import Setpoints
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from sim_hw.recordings import Recording
@@ -33,7 +34,7 @@ def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
         rate_hz: rate of the recording to come.
 
     Raises:
-        DemoError: the recording is shorter than one window.
+        DemoError: the recording is shorter than one window, or a channel of it does not move.
     """
     # Imported here: it takes over a second, and only --baseline needs it.
     from scipy.signal import resample_poly  # noqa: PLC0415
@@ -42,6 +43,11 @@ def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
     found = Setpoints()
     for column, name in enumerate(healthy.names):
         samples: NDArray[np.float64] = healthy.samples[:, column]
+        if np.ptp(samples) == 0.0:
+            raise DemoError(
+                f"baseline {healthy.source} does not move: every sample of {name} is {samples[0]:g}; "
+                "give a recording of the running machine"
+            )
         if ratio != 1:
             samples = resample_poly(samples - samples.mean(), ratio.numerator, ratio.denominator)
         size = round(WINDOW_S * rate_hz)

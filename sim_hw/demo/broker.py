@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import socket
 from typing import TYPE_CHECKING, Self
 
 from amqtt.broker import Broker
 from amqtt.contexts import BrokerConfig, ListenerConfig
+from amqtt.errors import BrokerError
 
 if TYPE_CHECKING:
     from types import TracebackType
 
 _LOOPBACK = "127.0.0.1"
+_ATTEMPTS = 5
 
 # These tell about every client that comes and goes, at warning level and above.
 _NOISY_LOGGERS = ("amqtt", "transitions")
@@ -74,15 +77,29 @@ class EmbeddedBroker:
     async def __aenter__(self) -> Self:
         for name in _NOISY_LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        port = self._wanted_port or _free_port()
+        attempts_left = 1 if self._wanted_port else _ATTEMPTS
+        while self._broker is None:
+            attempts_left -= 1
+            port = self._wanted_port or _free_port()
+            try:
+                self._broker = await self._started(port)
+            except BrokerError as error:
+                # Between finding a free port and listening on it, somebody else may take it.
+                if not (attempts_left and _address_in_use(error)):
+                    raise
+            else:
+                self._port = port
+        return self
+
+    @staticmethod
+    async def _started(port: int) -> _TidyBroker:
         config = BrokerConfig(
             listeners={"default": ListenerConfig(bind=f"{_LOOPBACK}:{port}")},
             plugins={"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
         )
-        self._broker = _TidyBroker(config)
-        await self._broker.start()
-        self._port = port
-        return self
+        broker = _TidyBroker(config)
+        await broker.start()
+        return broker
 
     async def __aexit__(
         self,
@@ -93,6 +110,13 @@ class EmbeddedBroker:
         if self._broker is not None:
             await self._broker.shutdown()
         self._broker = self._port = None
+
+
+def _address_in_use(error: BaseException) -> bool:
+    cause = error.__cause__
+    return cause is not None and (
+        (isinstance(cause, OSError) and cause.errno == errno.EADDRINUSE) or _address_in_use(cause)
+    )
 
 
 def _free_port() -> int:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
+import contextlib
 import json
-import math
-import re
+import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sim_hw.demo import arguments as arguments_of
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    import argparse
+    from collections.abc import Callable, Iterator, Mapping
+    from types import FrameType
 
     from sim_hw.demo.listener import Received
     from sim_hw.demo.session import Outcome, Script
     from sim_hw.recordings import Recording
 
 EXIT_FAILED = 1
+SCENARIO = "paper"
+UNIT = "g"
 UNITS = ("g", "m/s2", "mm/s", "um", "mm", "mil")
 
 
@@ -37,19 +40,22 @@ class DemoCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
+        self._parser = parser
         what = parser.add_argument_group("what to play")
         what.add_argument(
             "--scenario",
-            default="paper",
             metavar="NAME|FILE",
             help="a built-in scenario (paper, healthy, link-faults) or a scenario file (default: paper)",
         )
         what.add_argument(
-            "--seed", type=_whole, metavar="N", help="seed of everything random (default: the scenario's)"
+            "--seed",
+            type=arguments_of.whole,
+            metavar="N",
+            help="seed of everything random (default: the scenario's)",
         )
         what.add_argument(
             "--snr-db",
-            type=float,
+            type=arguments_of.decibels,
             metavar="DB",
             help="signal to noise of the probes (default: the scenario's)",
         )
@@ -61,34 +67,39 @@ class DemoCommand:
         )
         what.add_argument(
             "--map",
-            type=_mapping,
+            type=arguments_of.mapping,
             metavar="SENSOR=VARIABLE,...",
             help="which variables of the recording to play, and as which sensors (default: all of them)",
         )
-        what.add_argument("--fs", type=_positive, metavar="HZ", help="sampling rate of the recording")
         what.add_argument(
-            "--unit", choices=UNITS, default="g", help="unit of the recording's channels (default: g)"
+            "--fs", type=arguments_of.rate_hz, metavar="HZ", help="sampling rate of the recording"
         )
+        what.add_argument("--unit", choices=UNITS, help="unit of the recording's channels (default: g)")
         what.add_argument(
             "--baseline",
             type=Path,
             metavar="FILE",
             help="recording of the healthy machine: alarm setpoints become 1.5 and 3 times its RMS",
         )
-        what.add_argument("--baseline-map", type=_mapping, metavar="SENSOR=VARIABLE,...", help="as --map")
-        what.add_argument("--baseline-fs", type=_positive, metavar="HZ", help="as --fs (default: the same)")
+        what.add_argument(
+            "--baseline-map", type=arguments_of.mapping, metavar="SENSOR=VARIABLE,...", help="as --map"
+        )
+        what.add_argument(
+            "--baseline-fs", type=arguments_of.rate_hz, metavar="HZ", help="as --fs (default: the same)"
+        )
         how = parser.add_argument_group("how to play it")
         how.add_argument(
             "--speed",
-            type=_positive,
+            type=arguments_of.positive,
             default=1.0,
             metavar="N",
             help="N times as fast as real time (default: 1)",
         )
         how.add_argument(
             "--broker",
+            type=arguments_of.broker_url,
             metavar="URL",
-            help="publish to this broker, mqtt://HOST:PORT (default: one in the process)",
+            help="publish to this broker, mqtt://HOST[:PORT], without TLS (default: one in the process)",
         )
         how.add_argument(
             "--json",
@@ -98,39 +109,67 @@ class DemoCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
-        from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
+        if wrong := arguments_of.misuse(arguments):
+            self._parser.error(wrong)
+        with _sigterm_interrupts():
+            try:
+                return _run(arguments)
+            except KeyboardInterrupt:
+                return _fail("interrupted")
 
-        start_logging(verbose=False)
-        if not arguments.json:
-            import logging  # noqa: PLC0415
 
-            # The view shows every alarm; the service's log would say it twice.
-            logging.getLogger("daqsvc.service").setLevel(logging.ERROR)
-        prepare_kernel_cache()
-        try:
-            import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
-            from daqsvc.settings import MachineFileError  # noqa: PLC0415
-            from sim_hw.recordings import RecordingError  # noqa: PLC0415
-            from sim_hw.scenario import ScenarioError  # noqa: PLC0415
-        except ModuleNotFoundError as error:
-            return _fail(f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'")
-        try:
-            script = script_of(arguments)
-            summary = _play(script, arguments)
-        except (DemoError, MachineFileError, RecordingError, ScenarioError) as error:
-            return _fail(str(error))
-        except KeyboardInterrupt:
-            return _fail("interrupted")
-        return (
-            0
-            if summary["complete"]
-            else _fail("the service's last messages did not come back from the broker")
-        )
+def _run(arguments: argparse.Namespace) -> int:
+    from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
+
+    start_logging(verbose=False)
+    if not arguments.json:
+        import logging  # noqa: PLC0415
+
+        # The view shows every alarm; the service's log would say it twice.
+        logging.getLogger("daqsvc.service").setLevel(logging.ERROR)
+    prepare_kernel_cache()
+    try:
+        import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
+        from daqsvc.settings import MachineFileError  # noqa: PLC0415
+        from sim_hw.recordings import RecordingError  # noqa: PLC0415
+        from sim_hw.scenario import ScenarioError  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        return _fail(f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'")
+    try:
+        script = script_of(arguments)
+        summary = _play(script, arguments)
+    except (DemoError, MachineFileError, RecordingError, ScenarioError) as error:
+        return _fail(str(error))
+    return (
+        0 if summary["complete"] else _fail("the service's last messages did not come back from the broker")
+    )
+
+
+@contextlib.contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """SIGTERM does what Ctrl-C does: everything is closed and removed on the way out."""
+
+    def interrupt(_number: int, frame: FrameType | None) -> None:
+        # While the event loop runs, the handler of Ctrl-C is asyncio's, which cancels the main task.
+        handler = signal.getsignal(signal.SIGINT)
+        if not callable(handler):
+            raise KeyboardInterrupt  # a shell's background job ignores Ctrl-C
+        handler(signal.SIGINT, frame)
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _fail(message: str) -> int:
-    print(f"daqsvc demo: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    _say(message)
     return EXIT_FAILED
+
+
+def _say(message: str) -> None:
+    print(f"daqsvc demo: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
 
 
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -179,7 +218,7 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
     from sim_hw.demo.session import Script  # noqa: PLC0415
     from sim_hw.scenario import load_scenario  # noqa: PLC0415
 
-    scenario = load_scenario(arguments.scenario)
+    scenario = load_scenario(arguments.scenario or SCENARIO)
     machine = scenario.simulate(arguments.seed, arguments.snr_db)
     samples = np.column_stack([machine.channels[name] for name in ("x_um", "y_um", "keyphasor_v")])
     return Script(
@@ -198,61 +237,43 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
 def _from_recording(arguments: argparse.Namespace) -> Script:
     from sim_hw.demo.baseline import setpoints  # noqa: PLC0415
     from sim_hw.demo.machines import Setpoints, for_recording  # noqa: PLC0415
+    from sim_hw.demo.playable import playable  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
-    from sim_hw.recordings import load_recording  # noqa: PLC0415
 
-    recording = _playable(load_recording(arguments.recording, arguments.map, arguments.fs))
+    recording = playable(_load(arguments.recording, arguments.map, arguments.fs, "--map"))
     limits = Setpoints()
     if arguments.baseline is not None:
         rate_hz = arguments.baseline_fs or arguments.fs
-        healthy = _playable(
-            load_recording(arguments.baseline, arguments.baseline_map or arguments.map, rate_hz)
+        healthy = _load(
+            arguments.baseline, arguments.baseline_map or arguments.map, rate_hz, "--baseline-map"
         )
+        healthy = playable(healthy)
         limits = setpoints(healthy, recording.rate_hz)
         if not set(limits) & set(recording.names):
             raise DemoError(
                 f"baseline {healthy.source} gives {', '.join(limits)}, the recording "
                 f"{', '.join(recording.names)}; give both the same sensor names with --map and --baseline-map"
             )
+    unit = arguments.unit or UNIT
+    # Made once before anything is started: it says what is wrong with the recording.
+    for_recording(recording, unit, limits, "mqtt://127.0.0.1:1883")
     return Script(
         title=f"{recording.source.name}: {', '.join(recording.names)} at {recording.rate_hz:g} Hz",
-        machine=lambda url: for_recording(recording, arguments.unit, limits, url),
+        machine=lambda url: for_recording(recording, unit, limits, url),
         stream="recording",
         samples=recording.samples,
         rate_hz=recording.rate_hz,
     )
 
 
-def _playable(recording: Recording) -> Recording:
-    if recording.nan_count:
-        raise DemoError(
-            f"{recording.source} holds {recording.nan_count} NaN samples, which no device could send; "
-            "cut them out or interpolate them"
+def _load(path: Path, channels: Mapping[str, str] | None, rate_hz: float | None, option: str) -> Recording:
+    from sim_hw.recordings import load_recording  # noqa: PLC0415
+
+    recording = load_recording(path, channels, rate_hz)
+    if recording.left_out:
+        left_out = ", ".join(f"{name} ({length} samples)" for name, length in recording.left_out.items())
+        _say(
+            f"warning: {path}: left out {left_out}: not as long as the others "
+            f"({len(recording.samples)} samples); choose channels with {option}"
         )
-    names = tuple(re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-") for name in recording.names)
-    return replace(recording, names=names)
-
-
-def _mapping(text: str) -> dict[str, str]:
-    pairs = [pair.partition("=") for pair in text.split(",")]
-    if not all(sensor and variable for sensor, _, variable in pairs):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a map; write SENSOR=VARIABLE, several with commas between"
-        )
-    return {sensor.strip(): variable.strip() for sensor, _, variable in pairs}
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
-    return int(text)
+    return recording

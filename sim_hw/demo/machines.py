@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.settings import MachineFile, parse_machine_file
+from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ def for_recording(recording: Recording, unit: str, setpoints: Setpoints, url: st
     """A machine with one sensor per channel of a recording, int16 samples over CAN FD.
 
     Raises:
-        DemoError: more channels than a frame has room for.
+        DemoError: more channels than a frame has room for, or the service could not diagnose it; says so
+            in words of the recording, as nobody sees the machine file that is made of it.
     """
     names = recording.names
     if len(names) > MOST_CHANNELS:
@@ -93,7 +94,7 @@ site = "demo"
 box = "virtual"
 [machine]
 name = "recorded-machine"
-description = {json.dumps(str(recording.source))}
+description = {json.dumps(str(recording.source).encode(errors="replace").decode())}
 speed_rpm = 1800.0
 [buses.can0]
 driver = "can"
@@ -149,7 +150,33 @@ danger = {danger!r}
 deadband = {0.05 * alert!r}
 """
             )
-    return parse_machine_file("".join(tables), Path("recorded-machine.toml"))
+    try:
+        return parse_machine_file("".join(tables), Path("recorded-machine.toml"))
+    except MachineFileError as error:
+        raise _in_words(error, recording) from error
+
+
+def _in_words(error: MachineFileError, recording: Recording) -> DemoError:
+    """What is wrong with the file made of a recording, as the recording's and the options' fault."""
+    told: list[str] = []
+    remedies: dict[str, None] = {}
+    for problem in error.problems:
+        of_levels = problem.key.startswith("pipeline")
+        key = problem.key.rpartition(".")[2]
+        told.append(problem.message if of_levels or not problem.value else f"{key} {problem.message}")
+        remedies |= dict.fromkeys(
+            [
+                "correct the sampling rate (--fs)"
+                if of_levels
+                else "give another baseline (--baseline)"
+                if problem.key.startswith("alarms")
+                else "choose and name the channels with --map"
+            ]
+        )
+    return DemoError(
+        f"{recording.source} cannot be played at {recording.rate_hz:g} Hz as {', '.join(recording.names)}: "
+        f"{'; '.join(told)}. Remedy: {', or '.join(remedies)}"
+    )
 
 
 def _scale(samples: NDArray[np.float64]) -> float:

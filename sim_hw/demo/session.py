@@ -7,8 +7,9 @@ import contextlib
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import aiomqtt
 import can
 
 from daqsvc import assembly
@@ -21,7 +22,7 @@ from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import DrivenPacer, RealTimePacer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -33,7 +34,11 @@ if TYPE_CHECKING:
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.scenario import Onset
 
+T = TypeVar("T")
+
 LINK_UP_S = 20.0
+KERNELS_S = 300.0
+"""What a slow box may take to compile the kernels, at the first run."""
 LAST_FRAMES_S = 5.0
 
 
@@ -126,7 +131,8 @@ class Session:
         """Play it from the beginning to the end.
 
         Raises:
-            DemoError: the broker cannot be reached, or the service failed.
+            DemoError: the broker cannot be reached or was lost, or the service did not start.
+            Exception: what ``hear`` raised; the service has been stopped.
         """
         async with contextlib.AsyncExitStack() as stack:
             url = self._broker_url
@@ -136,9 +142,15 @@ class Session:
             store = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="daqsvc-demo-")))
             listener = Listener(url, f"daqsvc/{machine.site}/{machine.box}", self._take)
             listening = await stack.enter_async_context(_task(listener.run()))
-            await _first(listener.subscribed(), listening, f"the broker {url} does not answer")
-            await self._serve(machine, store)
-            self.outcome.complete = await listener.farewell()
+            await _first(listener.subscribed(), listening, f"the broker {url} does not answer", LINK_UP_S)
+            try:
+                await _unless_ended(listening, self._serve(machine, store))
+                self.outcome.complete = await _unless_ended(listening, listener.farewell())
+            except aiomqtt.MqttError as error:
+                raise DemoError(
+                    f"the broker {url} was lost while the demo played ({error}); see that it runs, and "
+                    "play again"
+                ) from error
             self.outcome.messages = listener.messages
         return self.outcome
 
@@ -147,14 +159,18 @@ class Session:
         service = self.service = Service(machine, store, clock)
         stop = asyncio.Event()
         async with _task(service.run(stop)) as running:
-            await _first(service.ready.wait(), running, "the service did not start")
-            await _first(_links_up(service), running, "bus and broker did not come up")
-            channel = machine.buses["can0"].model_dump()["channel"]
-            with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-                await self._play(bus, service, clock)
-            await self._last_frames(service)
-            stop.set()
-            await asyncio.shield(running)
+            await _first(service.ready.wait(), running, "the service did not start", KERNELS_S)
+            try:
+                await _first(_links_up(service), running, "bus and broker did not come up", LINK_UP_S)
+                channel = machine.buses["can0"].model_dump()["channel"]
+                with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
+                    await _unless_ended(running, self._play(bus, service, clock))
+                await self._last_frames(service)
+            finally:
+                # Also when playing is broken off: the service stops as it does in the field.
+                stop.set()
+                await asyncio.wait({running})
+            running.result()
         self.outcome.figures = service.figures()
 
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
@@ -226,21 +242,31 @@ async def _until(true: Callable[[], bool]) -> None:
         await asyncio.sleep(0.01)
 
 
-async def _first(wanted: Any, task: asyncio.Task[None], failure: str) -> None:
+async def _first(wanted: Any, task: asyncio.Task[None], failure: str, limit_s: float) -> None:
     """Wait for ``wanted``, unless ``task`` fails before or it takes too long."""
     waiting = asyncio.ensure_future(wanted)
     try:
-        await asyncio.wait({waiting, task}, timeout=LINK_UP_S, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({waiting, task}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
         if task.done() and not task.cancelled() and (error := task.exception()) is not None:
             raise DemoError(f"{failure} ({error})") from error
         if not waiting.done():
-            raise DemoError(f"{failure} within {LINK_UP_S:g} s")
+            raise DemoError(f"{failure} within {limit_s:g} s")
     finally:
         waiting.cancel()
 
 
+async def _unless_ended(task: asyncio.Task[None], work: Coroutine[Any, Any, T]) -> T:
+    """The result of ``work``, broken off if ``task`` ends before; then what that raised is raised."""
+    async with _task(work) as working:
+        await asyncio.wait({working, task}, return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            return working.result()
+    task.result()
+    raise DemoError("the service or its listener ended before everything was played; play it again")
+
+
 @contextlib.asynccontextmanager
-async def _task(work: Any) -> AsyncIterator[asyncio.Task[None]]:
+async def _task(work: Coroutine[Any, Any, T]) -> AsyncIterator[asyncio.Task[T]]:
     """A task that is cancelled at the end, if it still runs; whoever awaits it hears of its failure."""
     task = asyncio.create_task(work)
     try:

@@ -23,7 +23,24 @@ if TYPE_CHECKING:
 LAST_ALARMS = 8
 BAR = 28
 PER_SECOND = 8
+COLUMNS = (
+    ("rms", "RMS", None),
+    ("peak", "peak", None),
+    ("crest_factor", "crest", ""),
+    ("velocity_rms", "velocity RMS", "mm/s"),
+    ("gap_voltage", "gap", "V"),
+)
+"""Statistics that are shown if there are any, with title and unit; None for the sensor's own unit."""
+
 COLOURS = {"normal": "green", "alert": "yellow", "danger": "red"}
+
+
+class _PipeConsole(Console):
+    """Says it when nobody reads any more, where rich would exit at once and leave everything as it is."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        raise BrokenPipeError
 
 
 class View:
@@ -38,7 +55,7 @@ class View:
     def __init__(self, script: Script, speed: float, console: Console | None = None) -> None:
         self._script = script
         self._speed = speed
-        self._console = console or Console()
+        self._console = console or _PipeConsole()
         self._levels: dict[str, dict[str, Any]] = {}
         self._bank: dict[str, Any] | None = None
         self._alarms: deque[dict[str, Any]] = deque(maxlen=LAST_ALARMS)
@@ -52,6 +69,7 @@ class View:
     def __enter__(self) -> Self:
         self._console.print(Text(self._script.title, style="bold"))
         if self._console.is_terminal:
+            self._console.print(Text("the first run compiles kernels, which may take minutes", style="dim"))
             self._live.start()
         return self
 
@@ -79,7 +97,7 @@ class View:
                 played_s = payload["window"]["end_index"] / self._script.rate_hz
                 self._start_ns = payload["monotonic_ns"] - round(1e9 * played_s)
         elif message.kind == "alarm":
-            self._alarms.append(payload)
+            self._alarms.appendleft(payload)
             if not self._console.is_terminal:
                 self._console.print(self._alarm_line(payload), soft_wrap=True)
         elif message.kind == "status":
@@ -90,12 +108,16 @@ class View:
         parts: list[Any] = [Panel(self._channels(), title="channels", title_align="left")]
         if self._bank is not None:
             title = f"rotor: {self._bank['decision']}"
+            if self._bank["revolutions"] is not None:
+                title += f" at revolution {self._bank['revolutions']:.0f}"
             if others := [mode for mode in self._bank["group"] if mode != self._bank["decision"]]:
                 title += f", not told apart from {', '.join(others)}"
             parts.append(Panel(self._modes(self._bank), title=title, title_align="left"))
-        alarms = [self._alarm_line(alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
-        parts.append(Panel(Group(*alarms), title="alarms, as they came from the broker", title_align="left"))
+        # The alarms come last, the newest first: a low terminal cuts off the oldest and nothing else.
         parts.append(Panel(self._health(), title="link and loop", title_align="left"))
+        alarms = [self._alarm_line(alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
+        title = "alarms, as they came from the broker, newest first"
+        parts.append(Panel(Group(*alarms), title=title, title_align="left"))
         return Group(*parts)
 
     def _seconds(self, t_ns: int) -> float:
@@ -104,9 +126,16 @@ class View:
     def _channels(self) -> Table:
         table = Table(box=None, pad_edge=False, expand=True)
         table.add_column("sensor")
-        for title in ("RMS", "peak", "crest", "velocity RMS", "gap"):
-            table.add_column(title, justify="right")
-        table.add_column("state")
+        measured = {
+            name
+            for payload in self._levels.values()
+            for name, value in payload["statistics"].items()
+            if value is not None
+        }
+        shown = [column for column in COLUMNS if column[0] in measured]
+        for _, title, _ in shown:
+            table.add_column(title, justify="right", no_wrap=True)
+        table.add_column("now", no_wrap=True)
         for sensor, payload in sorted(self._levels.items()):
             values = payload["statistics"]
             unit = payload.get("units", {}).get("rms", "")
@@ -116,11 +145,7 @@ class View:
             colour = COLOURS.get(payload["decision"], "dim") if payload["quality"] == "good" else "magenta"
             table.add_row(
                 sensor,
-                _figure(values.get("rms"), unit),
-                _figure(values.get("peak"), unit),
-                _figure(values.get("crest_factor"), ""),
-                _figure(values.get("velocity_rms"), "mm/s"),
-                _figure(values.get("gap_voltage"), "V"),
+                *(_figure(values.get(name), unit if its is None else its) for name, _, its in shown),
                 Text(state, style=colour),
             )
         if not self._levels:
@@ -140,8 +165,6 @@ class View:
                 f"{probability or 0.0:6.3f}",
                 Text("declared", style=f"bold {colour}") if declared else "",
             )
-        turns = bank["revolutions"]
-        table.add_row("", Text("" if turns is None else f"revolution {turns:.0f}", style="dim"), "", "")
         return table
 
     def _alarm_line(self, alarm: dict[str, Any]) -> Text:
@@ -152,31 +175,34 @@ class View:
         line.append(f" {alarm['kind']:<9} {alarm['message']}")
         return line
 
-    def _health(self) -> Table:
-        table = Table.grid(padding=(0, 3))
+    def _health(self) -> Group:
         if self._status is None:
-            table.add_row(Text("waiting for the first status", style="dim"))
-            return table
+            return Group(Text("waiting for the first status", style="dim"))
+        # Lines short enough for a narrow terminal, so that what stands below them stays in sight.
+        lines: list[Text] = []
         for name, stream in self._status["streams"].items():
-            table.add_row(
-                f"stream {name}",
-                f"{stream['samples_received']:,} samples",
-                Text(f"{stream['samples_lost']:,} lost", style="red" if stream["samples_lost"] else "green"),
-                f"{stream['frames_duplicate']} twice, {stream['frames_reordered']} overtaken, "
-                f"{stream['frames_corrupt']} corrupt",
-                f"jitter {stream['jitter_ms']:.2f} ms",
+            lost = stream["samples_lost"]
+            lines.append(
+                Text.assemble(
+                    f"{name}: {stream['samples_received']:,} samples, ",
+                    (f"{lost:,} lost", "red" if lost else "green"),
+                    f", jitter {stream['jitter_ms']:.2f} ms",
+                )
+            )
+            lines.append(
+                Text(
+                    f"frames: {stream['frames_duplicate']} twice, {stream['frames_reordered']} overtaken, "
+                    f"{stream['frames_corrupt']} corrupt"
+                )
             )
         played_s = min(self._seconds(self._now_ns), self._script.duration_s)
         lag = self._status["loop_lag_ms"]
-        mqtt = self._status["mqtt"]
-        table.add_row(
-            "event loop",
-            f"lag p50 {lag['p50']:.2f} ms",
-            f"p99 {lag['p99']:.2f} ms",
-            f"MQTT {mqtt.get('acknowledged', 0)} acknowledged, {self._status['outbox']['depth']} waiting",
-            f"{played_s:.1f} of {self._script.duration_s:.1f} s, speed {self._speed:g}",
-        )
-        return table
+        delivered = self._status["mqtt"].get("acknowledged", 0)
+        waiting = self._status["outbox"]["depth"]
+        lines.append(Text(f"event loop lag: p50 {lag['p50']:.2f} ms, p99 {lag['p99']:.2f} ms"))
+        lines.append(Text(f"MQTT: {delivered:,} acknowledged, {waiting:,} waiting"))
+        lines.append(Text(f"{played_s:.1f} of {self._script.duration_s:.1f} s, speed {self._speed:g}"))
+        return Group(*lines)
 
     def show_summary(self, summary: dict[str, Any], console: Console | None = None) -> None:
         """Print the summary, to another console if one is given."""

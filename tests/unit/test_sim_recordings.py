@@ -156,9 +156,9 @@ def test_channels_that_cannot_be_played(mat, channels, message):
         load_recording(mat, channels, 100)
 
 
-@pytest.mark.parametrize("rate_hz", [0, -1, float("nan"), float("inf")])
-def test_rate_must_be_positive(mat, rate_hz):
-    with pytest.raises(RecordingError, match="--fs"):
+@pytest.mark.parametrize("rate_hz", [0, -1, 0.9, 1.1e7, float("nan"), float("inf")])
+def test_rate_must_be_sensible(mat, rate_hz):
+    with pytest.raises(RecordingError, match="from 1 to 10,000,000 Hz with --fs"):
         load_recording(mat, rate_hz=rate_hz)
 
 
@@ -187,6 +187,11 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         ("a.mat", b"no such thing" * 20, "cannot be read"),
         ("a.mat", b"", "cannot be read"),
         ("a.npz", b"PK no such thing", "cannot be read"),
+        ("a.npz", b"\x80\x04no pickle either", "cannot be read: it is not a zip archive"),
+        ("a.npz", _npz(x=np.array([{"a": 1}])), r"no numeric channel; it holds x \(not numeric\)"),
+        ("a.npz", _npz(x=np.array([1.0])), "is too short: no channel has two samples"),
+        ("a.npz", _npz(x=np.array([])), "is too short"),
+        ("a.csv", b"1,2\n", "is too short"),
         ("a.npz", ENCRYPTED_NPZ, "cannot be read: .*encrypted"),
         ("a.wav", b"RIFF", "use .mat, .npz, .csv, .csv.gz"),
     ],
@@ -198,8 +203,24 @@ def test_files_that_cannot_be_read(tmp_path, name, content, message):
         load_recording(path, rate_hz=1)
 
 
+def test_one_sample_asked_for_by_name_is_too_short(tmp_path):
+    path = write_csv(tmp_path, "1,2\n")
+    with pytest.raises(RecordingError, match=r"too short: it holds one sample a channel"):
+        load_recording(path, {"x": "0"}, 100)
+
+
+def test_infinities_are_counted(tmp_path):
+    recording = load_recording(write_csv(tmp_path, "1,2\ninf,nan\n-inf,4\n"), rate_hz=1)
+    assert (recording.nan_count, recording.infinity_count) == (1, 2)
+
+
+def test_channels_of_another_length_are_told(mat):
+    assert load_recording(mat).left_out == {"short": 20}
+    assert load_recording(mat, {"a": "DE"}).left_out == {}
+
+
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"nothing\.csv cannot be read: .*No such file"):
+    with pytest.raises(RecordingError, match=r"nothing\.csv cannot be read: there is no such file"):
         list_channels(tmp_path / "nothing.csv")
 
 
