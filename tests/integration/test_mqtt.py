@@ -16,6 +16,7 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
+from daqsvc.publish.connection import Connection
 from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
 from daqsvc.publish.topics import Topics
@@ -158,8 +159,16 @@ async def test_telemetry_arrives_and_is_not_retained(broker, outbox):
             assert later.on("/status") == []
 
 
-async def test_a_publisher_that_stops_hands_over_the_telemetry_that_waits(broker, outbox):
+async def test_a_publisher_that_stops_hands_over_the_telemetry_that_waits(broker, outbox, monkeypatch):
     port, protocol = broker
+    publish = Connection.publish
+
+    async def at_leisure(self, topic, *arguments, **options):
+        if options["qos"] == 0:
+            await asyncio.sleep(0.005)
+        await publish(self, topic, *arguments, **options)
+
+    monkeypatch.setattr(Connection, "publish", at_leisure)
     async with Consumer(port) as live:
         async with publishing(outbox, port, protocol) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")

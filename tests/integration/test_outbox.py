@@ -200,6 +200,18 @@ async def test_numbers_go_on_though_everything_is_lost_and_the_wall_clock_was_se
     await second.close()
 
 
+async def test_the_latest_of_each_topic_is_known_whether_it_is_sent_or_not(tmp_path):
+    outbox = await opened(tmp_path / "outbox.sqlite")
+    first, second, other = [await outbox.append(topic, payload, retain=True) for topic in ("a", "a", "b")]
+    await outbox.append("telemetry", payload, retain=False)
+    outbox.mark_sent(first)
+    outbox.mark_sent(second)
+    await eventually(lambda: outbox.counters.depth == 2, "both are marked")
+    assert [message.sequence for message in await outbox.latest()] == [second, other]
+    assert [message.sequence for message in await outbox.retained()] == [second]
+    await outbox.close()
+
+
 async def test_the_journal_of_sent_messages_is_bounded(tmp_path):
     outbox = await opened(tmp_path / "outbox.sqlite", keep_sent=10)
     old = await outbox.append("old/but/retained", payload, retain=True)
