@@ -134,6 +134,9 @@ def list_channels(path: Path | str) -> dict[str, int]:
 
 def _read(path: Path) -> dict[str, NDArray[np.generic]]:
     """Everything in a file, as arrays of at most one dimension by name."""
+    # Asked first, as the readers say it in words of their own.
+    if not path.exists():
+        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path")
     name = path.name.lower()
     readers = {".mat": _read_mat, ".npz": _read_npz, ".csv": _read_csv, ".csv.gz": _read_csv}
     reader = next((reader for suffix, reader in readers.items() if name.endswith(suffix)), None)
@@ -143,8 +146,6 @@ def _read(path: Path) -> dict[str, NDArray[np.generic]]:
         return dict(reader(path))
     except RecordingError:
         raise
-    except FileNotFoundError:
-        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path") from None
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
     except DAMAGED as error:

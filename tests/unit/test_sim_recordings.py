@@ -219,9 +219,10 @@ def test_channels_of_another_length_are_told(mat):
     assert load_recording(mat, {"a": "DE"}).left_out == {}
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(RecordingError, match=r"nothing\.csv cannot be read: there is no such file"):
-        list_channels(tmp_path / "nothing.csv")
+@pytest.mark.parametrize("name", ["nothing.csv", "nothing.mat", "nothing.npz", "nothing"])
+def test_a_missing_file_is_named(name, tmp_path):
+    with pytest.raises(RecordingError, match=rf"{name} cannot be read: there is no such file"):
+        list_channels(tmp_path / name)
 
 
 def test_truncated_mat_and_gzip(tmp_path, mat):
