@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from daqsvc.alarms.alarm import Alarm, Instant
-from daqsvc.alarms.events import AlarmEvent, Identity
+from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
 from daqsvc.alarms.rules import DiagnosisRule, Finding, LevelRule, Watch
 from daqsvc.alarms.states import AlarmState, Hold, Level
 
@@ -118,13 +118,17 @@ class AlarmManager:
         for event in told:
             ours = event.identity == self._identity
             if ours and event.alarm in ruled_by_name:
-                self._resume_ruled(ruled_by_name[event.alarm], event, speakers)
+                self._resume_ruled(ruled_by_name[event.alarm], event)
             elif event.to_state is AlarmState.NORMAL:
                 continue
             elif ours and event.alarm in quality:
                 self._resume_quality(event, speakers)
             else:
                 withdrawn.append(self._withdraw(event))
+        for ruled in self._ruled:
+            if ruled.alarm.is_held(Hold.SUPPRESSED) and self._not_ok_reason(ruled) is None:
+                # Whoever found a sensor bad is gone; then the alarm's own detector must find it good.
+                self._not_ok[ruled.detector] = (frozenset(), "a sensor was not OK before the restart")
         return withdrawn
 
     def acknowledge(self, alarm: str, by: str = "") -> AlarmEvent:
@@ -207,17 +211,10 @@ class AlarmManager:
                 return reason
         return None
 
-    def _resume_ruled(self, ruled: _Ruled, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> None:
+    def _resume_ruled(self, ruled: _Ruled, event: AlarmEvent) -> None:
         level = event.to_level if event.own_state.is_active else Level.NORMAL
         found = ruled.watch.resume(level, event.cause)
         ruled.alarm.resume(event, found, self._since(event.wall_ns))
-        if not ruled.alarm.is_held(Hold.SUPPRESSED):
-            return
-        if event.cause.detector in speakers:
-            self._blame(event.cause)
-        else:
-            # Whoever found the sensor bad is gone; then the alarm's own detector must find it good.
-            self._not_ok.setdefault(ruled.detector, (frozenset(), "a sensor was not OK before the restart"))
 
     def _resume_quality(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> None:
         cause = event.cause
@@ -225,7 +222,8 @@ class AlarmManager:
         alarm.resume(event, cause.quality, self._since(event.wall_ns))
         if event.own_state.is_active and cause.quality != "good" and cause.detector in speakers:
             self._doubts.setdefault(event.alarm, {})[cause.detector] = cause
-            if cause.quality == "not_ok":
+            # What has changed to missing was not OK before, and nobody has said since that it is good.
+            if cause.quality == "not_ok" or event.kind is EventKind.CHANGED:
                 self._blame(cause)
 
     def _withdraw(self, event: AlarmEvent) -> AlarmEvent:
