@@ -46,7 +46,7 @@ class Setpoints(dict[str, tuple[float, float]]):
 
 def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
     """The rig of the paper, at the scenario's speed, rate, rotor and noise."""
-    text = resources.files(__package__).joinpath("machines", "laval-rig.toml").read_text("utf-8")
+    text = resources.files(__package__).joinpath("laval-rig.toml").read_text("utf-8")
     rig = parse_machine_file(text, Path("laval-rig.toml"))
     assert rig.machine.rotor is not None  # noqa: S101 - the file next to this one has it
     assert rig.pipeline.rotor_bank is not None  # noqa: S101
