@@ -12,6 +12,7 @@ Sequence numbers are never used twice on a box. A healthy file knows its highest
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import logging
 import os
 import sqlite3
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
+    from typing import BinaryIO
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +93,7 @@ class Journal:
         self._wall_ns = wall_ns
         self._keep_sent = keep_sent
         self._connection: sqlite3.Connection | None = None
+        self._lock: BinaryIO | None = None
         self._next = 0
         self._mark = 0
         self._sent_since_trim = 0
@@ -108,6 +111,7 @@ class Journal:
         """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._take_possession()
             self._mark = self._read_mark()
             try:
                 self._connect()
@@ -120,6 +124,25 @@ class Journal:
                 f"cannot open the outbox {self.path}: {error}; "
                 f"give the service a directory that it may write in, with space left"
             ) from error
+
+    def _take_possession(self) -> None:
+        """Keep other processes out: two writers would give the same numbers and fight at the broker.
+
+        The system gives the lock back however this process ends.
+        """
+        lock = self.path.with_name(self.path.name + ".lock").open("ab")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            raise OutboxError(
+                f"another daqsvc uses the store {self.path.parent}; "
+                "stop it, or give this one a directory of its own"
+            ) from None
+        except BaseException:
+            lock.close()
+            raise
+        self._lock = lock
 
     def quarantine(self, error: sqlite3.DatabaseError) -> None:
         """Set a corrupt file aside and begin a new one."""
@@ -233,6 +256,9 @@ class Journal:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def _open_connection(self) -> sqlite3.Connection:
         if self._connection is None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
+    check_bus_load,
     check_channel_use,
     check_channels,
     check_counter,
@@ -72,6 +73,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
                     yield check_plain_layout(stream.layout, (*at, "layout"))
                 yield check_channels(stream.layout, (*at, "layout"))
     yield check_ids(draft, messages)
+    yield check_bus_load(draft, messages)
     yield _unused_buses(draft)
     yield check_interfaces(draft)
     with suppress(UnusableValueError):

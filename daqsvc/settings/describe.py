@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm
 from daqsvc.settings.buses import CanBus
-from daqsvc.settings.layout_checks import frame_facts
+from daqsvc.settings.layout_checks import bus_share, frame_facts
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
-from daqsvc.settings.wire import frame_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -81,7 +80,8 @@ def _bus(machine: MachineFile, name: str) -> str:
         parts.append(f"data {_bit_rate(bus.data_bitrate)}")
     if bus.options:
         parts.append(f"options {' '.join(sorted(bus.options))}")
-    loads = [_bus_share(machine, key) for key, stream in machine.streams.items() if stream.bus == name]
+    streams = [key for key, stream in machine.streams.items() if stream.bus == name]
+    loads = [bus_share(machine, key, machine.dbc_messages.get(key)) for key in streams]
     known = [load for load in loads if load is not None]
     if loads and len(known) == len(loads):
         load = _percent(sum(least for least, _ in known), sum(most for _, most in known))
@@ -94,7 +94,7 @@ _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bu
 
 def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
     facts = frame_facts(stream, machine.dbc_messages.get(name))
-    share = _bus_share(machine, name)
+    share = bus_share(machine, name, machine.dbc_messages.get(name))
     shown_share = "" if share is None else _percent(*share)
     if facts is None:
         return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", "", "", shown_share
@@ -109,20 +109,6 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
         f"{facts.counter_bits} bit {stream.layout.counter.counts}",
         shown_share,
     )
-
-
-def _bus_share(machine: MachineFile, name: str) -> tuple[float, float] | None:
-    """Share of the bus's time that a stream takes, with the fewest and the most stuff bits."""
-    stream = machine.streams[name]
-    bus = machine.buses[stream.bus]
-    facts = frame_facts(stream, machine.dbc_messages.get(name))
-    if not isinstance(bus, CanBus) or bus.bitrate is None or facts is None:
-        return None
-    time = frame_time(
-        facts.length, extended=facts.extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
-    )
-    frames_per_s = stream.rate_hz / facts.samples_per_frame
-    return frames_per_s * time.least_s, frames_per_s * time.most_s
 
 
 _SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from daqsvc.settings.buses import CRC_BYTES, CanBus, DbcLayout, PlainLayout, Stream
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
-from daqsvc.settings.wire import CLASSIC_MAX_LENGTH
+from daqsvc.settings.wire import CLASSIC_MAX_LENGTH, frame_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -56,6 +56,23 @@ def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None
         counts_samples,
         layout.samples_per_frame,
     )
+
+
+def bus_share(machine: MachineFile, name: str, message: DbcMessage | None) -> tuple[float, float] | None:
+    """Share of the bus's time that a stream takes, with the fewest and the most stuff bits.
+
+    None where the bit rate or the frame is not known.
+    """
+    stream = machine.streams[name]
+    bus = machine.buses.get(stream.bus)
+    facts = frame_facts(stream, message)
+    if not isinstance(bus, CanBus) or bus.bitrate is None or facts is None:
+        return None
+    time = frame_time(
+        facts.length, extended=facts.extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
+    )
+    frames_per_s = stream.rate_hz / facts.samples_per_frame
+    return frames_per_s * time.least_s, frames_per_s * time.most_s
 
 
 def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
@@ -162,6 +179,22 @@ def check_frame_length(
             f'and bus "{stream.bus}" is classic CAN',
             f"write fd = true in [buses.{stream.bus}], or make the frame 8 bytes or shorter",
         )
+
+
+def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
+    """A bus has time for all the frames on it."""
+    for bus in draft.buses:
+        load = 0.0
+        for name, stream in draft.streams.items():
+            with suppress(UnusableValueError):
+                share = bus_share(draft, name, messages.get(name)) if stream.bus == bus else None
+                load += 0.0 if share is None else share[0]
+        if load > 1.0:
+            yield Finding(
+                ("buses", bus, "bitrate"),
+                f"is too slow: the streams on the bus would take it {100 * load:,.0f} % of the time at least",
+                "correct the rates of the streams, put more samples in a frame, or use a faster bus",
+            )
 
 
 def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> Iterator[Finding]:

@@ -17,7 +17,8 @@ def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, An
     """The summary as one JSON object.
 
     A declaration is a change of the rotor bank's decision. Its delay counts from the onset of the mode,
-    in revolutions. It is wrong if the machine was in another mode.
+    in revolutions. It is wrong if the machine was in another mode. Samples at the end that do not fill
+    a frame are left over: a device would send them with the next ones.
     """
     declared = [
         (str(payload["decision"]), int(payload["window"]["end_index"]))
@@ -41,6 +42,7 @@ def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, An
         else 0,
         "samples": {
             "sent": outcome.samples_sent,
+            "left_over": len(script.samples) - outcome.samples_sent,
             "received": stream["samples_received"],
             "lost": stream["samples_lost"],
             "skipped_by_detectors": sum(d["samples_skipped"] for d in figures["detectors"].values()),

@@ -228,6 +228,8 @@ class View:
             f"samples: {samples['sent']:,} sent, {samples['received']:,} received, {samples['lost']:,} lost, "
             f"{samples['skipped_by_detectors']:,} skipped"
         )
+        if samples["left_over"]:
+            console.print(f"the last {samples['left_over']} samples do not fill a frame and were not sent")
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):
                 told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())

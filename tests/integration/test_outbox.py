@@ -284,3 +284,16 @@ async def test_kill_minus_nine_loses_nothing_that_was_promised(tmp_path):
     there = {m.sequence for m in await outbox.pending(0, 10**6)}
     assert there.issuperset(promised)
     await outbox.close()
+
+
+async def test_a_store_belongs_to_one_service_at_a_time(tmp_path):
+    first = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    await first.open()
+    second = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    with pytest.raises(OutboxError, match="another daqsvc uses the store"):
+        await second.open()
+    await second.close()
+    await first.close()
+    third = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    await third.open()
+    await third.close()

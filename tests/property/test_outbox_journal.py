@@ -70,6 +70,7 @@ class Restarts(RuleBasedStateMachine):
 
     @rule()
     def crash(self):
+        self.journal._lock.close()  # as the system does for a process that ends
         self.left_open.append(self.journal)
         self.journal = self.opened()
 

@@ -307,3 +307,11 @@ def test_what_is_doubtful_is_a_warning(path, replacements, key, words):
     assert words in warning.message
     assert warning.remedy
     assert warning.line
+
+
+def test_a_bus_without_time_for_its_frames_is_refused():
+    text = MOTOR.read_text().replace("rate_hz = 12_000.0", "rate_hz = 1_200_000.0")
+    found = [problem for problem in problems_of(text, MOTOR) if problem.key == "buses.can0.bitrate"]
+    assert len(found) == 1
+    assert "would take it 1," in found[0].message
+    assert "faster bus" in found[0].remedy
