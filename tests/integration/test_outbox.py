@@ -126,12 +126,13 @@ async def test_a_full_disk_is_reported_once_and_nothing_is_lost(tmp_path, connec
         assert not any(future.done() for future in waiting)
         disk.execute("PRAGMA max_page_count = 1000000")
         sequences = await asyncio.gather(*waiting)
+        # The writer says so from its own thread, after whoever waited has heard.
+        await eventually(lambda: "can be written again" in caplog.text, "the recovery is told")
     assert sequences == [before + 1, before + 2, before + 3]
     assert outbox.counters.waiting == 0
     assert [
         record.getMessage().split(": ")[-1] for record in caplog.records if record.levelname == "ERROR"
     ] == ["database or disk is full; messages wait in memory until it can"]
-    assert "can be written again" in caplog.text
     await outbox.close()
 
 
