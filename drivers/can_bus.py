@@ -132,7 +132,13 @@ class CanDriver:
         try:
             return await reader.ended
         finally:
-            await asyncio.shield(asyncio.to_thread(reader.close))
+            closing = asyncio.ensure_future(asyncio.to_thread(reader.close))
+            try:
+                await asyncio.shield(closing)
+            except asyncio.CancelledError:
+                # Cancelled while the bus is being closed: that takes its half second all the same.
+                await asyncio.wait({closing}, timeout=2 * SHUTDOWN_S)
+                raise
 
     def take(self, found: _Sorted) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""
