@@ -4,9 +4,9 @@ Source: the paper "Fault Detection and Diagnosis of Rotating Machinery", section
 normalised by the radial clearance c, time by the undamped natural frequency of the healthy shaft,
 tau = omega_s t. With z = x + iy the motion is
 
-    z'' + 2 zeta z' + k z = e w^2 exp(i (theta + phi)) - i g + f(z, z'),    theta' = w
+    z'' + 2 zeta z' + k z = e w^2 exp(i (theta + phi)) + l_x - i g + f(z, z'),    theta' = w
 
-Four statements of the paper cannot stand as printed and are corrected here:
+The paper's static load acts along -y alone; here it has both components. Four statements of the paper cannot stand as printed and are corrected here:
 
 * The contact force pushes the disc back: the state equation needs ``- gamma f(Cx)``, not ``+``. With
   the printed sign the disc is thrown out as soon as it touches.
@@ -36,6 +36,7 @@ class NormalisedRotor:
         zeta: damping ratio, D_s / (2 M omega_s).
         k: stiffness over the stiffness that omega_s was taken with.
         g: static load towards -y, G / (M c omega_s^2).
+        load_x: static load towards +x, in the unit of ``g``.
         contact_stiffness: K* = K_beta / (M c omega_s^2).
         alpha: exponent of the contact force, 1 linear, 1.5 Hertz.
         mu: coefficient of Coulomb friction at the contact.
@@ -53,13 +54,16 @@ class NormalisedRotor:
     mu: float = 0.0
     heavy_spot_rad: float = 0.0
     contact_radius: float = 250.0
+    load_x: float = 0.0
 
     def __post_init__(self) -> None:
         _require_positive("normalised rotor", zeta=self.zeta, k=self.k, contact_radius=self.contact_radius)
         _require_not_negative(
             "normalised rotor", e=self.e, contact_stiffness=self.contact_stiffness, mu=self.mu
         )
-        _require_finite("normalised rotor", w=self.w, g=self.g, heavy_spot_rad=self.heavy_spot_rad)
+        _require_finite(
+            "normalised rotor", w=self.w, g=self.g, load_x=self.load_x, heavy_spot_rad=self.heavy_spot_rad
+        )
         if not 1.0 <= self.alpha <= 3.0:
             raise ValueError(f"normalised rotor: alpha is {self.alpha}; a contact has 1 <= alpha <= 3")
 
@@ -76,7 +80,7 @@ class NormalisedRotor:
     @property
     def rest(self) -> complex:
         """Where the disc rests under its static load, in clearances."""
-        return -1j * self.g / self.k
+        return complex(self.load_x, -self.g) / self.k
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +98,7 @@ class RotorParameters:
         hertz_exponent: alpha of the contact force.
         friction: Coulomb coefficient mu of the contact.
         contact_radius_um: radius of the rubbing surface.
+        static_load_x_um: how far a static load bends the healthy shaft towards +x.
     """
 
     natural_frequency_hz: float
@@ -106,6 +111,7 @@ class RotorParameters:
     hertz_exponent: float = 1.0
     friction: float = 0.1
     contact_radius_um: float = 25_000.0
+    static_load_x_um: float = 0.0
 
     def __post_init__(self) -> None:
         _require_positive(
@@ -142,6 +148,7 @@ class RotorParameters:
             mu=self.friction,
             heavy_spot_rad=math.radians(self.heavy_spot_deg),
             contact_radius=self.contact_radius_um / self.clearance_um,
+            load_x=self.static_load_x_um / self.clearance_um,
         )
 
     @classmethod
@@ -169,6 +176,7 @@ class RotorParameters:
             hertz_exponent=rotor.alpha,
             friction=rotor.mu,
             contact_radius_um=rotor.contact_radius * clearance_um,
+            static_load_x_um=rotor.load_x / rotor.k * clearance_um,
         )
 
 

@@ -19,6 +19,7 @@ PAPER = RotorParameters(
     heavy_spot_deg=20.0,
     clearance_um=100.0,
     static_sag_um=10.0,
+    static_load_x_um=4.0,
     contact_stiffness=30.0,
 )
 
@@ -28,6 +29,8 @@ def test_paper_values_in_normalised_units():
     assert rotor.w == pytest.approx(1.0)
     assert rotor.e == pytest.approx(0.1)
     assert rotor.g == pytest.approx(0.1)
+    assert rotor.load_x == pytest.approx(0.04)
+    assert rotor.rest == pytest.approx(0.04 - 0.1j)
     assert rotor.zeta == 0.18
     assert PAPER.normalised(-300.0, damping_ratio=0.02).w == pytest.approx(-0.5)
     assert PAPER.normalised(600.0, damping_ratio=0.02).zeta == 0.02
@@ -51,12 +54,13 @@ def test_normalising_is_undone():
     ):
         assert getattr(back, name) == pytest.approx(getattr(PAPER, name)), name
     assert back.static_sag_um == pytest.approx(PAPER.static_sag_um)
+    assert back.static_load_x_um == pytest.approx(PAPER.static_load_x_um)
     assert back.contact_stiffness == pytest.approx(PAPER.contact_stiffness)
     assert back.contact_radius_um == pytest.approx(PAPER.contact_radius_um)
 
 
 def test_softer_shaft_has_its_own_frequency_but_the_same_orbit():
-    soft = NormalisedRotor(w=0.9, e=0.1, zeta=0.1, k=0.8, g=0.1, contact_stiffness=30.0)
+    soft = NormalisedRotor(w=0.9, e=0.1, zeta=0.1, k=0.8, g=0.1, load_x=-0.03, contact_stiffness=30.0)
     physical = RotorParameters.from_normalised(soft, natural_frequency_hz=10.0, clearance_um=100.0)
     assert physical.natural_frequency_hz == pytest.approx(10.0 * math.sqrt(0.8))
     again = physical.normalised(0.9 * 600.0)
@@ -87,10 +91,17 @@ def test_impossible_contact_is_refused():
 @pytest.mark.parametrize("speed_ratio", [0.7, 1.0, 1.4])
 def test_orbit_is_where_the_plant_settles(speed_ratio):
     parameters = plant.RotorParameters(
-        damping_ratio=0.18, speed_ratio=speed_ratio, heavy_spot_deg=35.0, contact_stiffness=0.0
+        damping_ratio=0.18,
+        stiffness=0.9,
+        speed_ratio=speed_ratio,
+        heavy_spot_deg=35.0,
+        side_load=0.05,
+        contact_stiffness=0.0,
     )
     motion = plant.simulate(parameters, revolutions=30.0, samples_per_rev=32.0, initial=np.zeros(4))
-    rotor = NormalisedRotor(w=speed_ratio, e=0.1, zeta=0.18, g=0.1, heavy_spot_rad=math.radians(35.0))
+    rotor = NormalisedRotor(
+        w=speed_ratio, e=0.1, zeta=0.18, k=0.9, g=0.1, load_x=0.05, heavy_spot_rad=math.radians(35.0)
+    )
     z = rotor.orbit() * np.exp(2j * math.pi * motion.revolution) + rotor.rest
     settled = motion.revolution > 20.0
     assert np.abs(motion.x + 1j * motion.y - z)[settled].max() < 1e-6
