@@ -6,7 +6,8 @@ tau = omega_s t. With z = x + iy the motion is
 
     z'' + 2 zeta z' + k z = e w^2 exp(i (theta + phi)) + l_x - i g + f(z, z'),    theta' = w
 
-The paper's static load acts along -y alone; here it has both components. Four statements of the paper cannot stand as printed and are corrected here:
+The paper's static load acts along -y alone; here it has both components. Four statements of the paper
+cannot stand as printed and are corrected here:
 
 * The contact force pushes the disc back: the state equation needs ``- gamma f(Cx)``, not ``+``. With
   the printed sign the disc is thrown out as soon as it touches.
