@@ -7,8 +7,6 @@ import math
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from sim_hw.recordings import LEAST_RATE_HZ, MOST_RATE_HZ
-
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
@@ -39,34 +37,11 @@ def _given(arguments: argparse.Namespace, names: Iterable[str]) -> str | None:
     )
 
 
-def mapping(text: str) -> dict[str, str]:
-    """``SENSOR=VARIABLE,...``."""
-    pairs = [pair.partition("=") for pair in text.split(",")]
-    if not all(sensor.strip() and variable.strip() for sensor, _, variable in pairs):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a map; write SENSOR=VARIABLE, several with commas between"
-        )
-    found = {sensor.strip(): variable.strip() for sensor, _, variable in pairs}
-    if len(found) < len(pairs):
-        raise argparse.ArgumentTypeError(f"{text!r} names a sensor twice; give each a name of its own")
-    return found
-
-
 def positive(text: str) -> float:
     """A number greater than zero."""
     value = _number(text)
     if not (math.isfinite(value) and value > 0):
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
-
-
-def rate_hz(text: str) -> float:
-    """A sampling rate that a recording may have."""
-    value = _number(text)
-    if not LEAST_RATE_HZ <= value <= MOST_RATE_HZ:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a sampling rate from {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz"
-        )
     return value
 
 

@@ -13,7 +13,7 @@ from sim_hw.demo.machines import Setpoints
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sim_hw.recordings import Recording
+    from daqsvc.recording.recording import Recording
 
 WINDOW_S = 0.5
 ALERT = 1.5

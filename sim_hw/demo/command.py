@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.recording.channels import channel_map, sampling_rate_hz
 from sim_hw.demo import arguments as arguments_of
 from sim_hw.demo.errors import DemoError
 
@@ -18,9 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from types import FrameType
 
+    from daqsvc.recording.recording import Recording
     from sim_hw.demo.listener import Received
     from sim_hw.demo.session import Outcome, Script
-    from sim_hw.recordings import Recording
 
 EXIT_FAILED = 1
 SCENARIO = "paper"
@@ -63,17 +64,15 @@ class DemoCommand:
             "--recording",
             type=Path,
             metavar="FILE",
-            help="play a measured recording (.mat, .csv, .csv.gz, .npz) instead of a scenario",
+            help="play a measured recording (.npz, .mat, .csv[.gz], .wav, .parquet) instead of a scenario",
         )
         what.add_argument(
             "--map",
-            type=arguments_of.mapping,
-            metavar="SENSOR=VARIABLE,...",
+            type=channel_map,
+            metavar="NAME=VARIABLE,...",
             help="which variables of the recording to play, and as which sensors (default: all of them)",
         )
-        what.add_argument(
-            "--fs", type=arguments_of.rate_hz, metavar="HZ", help="sampling rate of the recording"
-        )
+        what.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
         what.add_argument("--unit", choices=UNITS, help="unit of the recording's channels (default: g)")
         what.add_argument(
             "--baseline",
@@ -81,11 +80,9 @@ class DemoCommand:
             metavar="FILE",
             help="recording of the healthy machine: alarm setpoints become 1.5 and 3 times its RMS",
         )
+        what.add_argument("--baseline-map", type=channel_map, metavar="NAME=VARIABLE,...", help="as --map")
         what.add_argument(
-            "--baseline-map", type=arguments_of.mapping, metavar="SENSOR=VARIABLE,...", help="as --map"
-        )
-        what.add_argument(
-            "--baseline-fs", type=arguments_of.rate_hz, metavar="HZ", help="as --fs (default: the same)"
+            "--baseline-fs", type=sampling_rate_hz, metavar="HZ", help="as --fs (default: the same)"
         )
         how = parser.add_argument_group("how to play it")
         how.add_argument(
@@ -130,8 +127,8 @@ def _run(arguments: argparse.Namespace) -> int:
     prepare_kernel_cache()
     try:
         import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
+        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
-        from sim_hw.recordings import RecordingError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
     except ModuleNotFoundError as error:
         return _fail(f"the demo needs {error.name}; install it with: pip install 'daqsvc[demo]'")
@@ -267,7 +264,7 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
 
 
 def _load(path: Path, channels: Mapping[str, str] | None, rate_hz: float | None, option: str) -> Recording:
-    from sim_hw.recordings import load_recording  # noqa: PLC0415
+    from daqsvc.recording.recording import load_recording  # noqa: PLC0415
 
     recording = load_recording(path, channels, rate_hz)
     if recording.left_out:

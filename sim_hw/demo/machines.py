@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sim_hw.recordings import Recording
+    from daqsvc.recording.recording import Recording
     from sim_hw.scenario import Scenario
 
 CHANNEL = "daqsvc-demo"

@@ -12,7 +12,7 @@ from sim_hw.demo.baseline import WINDOW_S
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
-    from sim_hw.recordings import Recording
+    from daqsvc.recording.recording import Recording
 
 LONGEST_NAME = 64
 
@@ -51,7 +51,7 @@ def _sensor_names(recording: Recording) -> tuple[str, ...]:
     found: dict[str, str] = {}
     for original in recording.names:
         name = re.sub(r"[^A-Za-z0-9_.-]+", "-", original).strip("-")
-        remedy = "name its sensor with --map SENSOR=VARIABLE"
+        remedy = "name its sensor with --map NAME=VARIABLE"
         if not name:
             raise DemoError(f"{recording.source}: no sensor can be named {original!r}; {remedy}")
         if len(name) > LONGEST_NAME:

@@ -77,7 +77,7 @@ def demo(*arguments: str, **options: Any) -> subprocess.Popen[str]:
         ("--broker mqtt://box/topic", "something after host and port"),
         ("--fs 0.5 --recording a.npz", "not a sampling rate from 1 to 10,000,000 Hz"),
         ("--fs 2e7 --recording a.npz", "not a sampling rate"),
-        ("--map x=a,x=b --recording a.npz", "names a sensor twice"),
+        ("--map x=a,x=b --recording a.npz", "names 'x' twice"),
         ("--map x=a", "--map goes with a recording; give that with --recording"),
         ("--fs 100", "--fs goes with a recording"),
         ("--unit g", "--unit goes with a recording"),

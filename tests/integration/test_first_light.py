@@ -14,6 +14,7 @@ from brokers import Consumer, running_mosquitto
 
 from daqsvc import assembly
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
+from daqsvc.recording.recording import Recording, load_recording
 from sim_hw.demo.baseline import setpoints
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
@@ -21,7 +22,6 @@ from sim_hw.demo.session import Outcome, Script, Session
 from sim_hw.demo.summary import summarise
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.wire import quantised
-from sim_hw.recordings import Recording, load_recording
 from sim_hw.scenario import load_scenario
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from brokers import Consumer, eventually, free_port
 from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.store import Outbox
+from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
-from sim_hw.recordings import Recording
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

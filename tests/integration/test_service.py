@@ -14,13 +14,13 @@ from brokers import Consumer, eventually, free_port
 
 from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
 from sim_hw.demo.session import Script, Session
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
-from sim_hw.recordings import Recording
 from sim_hw.scenario import load_scenario
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from sim_hw.recordings import RecordingError, list_channels, load_recording
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import list_channels, load_recording
 
 DATA = Path(os.environ.get("DAQSVC_DATA", Path(__file__).parents[2] / ".." / "shared" / "data")).resolve()
 needs_data = [
@@ -193,7 +194,7 @@ def test_an_unknown_rate_is_asked_for(tmp_path):
         ("a.npz", _npz(x=np.array([])), "is too short"),
         ("a.csv", b"1,2\n", "is too short"),
         ("a.npz", ENCRYPTED_NPZ, "cannot be read: .*encrypted"),
-        ("a.wav", b"RIFF", "use .mat, .npz, .csv, .csv.gz"),
+        ("a.tdms", b"TDSm", r"use .npz, .mat, .csv, .csv.gz, .wav, .parquet$"),
     ],
 )
 def test_files_that_cannot_be_read(tmp_path, name, content, message):

@@ -1,0 +1,1 @@
+"""Measured recordings: named channels of samples, out of the files that laboratories and loggers write."""

@@ -1,0 +1,89 @@
+"""Which variable of a recording is which channel, at what rate and in what unit of length."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+
+from daqsvc.recording.errors import RecordingError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+LengthUnit = Literal["m", "mm", "um", "mil"]
+
+LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
+
+UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
+
+LEAST_RATE_HZ = 1.0
+MOST_RATE_HZ = 10e6
+"""Sampling rates outside of these are mistakes: a rate in kHz, or a period in its place."""
+
+
+def channel_map(text: str) -> dict[str, str]:
+    """``NAME=VARIABLE,...``: what each channel is called from now on, and in the file (for argparse).
+
+    Raises:
+        argparse.ArgumentTypeError: it is not of this form, or names a channel twice.
+    """
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    found: dict[str, str] = {}
+    for name, _, variable in pairs:
+        if not (name.strip() and variable.strip()):
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not a map; write NAME=VARIABLE, several with commas between"
+            )
+        if name.strip() in found:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} names {name.strip()!r} twice; give each channel a name of its own"
+            )
+        found[name.strip()] = variable.strip()
+    return found
+
+
+def sampling_rate_hz(text: str) -> float:
+    """A sampling rate that a recording may have (for argparse).
+
+    Raises:
+        argparse.ArgumentTypeError: it is not a number from `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not LEAST_RATE_HZ <= value <= MOST_RATE_HZ:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a sampling rate from {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz"
+        )
+    return value
+
+
+def metres_per_unit(unit: str) -> float:
+    """Length of one ``unit`` in m.
+
+    Raises:
+        RecordingError: the unit is none of `LENGTH_UNITS`.
+    """
+    return _um_per(unit) / 1e6
+
+
+def to_um(lengths: Floats, unit: str) -> Floats:
+    """Lengths in ``unit`` as lengths in um, float64 of the same shape.
+
+    Raises:
+        RecordingError: the unit is none of `LENGTH_UNITS`.
+    """
+    return lengths * _um_per(unit)
+
+
+def _um_per(unit: str) -> float:
+    if unit not in UM_PER_UNIT:
+        raise RecordingError(f"{unit!r} is not a unit of length; use {', '.join(LENGTH_UNITS)}")
+    return UM_PER_UNIT[unit]

@@ -1,0 +1,84 @@
+"""What a file of any format holds, before anybody has chosen channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from numpy.typing import NDArray
+
+NUMERIC = "iuf"
+"""Kinds of dtype that samples may have: integers and floats."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """Everything in a file by name, in the file's order.
+
+    Attributes:
+        entries: arrays; one dimension is a channel, none a scalar or a text.
+        is_table: the first entries are columns that may also be called by their number from 0.
+        has_header: the file names its columns; without a header their names are their numbers.
+    """
+
+    entries: Mapping[str, NDArray[np.generic]]
+    is_table: bool = False
+    has_header: bool = True
+
+    def vectors(self) -> dict[str, NDArray[np.generic]]:
+        """Numeric entries of one dimension, of any length."""
+        return {
+            name: values
+            for name, values in self.entries.items()
+            if values.ndim == 1 and values.dtype.kind in NUMERIC
+        }
+
+    def scalars(self) -> dict[str, float]:
+        """Single numbers, e.g. a speed or a sampling rate."""
+        return {
+            name: float(value)
+            for name, value in self.entries.items()
+            if value.ndim == 0 and value.dtype.kind in NUMERIC
+        }
+
+    def texts(self) -> dict[str, str]:
+        """Single texts, e.g. a label."""
+        return {
+            name: str(value)
+            for name, value in self.entries.items()
+            if value.ndim == 0 and value.dtype.kind == "U"
+        }
+
+    def listing(self) -> str:
+        """What the file holds, in words."""
+        return ", ".join(_told(name, values) for name, values in self.entries.items()) or "nothing"
+
+
+def _told(name: str, values: NDArray[np.generic]) -> str:
+    if values.ndim > 1:
+        return f"{name} ({values.ndim}-D)"
+    if values.dtype.kind in NUMERIC and values.size and values.ndim:
+        return f"{name} ({len(values)})"
+    if values.ndim and values.dtype.kind not in NUMERIC:
+        return f"{name} (not numeric)"
+    return name if values.ndim == 0 else f"{name} (0)"
+
+
+def flattened(name: str, value: object) -> Iterator[tuple[str, NDArray[np.generic]]]:
+    """A variable as entries: structs as dotted names, matrices column by column along their longer side."""
+    fields = getattr(value, "_fieldnames", None)
+    if fields is not None:
+        for field in fields:
+            yield from flattened(f"{name}.{field}", getattr(value, field))
+        return
+    array = np.squeeze(np.asarray(value))
+    if array.ndim == 2:
+        columns = array.T if array.shape[0] >= array.shape[1] else array
+        yield from ((f"{name}[{i}]", column) for i, column in enumerate(columns))
+    else:
+        yield name, array

@@ -1,0 +1,111 @@
+"""WAV files: linear PCM and IEEE float (Multimedia Programming Interface and Data Specifications 1.0).
+
+Read here and not by a library: those at hand leave out float or extensible formats, and take a file that
+is cut short for a whole one.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from daqsvc.recording.contents import Contents
+from daqsvc.recording.errors import RecordingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+PCM = 1
+FLOAT = 3
+EXTENSIBLE = 0xFFFE
+"""The format itself stands in the first two bytes of the sub-format's GUID."""
+SUBFORMAT_AT = 24
+
+ENCODINGS = {PCM: (8, 16, 24, 32), FLOAT: (32, 64)}
+
+
+def read_wav(path: Path) -> Contents:
+    """Channels "0", "1", ... float64, integers scaled to a full scale of 1; and ``rate_hz``."""
+    content = path.read_bytes()
+    chunks = _chunks(path, content)
+    missing = [name for name in ("fmt ", "data") if name not in chunks]
+    if missing:
+        raise RecordingError(
+            f"{path} cannot be read: it has no {missing[0].strip()!r} chunk; it is cut short or empty, "
+            "and has to be copied or saved anew"
+        )
+    encoding, bits, channels, rate_hz = _format(path, chunks["fmt "])
+    data = chunks["data"]
+    frame_bytes = channels * bits // 8
+    if len(data) % frame_bytes:
+        raise RecordingError(
+            f"{path} cannot be read: its {len(data)} bytes of samples are no whole number of frames of "
+            f"{frame_bytes} bytes; copy or save it anew"
+        )
+    samples = _decoded(data, encoding, bits).reshape(-1, channels)
+    return Contents(
+        {str(i): samples[:, i] for i in range(channels)} | {"rate_hz": np.array(rate_hz)},
+        is_table=True,
+    )
+
+
+def _chunks(path: Path, content: bytes) -> dict[str, memoryview]:
+    """The first chunk of each name in a RIFF file."""
+    if content[:4] != b"RIFF" or content[8:12] != b"WAVE":
+        kind = repr(content[:4]) if content else "nothing"
+        raise RecordingError(
+            f"{path} is not a WAV file: it begins with {kind}, not with RIFF; "
+            "save it as WAV (not RF64 or RIFX)"
+        )
+    chunks: dict[str, memoryview] = {}
+    view, at = memoryview(content), 12
+    while at + 8 <= len(content):
+        tag, size = struct.unpack_from("<4sI", content, at)
+        body = view[at + 8 : at + 8 + size]
+        if len(body) < size:
+            raise RecordingError(
+                f"{path} is cut short: its {tag.decode('latin-1').strip()!r} chunk should have {size} bytes "
+                f"and has {len(body)}; copy or save it anew"
+            )
+        chunks.setdefault(tag.decode("latin-1"), body)
+        at += 8 + size + size % 2
+    return chunks
+
+
+def _format(path: Path, chunk: memoryview) -> tuple[int, int, int, int]:
+    """Encoding, bits per sample, channels, and samples per second."""
+    encoding, channels, rate_hz, _, frame_bytes, bits = struct.unpack_from("<HHIIHH", chunk)
+    if encoding == EXTENSIBLE:
+        (encoding,) = struct.unpack_from("<H", chunk, SUBFORMAT_AT)
+    if bits not in ENCODINGS.get(encoding, ()):
+        raise RecordingError(
+            f"{path} has {bits}-bit samples of WAV format {encoding}; save it as PCM of 8, 16, 24 or 32 "
+            "bits, or as float of 32 or 64 bits"
+        )
+    if frame_bytes != channels * bits // 8 or not channels:
+        raise RecordingError(
+            f"{path} cannot be read: {channels} channels of {bits} bits do not make frames of {frame_bytes} "
+            "bytes; copy or save it anew"
+        )
+    return encoding, bits, channels, rate_hz
+
+
+def _decoded(data: memoryview, encoding: int, bits: int) -> Floats:
+    """Samples of all channels in turn."""
+    if encoding == FLOAT:
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            return np.frombuffer(data, f"<f{bits // 8}").astype(np.float64)
+    if bits == 8:
+        return (np.frombuffer(data, np.uint8).astype(np.float64) - 128.0) / 128.0
+    if bits == 24:
+        # As the upper three bytes of 32 bits.
+        widened = np.zeros((len(data) // 3, 4), np.uint8)
+        widened[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
+        return widened.view("<i4").ravel().astype(np.float64) / 2.0**31
+    return np.frombuffer(data, f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
