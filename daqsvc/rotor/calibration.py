@@ -1,0 +1,278 @@
+"""Calibration: the healthy machine's synchronous vector, its scatter, and whether it may be believed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.departure import Spread
+from daqsvc.rotor.laval import LavalRotor, unbalance_response
+from daqsvc.rotor.signatures import Healthy
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.synchronous import SynchronousVectors
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+LEAST_REVOLUTIONS = 20
+
+_FLOOR = 0.002
+"""Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
+_NOISE_FLOOR = 1e-3
+"""The same of the residual: rounding of the recording."""
+_STATIONARY_NATS = 25.0
+"""Half against half: Gamma(5, 1) passes this once in 5 million calibrations."""
+_LAVAL_ELLIPTICITY = 0.05
+_REVERSED = 2.0
+_LEAST_WHIRL = 4.0
+"""1X amplitude over its own standard deviation below which there is no orbit to speak of."""
+
+
+class NotCalibratableError(ValueError):
+    """The data cannot be the healthy baseline; the message says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """The healthy machine at one speed.
+
+    Attributes:
+        rotor: what is known about the rotor.
+        speed_rpm: mean shaft speed.
+        revolutions: revolutions that went in.
+        baseline: complex128 ``[5]``, mean synchronous vector in um.
+        variance: float64 ``[5]``, complex variance of one revolution's vector, as it counts in long means.
+        noise: variance of the complex residual of a sample, um^2.
+        noise_variance: relative variance of that from revolution to revolution.
+        samples_per_rev: usable samples in a revolution.
+        fit_error: what a Laval rotor leaves unexplained of a run-up, relative; None if there was none.
+    """
+
+    rotor: LavalRotor
+    speed_rpm: float
+    revolutions: int
+    baseline: Complexes
+    variance: Floats
+    noise: float
+    noise_variance: float
+    samples_per_rev: float
+    fit_error: float | None = None
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean shaft speed Omega."""
+        return self.speed_rpm * math.pi / 30.0
+
+    @property
+    def noise_um(self) -> float:
+        """Standard deviation of the noise of one probe."""
+        return math.sqrt(self.noise / 2.0)
+
+    @property
+    def amplitude_um(self) -> float:
+        """Modulus of the forward 1X vector."""
+        return float(abs(self.baseline[1]))
+
+    @property
+    def ellipticity(self) -> float:
+        """Backward over forward 1X."""
+        return float(abs(self.baseline[2]) / max(self.amplitude_um, 1e-12))
+
+    @property
+    def eccentricity_um(self) -> complex:
+        """Complex mass eccentricity that makes the 1X vector of a Laval rotor, modulus in um."""
+        response = unbalance_response(
+            self.speed_rad_s / self.rotor.natural_frequency_rad_s, self.rotor.damping_ratio
+        )
+        return complex(self.baseline[1] / response)
+
+    @property
+    def laval(self) -> bool:
+        """Whether the machine behaves like a Laval rotor, as far as was seen."""
+        fits = self.fit_error is None or self.fit_error <= _LAVAL_ELLIPTICITY
+        return fits and self.ellipticity <= _LAVAL_ELLIPTICITY
+
+    @property
+    def snr_db(self) -> float:
+        """Power of the healthy whirl over that of the noise, per sample and probe."""
+        power = float(np.sum(np.abs(self.baseline[1:]) ** 2)) / 2.0
+        return 10.0 * math.log10(power / max(self.noise / 2.0, 1e-30))
+
+    @property
+    def healthy(self) -> Healthy:
+        """What the signatures are predicted from."""
+        return Healthy(self.baseline, self.speed_rad_s, self.rotor, self.laval)
+
+    @property
+    def spread(self) -> Spread:
+        """What the departure test needs."""
+        _, slope = self.rotor.speed_slope(self.speed_rad_s)
+        return Spread(
+            self.variance,
+            self.noise,
+            self.noise_variance,
+            (_FLOOR * self.amplitude_um) ** 2,
+            speed_slope=slope,
+            amplitude_um=self.amplitude_um,
+        )
+
+    def describe(self) -> str:
+        """The verdict in words: what the model of this machine can and cannot separate."""
+        said = []
+        if self.laval:
+            said.append(
+                f"behaves like a Laval rotor as far as was seen (backward over forward 1X "
+                f"{100.0 * self.ellipticity:.1f} %)"
+            )
+        else:
+            why = (
+                f"a run-up fits a Laval rotor only within {100.0 * (self.fit_error or 0.0):.0f} %"
+                if self.fit_error is not None and self.fit_error > _LAVAL_ELLIPTICITY
+                else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
+            )
+            said.append(
+                f"is no Laval rotor ({why}): generic mode, in which rub and unmodelled changes stay one group"
+            )
+        smallest = math.sqrt(20.0 * float(self.variance.mean()) / self.revolutions)
+        said.append(
+            f"after {self.revolutions} revolutions the smallest change that can be seen is {smallest:.2g} um, "
+            f"{100.0 * smallest / max(self.amplitude_um, 1e-12):.1f} % of 1X"
+        )
+        if self.rotor.natural_frequency_tolerance > 0.05 or self.fit_error is None:
+            said.append(
+                "without a run-up, unbalance and loss of damping are one group unless the steady orbit "
+                "excludes one of them"
+            )
+        return "; ".join(said)
+
+
+def compensated(
+    vectors: SynchronousVectors, rotor: LavalRotor, speed_rad_s: float, rate_hz: float
+) -> tuple[Complexes, Floats]:
+    """Vectors with 1X brought to one speed, and each revolution's relative deviation from it.
+
+    1X itself moves with the speed; the slope d ln H / d ln Omega of the rotor takes that out to first order.
+
+    Returns:
+        complex128 ``[R, 5]`` and float64 ``[R]``.
+    """
+    speed = 2.0 * math.pi * rate_hz / vectors.period_samples
+    deviation = speed / speed_rad_s - 1.0
+    slope, _ = rotor.speed_slope(speed_rad_s)
+    moved = vectors.vectors.copy()
+    moved[:, 1] /= 1.0 + slope * deviation
+    moved[:, 2] /= 1.0 + slope.conjugate() * deviation
+    return moved, deviation
+
+
+def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) -> Calibration:
+    """Calibrate on revolutions of a healthy machine at steady speed.
+
+    Args:
+        vectors: synchronous vectors in um.
+        rotor: what is known about the rotor.
+        rate_hz: sampling rate.
+
+    Raises:
+        NotCalibratableError: too few revolutions, no orbit, not stationary, not locked to the shaft, or an
+            orbit that turns against the shaft.
+    """
+    vectors = vectors[vectors.usable]
+    count = len(vectors)
+    if count < LEAST_REVOLUTIONS:
+        raise NotCalibratableError(
+            f"only {count} usable revolutions; a baseline needs {LEAST_REVOLUTIONS}: give a longer recording"
+        )
+    speed_rad_s = float(2.0 * math.pi * rate_hz / vectors.period_samples.mean())
+    moved, _ = compensated(vectors, rotor, speed_rad_s, rate_hz)
+    baseline = moved.mean(axis=0)
+    samples = float(vectors.samples.mean())
+    amplitude = float(np.sqrt(np.sum(np.abs(baseline[1:]) ** 2)))
+    noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
+    white = noise / samples
+    variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
+    _refuse_unsteady(moved, variance, vectors, rate_hz)
+    if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
+        raise NotCalibratableError(
+            f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of {math.sqrt(noise / 2.0):.3g} um; "
+            "check that the machine turns, the probes' names and their unit"
+        )
+    if abs(baseline[2]) > _REVERSED * abs(baseline[1]):
+        raise NotCalibratableError(
+            f"the orbit turns against the stated rotation (backward 1X {abs(baseline[2]):.3g} um, forward "
+            f"{abs(baseline[1]):.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft turns "
+            "clockwise; swap the probes, or give the speed a minus sign"
+        )
+    relative = vectors.noise / vectors.noise.mean()
+    freedom = 1.0 / max(samples - 5.0, 1.0)
+    return Calibration(
+        rotor=rotor,
+        speed_rpm=speed_rad_s * 30.0 / math.pi,
+        revolutions=count,
+        baseline=baseline,
+        variance=variance,
+        noise=noise,
+        noise_variance=max(freedom, float(relative.var(ddof=1))) if vectors.noise.mean() > 0 else freedom,
+        samples_per_rev=samples,
+    )
+
+
+def with_more(calibration: Calibration, baseline: Complexes, revolutions: int) -> Calibration:
+    """The same calibration with a baseline that has grown."""
+    return replace(calibration, baseline=baseline, revolutions=revolutions)
+
+
+def _memory(rotor: LavalRotor, speed_rad_s: float) -> float:
+    """Correlation of a stirred orbit from one revolution to the next."""
+    decay = rotor.damping_ratio * rotor.natural_frequency_rad_s / abs(speed_rad_s)
+    return math.exp(-2.0 * math.pi * decay)
+
+
+def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Floats:
+    """v_k: variance of one revolution's vector as it counts in means of many.
+
+    What is above the white noise is the stirred orbit, correlated from revolution to revolution. A trend is
+    taken out first: it is for the test of steadiness to judge, not to hide behind.
+    """
+    time = np.arange(len(vectors)) - (len(vectors) - 1) / 2.0
+    level = vectors - vectors.mean(axis=0)
+    trend = (time @ level) / (time @ time)
+    scatter = np.sum(np.abs(level - np.outer(time, trend)) ** 2, axis=0) / (len(vectors) - 2)
+    stirred = np.maximum(scatter - white, 0.0)
+    return np.asarray(white + stirred * (1.0 + memory) / (1.0 - memory))
+
+
+def _refuse_unsteady(moved: Complexes, variance: Floats, vectors: SynchronousVectors, rate_hz: float) -> None:
+    """Half against half; if they differ, say why."""
+    half = len(moved) // 2
+    first, second = moved[:half].mean(axis=0), moved[half:].mean(axis=0)
+    amplitude = float(np.abs(moved[:, 1]).mean())
+    allowed = variance * (1.0 / half + 1.0 / (len(moved) - half)) + (_FLOOR * amplitude) ** 2
+    nats = float((np.abs(second - first) ** 2 / allowed).sum())
+    if nats <= _STATIONARY_NATS:
+        return
+    turn = np.angle(np.sum(moved[1:, 1] * moved[:-1, 1].conj()))
+    held = float(np.abs(np.sum(moved[1:, 1] * moved[:-1, 1].conj())) / np.sum(np.abs(moved[1:, 1]) ** 2))
+    whole = abs(turn) * len(moved)
+    period = float(vectors.period_samples.mean())
+    speed_rpm = 60.0 * rate_hz / period
+    if whole > 0.3 and held > 0.3:
+        orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
+        raise NotCalibratableError(
+            f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a revolution "
+            f"against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} rpm "
+            f"({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
+        )
+    worst = int(np.argmax(np.abs(second - first) ** 2 / allowed))
+    name = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")[worst]
+    raise NotCalibratableError(
+        f"not steady: {name} moves by {abs(second[worst] - first[worst]):.3g} um from the first half of the "
+        f"{len(moved)} revolutions to the second ({nats:.0f} nats, at most {_STATIONARY_NATS:.0f} are chance); "
+        "calibrate where the machine runs steadily and is healthy"
+    )

@@ -1,0 +1,136 @@
+"""Which fault a change is: the name, the group, or that it is none of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.signatures import RotorFault, likelihoods
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.calibration import Calibration
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+_RIVALS = frozenset(("rub", "unmodelled"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamingRules:
+    """Margins of a name.
+
+    Attributes:
+        margin_nats: lead over every other hypothesis that a name takes: odds of 150 to 1.
+        rub_margin_nats: lead of rub over "unmodelled": a crack at half speed looks much like a rub.
+        least_severity: part of the healthy whirl below which a change is small and gets no name.
+    """
+
+    margin_nats: float = 5.0
+    rub_margin_nats: float = 12.0
+    least_severity: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """What a change of the synchronous vector is.
+
+    Attributes:
+        verdict: the name, or the most likely member of the group.
+        group: all that cannot be told apart, the most likely first; the verdict alone if it stands alone.
+        named: whether two looks in a row agreed on the group.
+        evidence: nats of every hypothesis over "normal".
+        probabilities: posterior of every verdict, hypotheses equally likely before.
+        change: complex128 ``[5]``, d in um.
+        severity: modulus of the change over the healthy whirl's amplitude.
+        candidates: verdict and group of this look alone.
+    """
+
+    verdict: RotorFault
+    group: tuple[RotorFault, ...]
+    named: bool
+    evidence: Mapping[RotorFault, float]
+    probabilities: Mapping[RotorFault, float]
+    change: Complexes
+    severity: float
+    candidates: tuple[RotorFault, ...] = field(default=())
+
+
+def identify(
+    change: Complexes,
+    variance: Floats,
+    healthy: Calibration,
+    *,
+    previous: Identification | None,
+    rules: NamingRules,
+    may_name: bool = True,
+) -> Identification:
+    """Weigh the hypotheses.
+
+    Args:
+        change: complex128 ``[5]``, mean synchronous vector of the present segment less the baseline, um.
+        variance: float64 ``[5]``, its variance, um^2.
+        healthy: the baseline.
+        previous: the look before; a name takes two that agree.
+        rules: margins.
+        may_name: whether the rotor has settled enough for a name.
+    """
+    scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
+    amplitude = healthy.healthy.amplitude_um
+    size = float(np.sqrt(np.sum(np.abs(change) ** 2)))
+    deviation = math.sqrt(float(variance.max()))
+    best = max(scores, key=lambda name: scores[name])
+    probabilities = _posterior(scores)
+    candidates: tuple[RotorFault, ...]
+    if best != "normal" and size < rules.least_severity * amplitude + 2.0 * deviation:
+        candidates = ("small_change",)
+        probabilities = {"normal": probabilities["normal"], "small_change": 1.0 - probabilities["normal"]}
+    else:
+        candidates = _group(scores, best, healthy, rules)
+    agreed = previous is not None and set(previous.candidates) == set(candidates)
+    named = may_name and agreed
+    group = candidates
+    if previous is not None and previous.named and not named:
+        # One look does not take a name away.
+        group = previous.group
+        named = True
+    return Identification(
+        verdict=group[0],
+        group=group,
+        named=named,
+        evidence=scores,
+        probabilities=probabilities,
+        change=change,
+        severity=size / max(amplitude, 1e-12),
+        candidates=candidates,
+    )
+
+
+def _group(
+    scores: Mapping[RotorFault, float], best: RotorFault, healthy: Calibration, rules: NamingRules
+) -> tuple[RotorFault, ...]:
+    """All hypotheses within the margin of the best one, the best first."""
+
+    def margin(name: RotorFault) -> float:
+        if {name, best} == _RIVALS:
+            return rules.rub_margin_nats if healthy.laval else math.inf
+        return rules.margin_nats
+
+    close = [name for name in scores if scores[best] - scores[name] < margin(name)]
+    if "normal" in close and best != "normal":
+        close.remove("normal")
+    return tuple(sorted(close, key=lambda name: -scores[name]))
+
+
+def _posterior(scores: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
+    top = max(scores.values())
+    weights = {name: math.exp(score - top) for name, score in scores.items()}
+    total = math.fsum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}

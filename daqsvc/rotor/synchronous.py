@@ -1,0 +1,137 @@
+"""The synchronous vector: what a rotor does in one revolution, in five complex numbers and an energy.
+
+With z = x + iy and the shaft angle theta, the orbit of a revolution is fitted by
+
+    z = sum over k of Z_k exp(i k theta),    k in (0, 1, -1, 2, -2)
+
+Z_0 is where the shaft runs (gap voltage), Z_1 its forward 1X whirl, Z_-1 the backward part that makes the
+orbit an ellipse, Z_2 and Z_-2 what misalignment, cracks and rub add. What the five leave over is the
+non-harmonic energy: noise, and all that does not repeat with the shaft.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.dsp.revolutions import Revolutions
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+HARMONICS = (0, 1, -1, 2, -2)
+"""Orders of the components of a synchronous vector, in this order."""
+
+_LEAST_SHARE = 0.75
+"""Part of a revolution's samples that must be there."""
+_WORST_CONDITION = 20.0
+"""Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long."""
+
+
+@dataclass(frozen=True, slots=True)
+class SynchronousVectors:
+    """Synchronous vectors of R revolutions.
+
+    Attributes:
+        vectors: complex128 ``[R, 5]``, Z_k in the order of `HARMONICS`, in the unit of the samples; NaN where
+            a revolution cannot be fitted.
+        noise: float64 ``[R]``, variance of the complex residual of one sample, squared unit.
+        samples: float64 ``[R]``, usable samples in the revolution.
+        period_samples: float64 ``[R]``, length of the revolution in samples.
+        end_index: int64 ``[R]``, samples since the start up to the end of the revolution.
+    """
+
+    vectors: Complexes
+    noise: Floats
+    samples: Floats
+    period_samples: Floats
+    end_index: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.noise)
+
+    @property
+    def usable(self) -> Flags:
+        """Bool ``[R]``, revolutions that could be fitted."""
+        return np.isfinite(self.noise)
+
+    def __getitem__(self, part: slice | Flags) -> Self:
+        return type(self)(
+            self.vectors[part],
+            self.noise[part],
+            self.samples[part],
+            self.period_samples[part],
+            self.end_index[part],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """One after another."""
+        return cls(
+            np.concatenate([part.vectors for part in parts]) if parts else np.empty((0, 5), np.complex128),
+            *(
+                np.concatenate([getattr(part, name) for part in parts]) if parts else np.empty(0)
+                for name in ("noise", "samples", "period_samples")
+            ),
+            np.concatenate([part.end_index for part in parts]) if parts else np.empty(0, np.int64),
+        )
+
+
+def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
+    """Fit every revolution by least squares.
+
+    Exact for any number of samples in a revolution, whole or not, and for missing ones: the normal equations
+    are solved instead of taking the harmonics as orthogonal.
+
+    Args:
+        revolutions: whole revolutions with the shaft angle of every sample.
+    """
+    count = len(revolutions.starts)
+    ends = np.append(revolutions.starts[1:], len(revolutions.xy)).astype(np.int64)
+    end_index = revolutions.first_index + ends
+    if not count:
+        empty = np.empty(0)
+        return SynchronousVectors(np.empty((0, 5), np.complex128), empty, empty, empty, end_index[:0])
+    z = revolutions.xy[:, 0] + 1j * revolutions.xy[:, 1]
+    there = np.isfinite(z) & np.isfinite(revolutions.angle_rad)
+    z = np.where(there, z, 0.0)
+    turn = np.where(there, np.exp(1j * np.where(there, revolutions.angle_rad, 0.0)), 0.0)
+
+    def total(values: Complexes | Floats) -> Complexes:
+        # A revolution without samples would make reduceat return its neighbour's first one.
+        sums = np.add.reduceat(np.append(values, 0.0), revolutions.starts)
+        return np.where(ends > revolutions.starts, sums, 0.0)
+
+    powers = [there.astype(np.complex128), turn, turn**2, turn**3, turn**4]
+    sums = [total(power) for power in powers]
+    samples = sums[0].real
+    order = np.array(HARMONICS)
+    difference = order[np.newaxis, :] - order[:, np.newaxis]
+    spectrum = np.stack([*(np.conj(s) for s in sums[:0:-1]), *sums], axis=-1)  # orders -4 to 4
+    normal = spectrum[:, difference + 4]
+    projected = np.stack([total(z * np.conj(_power(powers, k))) for k in HARMONICS], axis=-1)
+
+    eigenvalues = np.linalg.eigvalsh(normal)
+    usable = revolutions.trusted & (samples >= np.maximum(_LEAST_SHARE * revolutions.period_samples, 8.0))
+    usable &= eigenvalues[:, -1] < _WORST_CONDITION * eigenvalues[:, 0]
+    normal[~usable] = np.eye(5)
+    vectors = np.linalg.solve(normal, projected[..., np.newaxis])[..., 0]
+    residual = total(np.abs(z) ** 2).real - np.einsum("rk,rk->r", projected.conj(), vectors).real
+    noise = np.maximum(residual, 0.0) / np.maximum(samples - 5.0, 1.0)
+    vectors[~usable] = np.nan
+    noise[~usable] = np.nan
+    return SynchronousVectors(
+        vectors, noise, samples, np.asarray(revolutions.period_samples, dtype=np.float64), end_index
+    )
+
+
+def _power(powers: Sequence[Complexes], k: int) -> Complexes:
+    return powers[k] if k >= 0 else np.conj(powers[-k])

@@ -1,0 +1,330 @@
+"""A calibrated rotor under watch: departure at once, identity after settling, the healthy state again.
+
+The machine's life is a chain of segments, each a stretch in which it does not change. A departure test runs
+on the segment; when it says that the machine has changed, a new segment begins at the estimated onset, and the
+segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`): names within the
+first revolutions are those of the transient.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from daqsvc.rotor.calibration import (
+    Calibration,
+    NotCalibratableError,
+    calibrate,
+    compensated,
+    with_more,
+)
+from daqsvc.rotor.departure import DepartureTest, Evidence, threshold_for
+from daqsvc.rotor.identify import Identification, NamingRules, identify
+from daqsvc.rotor.synchronous import SynchronousVectors
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.laval import LavalRotor
+
+    Complexes = NDArray[np.complex128]
+
+State: TypeAlias = Literal["calibrating", "watching", "departed"]
+
+LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
+"""Revolutions since the onset after which a change is looked at; then every 110 more."""
+_NAMED_FROM = 8
+"""Revolutions since the onset before which no look gives a name: the rotor is still on its way."""
+_LATER_LOOKS = 110
+_SETTLING = 8
+"""Revolutions after an onset before the new segment's own reference begins."""
+_LEAST_SEGMENT = 30
+_SEGMENT_THRESHOLD_NATS = 30.0
+"""A changed machine is less steady than a healthy one: only clear further changes begin a new segment."""
+_KEPT = 512
+"""Revolutions that identification can reach back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatchRules:
+    """How the watch decides.
+
+    Attributes:
+        calibrate_revolutions: revolutions of the healthy machine that make the baseline.
+        false_alarms_per_1000_rev: wanted rate of false departures.
+        energy_threshold_nats: threshold of the non-harmonic energy.
+        naming: how a change gets its name.
+        probe_drift_um: standard deviation of the mean position that is drift of the probes.
+        retry: whether to try again after data that cannot be the baseline.
+    """
+
+    calibrate_revolutions: int = 50
+    false_alarms_per_1000_rev: float = 0.1
+    energy_threshold_nats: float = 12.0
+    naming: NamingRules = field(default_factory=NamingRules)
+    probe_drift_um: float = 0.0
+    retry: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class WatchReport:
+    """What the watch says after a revolution.
+
+    Attributes:
+        revolution: revolutions since the start, this one included.
+        end_index: samples since the start up to its end.
+        state: what the watch does.
+        evidence: of the departure test; None while calibrating.
+        departed: whether a departure was declared on this revolution.
+        onset_revolution: first revolution of the present segment, None while the machine is healthy.
+        identification: what the change is; None while the machine is healthy or before the first look.
+        looked: whether the identification is of this revolution.
+        refused: why the last revolutions could not be the baseline; empty if they could.
+    """
+
+    revolution: int
+    end_index: int
+    state: State
+    evidence: Evidence | None = None
+    departed: bool = False
+    onset_revolution: int | None = None
+    identification: Identification | None = None
+    looked: bool = False
+    refused: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    revolution: int
+    vector: Complexes
+    noise: float
+    speed: float
+
+
+class RotorWatch:
+    """Watches one rotor by its synchronous vectors.
+
+    Args:
+        rotor: what is known about it.
+        rate_hz: sampling rate.
+        calibration: of an earlier time; made of the first revolutions if not given.
+        rules: thresholds.
+    """
+
+    def __init__(
+        self,
+        rotor: LavalRotor,
+        rate_hz: float,
+        *,
+        calibration: Calibration | None = None,
+        rules: WatchRules | None = None,
+    ) -> None:
+        self.rules = rules or WatchRules()
+        self.rotor = rotor
+        self.rate_hz = rate_hz
+        self.calibration: Calibration | None = None
+        self.refused = ""
+        self.revolutions = 0
+        self._waiting: list[SynchronousVectors] = []
+        self._rows: deque[_Row] = deque(maxlen=_KEPT)
+        self._segment: list[_Row] = []
+        self._test: DepartureTest | None = None
+        self._healthy: Calibration | None = None
+        self._onset: int | None = None
+        self._look = 0
+        self._identification: Identification | None = None
+        if calibration is not None:
+            self._begin(calibration)
+
+    @property
+    def state(self) -> State:
+        """What the watch does now."""
+        if self.calibration is None:
+            return "calibrating"
+        return "watching" if self._onset is None else "departed"
+
+    def take(self, vectors: SynchronousVectors) -> list[WatchReport]:
+        """Take in revolutions, in order; one report for each that could be fitted."""
+        said = []
+        for i in range(len(vectors)):
+            one = vectors[i : i + 1]
+            self.revolutions += 1
+            if one.usable[0]:
+                said.append(self._take(one))
+        return said
+
+    def _take(self, one: SynchronousVectors) -> WatchReport:
+        if self.calibration is None:
+            return self._calibrate(one)
+        moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
+        row = _Row(
+            self.revolutions, moved[0] - self.calibration.baseline, float(one.noise[0]), float(speed[0])
+        )
+        self._rows.append(row)
+        assert self._test is not None  # noqa: S101 - made with the calibration
+        evidence = (
+            self._test.add(row.vector, self._floored(row.noise), row.speed) if self._tests(row) else None
+        )
+        departed = evidence is not None and evidence.departed
+        looked = False
+        if departed and evidence is not None:
+            self._depart(row.revolution - evidence.window + 1, evidence.window)
+        elif self._onset is not None:
+            looked = self._maybe_look(row.revolution)
+        return self._report(one, evidence, departed=departed, looked=looked)
+
+    def _calibrate(self, one: SynchronousVectors) -> WatchReport:
+        self._waiting.append(one)
+        if len(self._waiting) >= self.rules.calibrate_revolutions and (self.rules.retry or not self.refused):
+            try:
+                made = calibrate(SynchronousVectors.joined(self._waiting), self.rotor, self.rate_hz)
+            except NotCalibratableError as error:
+                self.refused = str(error)
+                del self._waiting[: max(1, self.rules.calibrate_revolutions // 2)]
+            else:
+                self._begin(made)
+        return self._report(one, None, departed=False, looked=False)
+
+    def _begin(self, calibration: Calibration) -> None:
+        self.calibration = self._healthy = calibration
+        self.rotor = calibration.rotor
+        self.refused = ""
+        self._test = self._new_test(
+            threshold_for(self.rules.false_alarms_per_1000_rev), least=calibration.revolutions
+        )
+        # The baseline counts as revolutions seen; they are zero in the test's coordinates.
+        for _ in range(calibration.revolutions):
+            self._test.add(np.zeros(5, dtype=np.complex128), calibration.noise, 0.0)
+        self._waiting.clear()
+
+    def _new_test(self, threshold_nats: float, *, least: int) -> DepartureTest:
+        assert self.calibration is not None  # noqa: S101 - only called after it was made
+        spread = replace(self.calibration.spread, drift=self.rules.probe_drift_um**2)
+        if self._onset is not None:
+            spread = replace(
+                spread,
+                variance=np.maximum(spread.variance, self._scatter(self._segment)),
+                noise_variance=max(spread.noise_variance, self._noise_scatter()),
+            )
+        return DepartureTest(
+            spread,
+            threshold_nats=threshold_nats,
+            energy_threshold_nats=self.rules.energy_threshold_nats * threshold_nats / 20.0,
+            least_reference=least,
+        )
+
+    def _tests(self, row: _Row) -> bool:
+        """Whether a revolution goes into a departure test: not while a new segment settles."""
+        if self._onset is None:
+            return True
+        since = row.revolution - self._onset
+        if since < _SETTLING:
+            return False
+        if since < _SETTLING + _LEAST_SEGMENT:
+            self._segment.append(row)
+            if since + 1 == _SETTLING + _LEAST_SEGMENT:
+                self._test = self._new_test(_SEGMENT_THRESHOLD_NATS, least=_LEAST_SEGMENT)
+                for earlier in self._segment:
+                    self._test.add(earlier.vector, self._floored(earlier.noise), earlier.speed)
+            return False
+        return True
+
+    def _depart(self, onset: int, window: int) -> None:
+        assert self._test is not None  # noqa: S101
+        assert self.calibration is not None  # noqa: S101
+        if self._onset is None:
+            mean, count = self._test.reference_before(window)
+            self._healthy = with_more(self.calibration, self.calibration.baseline + mean, count)
+        self._onset = onset
+        self._look = 0
+        self._segment.clear()
+
+    def _maybe_look(self, revolution: int) -> bool:
+        assert self._onset is not None  # noqa: S101
+        since = revolution - self._onset + 1
+        if since < self._next_look():
+            return False
+        while self._next_look() <= since:
+            self._look += 1
+        self._identify(revolution, may_name=since >= _NAMED_FROM)
+        if self._identification is not None and self._identification.verdict == "normal":
+            self._return_to_health()
+        return True
+
+    def _next_look(self) -> int:
+        if self._look < len(LOOKS):
+            return LOOKS[self._look]
+        return LOOKS[-1] + _LATER_LOOKS * (self._look - len(LOOKS) + 1)
+
+    def finish(self) -> Identification | None:
+        """A last look, at the end of a recording."""
+        if self._onset is not None:
+            self._identify(self.revolutions, may_name=self.revolutions - self._onset + 1 >= _NAMED_FROM)
+        return self._identification
+
+    def _identify(self, revolution: int, *, may_name: bool) -> None:
+        assert self._onset is not None  # noqa: S101
+        assert self._healthy is not None  # noqa: S101
+        assert self.calibration is not None  # noqa: S101
+        since = revolution - self._onset + 1
+        settled = self._onset + since // 3
+        rows = [row for row in self._rows if row.revolution >= settled]
+        if not rows:
+            return
+        vectors = np.array([row.vector for row in rows])
+        speed = float(np.mean([row.speed for row in rows]))
+        shift = self._healthy.baseline - self.calibration.baseline
+        change = vectors.mean(axis=0) - shift
+        spread = replace(self._healthy.spread, drift=self.rules.probe_drift_um**2)
+        spread = replace(spread, variance=np.maximum(spread.variance, self._scatter(rows)))
+        variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed)
+        self._identification = identify(
+            change,
+            variance,
+            self._healthy,
+            previous=self._identification,
+            rules=self.rules.naming,
+            may_name=may_name,
+        )
+
+    def _return_to_health(self) -> None:
+        assert self._healthy is not None  # noqa: S101
+        self._onset, self._identification = None, None
+        self._begin(self._healthy)
+
+    def _floored(self, noise: float) -> float:
+        assert self.calibration is not None  # noqa: S101
+        return max(noise, 1e-6 * self.calibration.amplitude_um**2)
+
+    @staticmethod
+    def _scatter(rows: Sequence[_Row]) -> NDArray[np.float64]:
+        """Variance of the vectors of a segment, or zero of too few to tell."""
+        if len(rows) < 8:
+            return np.zeros(5)
+        vectors = np.array([row.vector for row in rows])
+        return np.asarray(np.abs(vectors - vectors.mean(axis=0)) ** 2).sum(axis=0) / (len(rows) - 1)
+
+    def _noise_scatter(self) -> float:
+        noise = np.array([row.noise for row in self._segment])
+        mean = float(noise.mean())
+        return float(noise.var(ddof=1)) / mean**2 if mean > 0.0 else 0.0
+
+    def _report(
+        self, one: SynchronousVectors, evidence: Evidence | None, *, departed: bool, looked: bool
+    ) -> WatchReport:
+        return WatchReport(
+            revolution=self.revolutions,
+            end_index=int(one.end_index[0]),
+            state=self.state,
+            evidence=evidence,
+            departed=departed,
+            onset_revolution=self._onset,
+            identification=self._identification,
+            looked=looked,
+            refused=self.refused,
+        )
