@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity, silence_reason
-from daqsvc.dsp.keyphasor import Edge, KeyphasorTracker
+from daqsvc.diagnosis.orbit_checks import OrbitWatch
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe, Verdict, judge_probes, stands_still
+from daqsvc.diagnosis.record import Diagnosis, Severity, silence_reason
+from daqsvc.diagnosis.rotor_modes import RotorMode, bank_modes, fault_of
+from daqsvc.dsp.keyphasor import KeyphasorTracker
+from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules
-from daqsvc.rotor.discretise import BankMode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.detector import Window
+    from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.model import RotorParameters
 
     Floats = NDArray[np.float64]
 
+__all__ = ["DEPARTURE", "KeyphasorProbe", "Probe", "RotorBankDetector", "RotorMode"]
+
 MODEL = "laval-rotor-rub/1"
+
+DEPARTURE = "departure"
+"""Decision while the machine has left the declared mode and the cause is not yet known."""
+
+UNDETERMINED_DECISION = "undetermined"
+_SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
 
 _MIN_PROBE_SPREAD = 0.5
 """Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
@@ -34,67 +45,6 @@ _BLIND_REVOLUTIONS = 3.0
 """So long the angle is trusted without an edge."""
 _DEAD = 0.05
 """A probe that moves less than this part of what it must is dead."""
-_CLIPPED = 1 / 16
-"""Part of a revolution at one extreme value that makes a probe clipped."""
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """A proximity probe.
-
-    Attributes:
-        name: name of the sensor.
-        column: its column in the stream, micrometres from the shaft-centred position.
-        angle_deg: where it points, from +x against the clock.
-    """
-
-    name: str
-    column: int
-    angle_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class KeyphasorProbe:
-    """A keyphasor.
-
-    Attributes:
-        name: name of the sensor.
-        column: its column in the stream, volts.
-        threshold_v: level that marks the edge.
-        hysteresis_v: how far the voltage must return before there can be another edge.
-        edge: the edge that marks angle zero.
-    """
-
-    name: str
-    column: int
-    threshold_v: float
-    hysteresis_v: float = 0.5
-    edge: Edge = "rising"
-
-
-@dataclass(frozen=True, slots=True)
-class RotorMode:
-    """A mode of the rotor.
-
-    Attributes:
-        name: name of the mode.
-        damping_ratio: zeta in this mode.
-        severity: how bad it is.
-        rub: whether the shaft touches its housing.
-    """
-
-    name: str
-    damping_ratio: float
-    severity: Severity = "normal"
-    rub: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Verdict:
-    """Whether the last revolution can be trusted, and why not."""
-
-    quality: DataQuality = "good"
-    reason: str = ""
 
 
 class RotorBankDetector:
@@ -107,6 +57,10 @@ class RotorBankDetector:
     evidence, in nats: ``lead.M``, of the declared mode over mode M, and ``cusum.M``, of M against the
     declared one since the onset of its evidence. Under the paper's rule every severity is normal: a
     posterior of 0.9 is no ground for an alarm.
+
+    When the evidence against the declared mode is past its threshold, but does not yet favour one other
+    mode, the decision is ``departure`` with the candidates as group, at once and until the cause is known;
+    the declared mode has not changed by that.
 
     A gap of up to a revolution is predicted through; after a longer one the observers start anew. While
     the quality is not good there is no evidence, and the decision is held.
@@ -124,6 +78,9 @@ class RotorBankDetector:
         process_noise: power spectral density q of the linear observers, normalised.
         rub_process_noise: that of the rub observers; large, so that they follow what they do not know.
         rules: decision rule and thresholds.
+        calibrate_revolutions: healthy revolutions at the start over which unbalance and static position are
+            measured, to stand in every mode in place of the stated ones; 0 to trust what is stated.
+        ac_coupled: whether the probes show no static position.
         name: name of the detector.
 
     Raises:
@@ -145,6 +102,8 @@ class RotorBankDetector:
         process_noise: float = 1e-4,
         rub_process_noise: float = 0.1,
         rules: DecisionRules | None = None,
+        calibrate_revolutions: int = 0,
+        ac_coupled: bool = False,
         name: str = "rotor-bank",
     ) -> None:
         if not (math.isfinite(speed_rpm) and speed_rpm != 0.0 and math.isfinite(rate_hz) and rate_hz > 0.0):
@@ -175,15 +134,15 @@ class RotorBankDetector:
             )
         angles = np.radians([probe.angle_deg for probe in probes])
         self._to_xy = np.linalg.inv(np.vstack((np.cos(angles), np.sin(angles)))) / rotor.clearance_um
-        self._bank_modes = tuple(
-            BankMode(
-                mode.name,
-                rotor.normalised(speed_rpm, mode.damping_ratio),
-                rub_process_noise if mode.rub else process_noise,
-                mode.rub,
-            )
-            for mode in self._modes
+        self._bank_modes = bank_modes(
+            self._modes,
+            rotor,
+            speed_rpm,
+            process_noise=process_noise,
+            rub_process_noise=rub_process_noise,
+            ac_coupled=ac_coupled,
         )
+        self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
         self._noise = noise_um / rotor.clearance_um / abs(spread)
         self._bank = self._new_bank()
@@ -195,11 +154,50 @@ class RotorBankDetector:
         )
         healthy = abs(self._bank_modes[0].rotor.orbit()) * rotor.clearance_um
         self._least_motion_um = _DEAD * math.hypot(noise_um, healthy / math.sqrt(2.0))
+        self._watch = OrbitWatch(
+            noise=self._noise,
+            rest=self._bank_modes[0].rotor.rest,
+            probes=(probes[0].name, probes[1].name),
+            keyphasor=keyphasor.name,
+        )
+        if calibrate_revolutions < 0:
+            raise ValueError(
+                f"rotor bank of {machine!r}: calibrate_revolutions is {calibrate_revolutions}; "
+                "write 0 to trust the stated rotor, or 20 or more"
+            )
+        self._calibrate_revolutions = calibrate_revolutions
+        self._calibration = SteadyFit() if calibrate_revolutions else None
+        self._departed = False
         self._last_revolution = np.empty((0, 3))
         self._next_index: int | None = None
         self._revolutions = 0.0
         self._progress_index: int | None = None
-        self._decision = "undetermined"
+        self._decision = UNDETERMINED_DECISION
+
+    @property
+    def faults(self) -> Mapping[str, str]:
+        """What each mode is in the words of a verdict, by name: ``"normal"``, ``"unbalance"``, ..."""
+        return self._faults
+
+    @property
+    def bank_modes(self) -> tuple[BankMode, ...]:
+        """The models behind the modes, healthy first, as they stand by now."""
+        return self._bank_modes
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the measured position, in clearances."""
+        return self._noise
+
+    @property
+    def duration(self) -> float:
+        """Normalised time between samples."""
+        return self._duration
+
+    @property
+    def rules(self) -> DecisionRules:
+        """Thresholds and the rule that declares."""
+        return self._rules
 
     def warm(self) -> None:
         """Compile the kernels on a bank that is thrown away."""
@@ -220,6 +218,7 @@ class RotorBankDetector:
         elif gap:
             self._tracker.reset()
             self._bank.reseed()
+            self._watch.reset()
             self._last_revolution = np.empty((0, 3))
         self._next_index = end_index = first_index + len(samples)
         said: list[Diagnosis] = []
@@ -257,8 +256,15 @@ class RotorBankDetector:
     def _columns(self) -> list[int]:
         return [self._probes[0].column, self._probes[1].column, self._keyphasor.column]
 
-    def _new_bank(self) -> ModelBank:
-        return ModelBank(self._bank_modes, noise=self._noise, duration=self._duration, rules=self._rules)
+    def _new_bank(self, *, variance_factor: float = 1.0, decision: int = UNDETERMINED) -> ModelBank:
+        return ModelBank(
+            self._bank_modes,
+            noise=self._noise,
+            duration=self._duration,
+            rules=self._rules,
+            variance_factor=variance_factor,
+            decision=decision,
+        )
 
     def _step(self, samples: Floats, first_index: int, t_ns: int, period_ns: float) -> list[Diagnosis]:
         """A block of probe, probe and keyphasor samples; ``t_ns`` is the time of its last one."""
@@ -266,33 +272,89 @@ class RotorBankDetector:
         track = self._tracker.process(samples[:, 2])
         revolution = round(self._tracker.period_samples)
         self._last_revolution = np.concatenate((self._last_revolution, samples))[-revolution:]
-        verdict = self._judge()
         angle = self._direction * track.angle_rad
-        self._follow_speed(float(angle[0]))
-
+        cos, sin = np.cos(angle), np.sin(angle)
         xy = samples[:, :2] @ self._to_xy
-        if verdict.quality != "good" or _stands_still(samples[:, :2]):
+        if stands_still(samples[:, :2]):
             xy[:] = np.nan
-        report = self._bank.process(xy, np.cos(angle), np.sin(angle))
+        self._watch.add(xy, cos, sin, revolution)
+        verdict = self._judge()
+        self._follow_speed(float(angle[0]))
+        if verdict.quality != "good":
+            xy[:] = np.nan
 
-        said = []
         before = self._revolutions
-        for change in report.declarations:
-            self._decision = self._modes[change.mode].name
-            self._revolutions = before + (change.sample + 1) / self._tracker.period_samples
-            at_ns = t_ns - round((len(samples) - 1 - change.sample) * period_ns)
-            onset = first_index + min(change.onset, change.sample)
-            end = first_index + change.sample + 1
-            said.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
         self._revolutions = before + len(samples) / self._tracker.period_samples
         if self._progress_index is None:
             self._progress_index = first_index
+        if self._calibration is not None:
+            said = self._calibrate(xy, cos, sin, verdict, end_index, t_ns)
+            report = self._bank.process(xy * np.nan, cos, sin)  # only time passes
+        else:
+            report = self._bank.process(xy, cos, sin)
+            said = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
+            said += self._departures(report, verdict, end_index, t_ns, period_ns)
         if math.floor(self._revolutions) > math.floor(before):
             began, self._progress_index = self._progress_index, end_index
             said.append(
-                self._diagnosis(report, verdict, began, end_index, t_ns, report.decision, changed=False)
+                self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=False)
             )
         return said
+
+    def _changes(
+        self,
+        report: BankReport,
+        verdict: Verdict,
+        first_index: int,
+        n: int,
+        before: float,
+        t_ns: int,
+        period_ns: float,
+    ) -> list[Diagnosis]:
+        """One statement for every change of the declared mode."""
+        said = []
+        after = self._revolutions
+        for change in report.declarations:
+            self._decision = self._modes[change.mode].name
+            self._revolutions = before + (change.sample + 1) / self._tracker.period_samples
+            at_ns = t_ns - round((n - 1 - change.sample) * period_ns)
+            onset = first_index + min(change.onset, change.sample)
+            end = first_index + change.sample + 1
+            said.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
+        self._revolutions = after
+        return said
+
+    def _departures(
+        self, report: BankReport, verdict: Verdict, end_index: int, t_ns: int, period_ns: float
+    ) -> list[Diagnosis]:
+        """The statement that the machine has left the declared mode, once."""
+        departure, departed = report.departure, self._departed
+        self._departed = departure is not None
+        if departure is None or departed:
+            return []
+        at_ns = t_ns + round(departure.sample * period_ns)
+        onset, end = end_index - 1 + departure.onset, end_index + departure.sample
+        return [
+            self._diagnosis(report, verdict, min(onset, end - 1), end, at_ns, report.decision, changed=False)
+        ]
+
+    def _calibrate(
+        self, xy: Floats, cos: Floats, sin: Floats, verdict: Verdict, end_index: int, t_ns: int
+    ) -> list[Diagnosis]:
+        """Measure the healthy motion; at the end, put it into every mode and say so."""
+        assert self._calibration is not None  # noqa: S101 - the caller asks while there is one
+        self._calibration.add(xy, cos, sin)
+        if self._calibration.samples < self._calibrate_revolutions * self._tracker.period_samples:
+            return []
+        motion = self._calibration.solve()
+        speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
+        self._bank_modes = adapted(self._bank_modes, motion, speed)
+        self._bank = self._new_bank(variance_factor=VARIANCE_FACTOR, decision=0)
+        self._calibration = None
+        self._decision = self._modes[0].name
+        report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))
+        onset = end_index - motion.samples
+        return [self._diagnosis(report, verdict, onset, end_index, t_ns, 0, changed=True)]
 
     def _follow_speed(self, angle_rad: float) -> None:
         if math.isnan(angle_rad):
@@ -301,46 +363,32 @@ class RotorBankDetector:
         if abs(speed / self._bank.speed - 1.0) > _RETUNE:
             self._bank.retune(speed, angle_rad)
 
-    def _judge(self) -> _Verdict:
+    def _judge(self) -> Verdict:
         """What the last revolution is worth."""
-        n = len(self._last_revolution)
-        for column, probe in enumerate(self._probes):
-            signal = self._last_revolution[:, column]
-            signal = signal[~np.isnan(signal)]
-            if n - len(signal) > n / 2:
-                return _Verdict(
-                    "missing",
-                    f"{probe.name}: {n - len(signal)} of the last {n} samples are missing; "
-                    "check the bus and the device",
-                )
-            if n < round(self._tracker.period_samples):
-                continue
-            if (deviation := float(signal.std())) < self._least_motion_um:
-                return _Verdict(
-                    "not_ok",
-                    f"{probe.name}: moved by {deviation:.3g} um rms in the last revolution, at least "
-                    f"{self._least_motion_um:.3g} um is expected; check the probe, its cable and driver",
-                )
-            if (clipped := _at_an_extreme(signal)) is not None:
-                return _Verdict(
-                    "not_ok",
-                    f"{probe.name}: clipped at {clipped:.6g} um in the last revolution; "
-                    "check the gap and the range of the converter",
-                )
+        bad = judge_probes(
+            self._last_revolution[:, :2],
+            self._probes,
+            revolution=round(self._tracker.period_samples),
+            least_motion_um=self._least_motion_um,
+        )
+        if bad is not None:
+            return bad
         if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
             expected_rpm = 60.0 * self._rate_hz / self._nominal_period
-            return _Verdict(
+            return Verdict(
                 "missing",
                 f"{self._keyphasor.name}: no pulse for {blind:.0f} revolutions at {expected_rpm:.0f} rpm; "
                 "check that the shaft turns at that speed, and that the pulse crosses "
                 f"{self._keyphasor.threshold_v} V",
             )
-        return _Verdict()
+        if doubt := self._watch.doubt():
+            return Verdict("not_ok", doubt)
+        return Verdict()
 
     def _diagnosis(
         self,
         report: BankReport,
-        verdict: _Verdict,
+        verdict: Verdict,
         first_index: int,
         end_index: int,
         t_ns: int,
@@ -349,18 +397,18 @@ class RotorBankDetector:
         changed: bool,
     ) -> Diagnosis:
         names = [mode.name for mode in self._modes]
-        known = decision != UNDETERMINED
-        evidence = {}
-        probabilities = conditional = report.probabilities
-        if known and self._rules.rule == "cusum":
-            others = [i for i in range(len(names)) if i != report.decision]
-            evidence = {f"lead.{names[i]}": float(report.lead_nats[i]) for i in others}
-            evidence |= {f"cusum.{names[i]}": float(report.cusum_nats[i]) for i in others}
-            odds = np.exp(-report.lead_nats)  # the decision leads itself by infinity in the report
-            odds[report.decision] = 1.0
-            probabilities = odds / odds.sum()
+        probabilities, evidence = report.probabilities, {}
+        if decision != UNDETERMINED and self._rules.rule == "cusum":
+            probabilities, evidence = _odds(report), _evidence(report, names)
+        group, severity = report.group, self._severity(decision)
+        stated = self._decision
+        if report.departure is not None and not changed:
+            group = report.departure.candidates
+            stated = DEPARTURE
+            mildest = min(_SEVERITIES.index(self._severity(i)) for i in group)
+            severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
         statistics = {"speed": 60.0 * self._rate_hz / self._tracker.period_samples}
-        statistics |= {f"paper.{name}": float(p) for name, p in zip(names, conditional, strict=True)}
+        statistics |= {f"paper.{name}": float(p) for name, p in zip(names, report.probabilities, strict=True)}
         return Diagnosis(
             machine=self._machine,
             detector=self.name,
@@ -368,11 +416,11 @@ class RotorBankDetector:
             stream=self.stream,
             first_index=first_index,
             end_index=end_index,
-            decision=self._decision,
+            decision=stated,
             changed=changed,
-            severity=self._modes[decision].severity if known and self._rules.rule == "cusum" else "normal",
+            severity=severity,
             probabilities=dict(zip(names, probabilities.tolist(), strict=True)),
-            group=tuple(names[i] for i in report.group),
+            group=tuple(names[i] for i in group),
             statistics=statistics,
             units={"speed": "rpm"},
             thresholds={
@@ -388,22 +436,21 @@ class RotorBankDetector:
             model=MODEL,
         )
 
+    def _severity(self, mode: int) -> Severity:
+        """How bad a declared mode is; the paper's rule raises no alarm."""
+        known = mode != UNDETERMINED and self._rules.rule == "cusum"
+        return self._modes[mode].severity if known else "normal"
 
-def _stands_still(probes: Floats) -> bool:
-    """Whether a probe repeats one value through a block, as none does that sees a turning shaft."""
-    return len(probes) > 2 and bool((probes == probes[0]).all(axis=0).any())
+
+def _odds(report: BankReport) -> Floats:
+    """Posterior probabilities of the modes by the evidence of the declared one over each."""
+    against = report.lead_nats.copy()  # the decision leads itself by infinity in the report
+    against[report.decision] = 0.0
+    odds = np.exp(against.min() - against)
+    return np.asarray(odds / odds.sum(), dtype=np.float64)
 
 
-def _at_an_extreme(signal: Floats) -> float | None:
-    """The extreme value that a signal is clipped at, or None.
-
-    A coarse converter repeats its values between the extremes as well, and a sine only twice as often at
-    its top as elsewhere: a clipped signal repeats its extreme four times as often as any other value.
-    """
-    values, counts = np.unique(signal, return_counts=True)
-    usual = int(counts[1:-1].max(initial=0))
-    least = max(_CLIPPED * len(signal), 4.0 * usual, 3.0)
-    for extreme in (0, -1):
-        if counts[extreme] >= least:
-            return float(values[extreme])
-    return None
+def _evidence(report: BankReport, names: Sequence[str]) -> dict[str, float]:
+    others = [i for i in range(len(names)) if i != report.decision]
+    evidence = {f"lead.{names[i]}": float(report.lead_nats[i]) for i in others}
+    return evidence | {f"cusum.{names[i]}": float(report.cusum_nats[i]) for i in others}

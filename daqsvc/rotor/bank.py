@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor import kernels
-from daqsvc.rotor.decision import DecisionRules, Declaration
+from daqsvc.rotor.decision import DecisionRules, Declaration, Departure
 from daqsvc.rotor.discretise import BankMode, at_speed, discretise
+from daqsvc.rotor.likeness import alike
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -40,8 +41,11 @@ class BankReport:
         cusum_nats: float64 ``[M]``, evidence of each mode against the decision since its onset.
         lead_nats: float64 ``[M]``, evidence of the decision over each mode, counted up to one and a half
             thresholds; infinite for the decision itself.
-        group: indices of the modes that the evidence cannot tell apart, the decision among them;
-            empty if it stands alone.
+        group: indices of the modes that cannot be told apart, the decision among them, be it that the
+            evidence so far does not or that their steady orbits are the same at this speed; empty if the
+            decision stands alone.
+        departure: set while the evidence against the declared mode is past its threshold, but no other
+            mode leads the rest by the margin: the machine has changed, the cause is not yet known.
     """
 
     decision: int
@@ -51,6 +55,7 @@ class BankReport:
     cusum_nats: Floats
     lead_nats: Floats
     group: tuple[int, ...]
+    departure: Departure | None = None
 
 
 class ModelBank:
@@ -63,6 +68,8 @@ class ModelBank:
         noise: standard deviation of the measured position, in clearances.
         duration: normalised time between samples, omega_s dt.
         rules: thresholds and the rule that declares.
+        variance_factor: see `discretise`.
+        decision: index of the mode that is known to be true at the start; -1 to let the evidence tell.
 
     Raises:
         ValueError: the modes or figures cannot make a bank.
@@ -75,13 +82,17 @@ class ModelBank:
         noise: float,
         duration: float,
         rules: DecisionRules | None = None,
+        variance_factor: float = 1.0,
+        decision: int = UNDETERMINED,
     ) -> None:
         names = [mode.name for mode in modes]
         if len(set(names)) != len(names) or len(names) < 2:
             raise ValueError(f"rotor bank: modes {names} must be two or more with different names")
         self.modes = tuple(modes)
         self.rules = rules or DecisionRules()
-        self.observers = discretise(self.modes, noise=noise, duration=duration)
+        self.observers = discretise(
+            self.modes, noise=noise, duration=duration, variance_factor=variance_factor
+        )
         self.speed = self.modes[0].rotor.w
         speed = abs(self.speed)
         if speed == 0.0:
@@ -92,6 +103,7 @@ class ModelBank:
         self._samples_per_rev = max(1, round(2.0 * math.pi / (speed * duration)))
         self._log_prior = self.rules.log_priors(names)
         self._thresholds = self.rules.thresholds(count)
+        self._alike = alike(self.observers, duration, self.rules.alike_nats_per_rev)
         self._states = np.zeros((count, 4))
         self._paper_states = np.zeros((count, 4))
         self._log_probability = self._log_prior.copy()
@@ -99,9 +111,12 @@ class ModelBank:
         self._lead = np.zeros(count)
         self._duels = np.zeros((count, count))
         self._ages = np.zeros(count, dtype=np.int64)
-        self._cusum_decision = UNDETERMINED
-        self._cusum_previous = UNDETERMINED
-        self._paper_decision = UNDETERMINED
+        if not UNDETERMINED <= decision < count:
+            raise ValueError(f"rotor bank: there is no mode {decision}; the {count} modes count from 0")
+        self._cusum_decision = decision
+        self._cusum_previous = decision
+        self._paper_decision = decision
+        self._departed = 0
         self._paper_age = 0
         self._unusable = 0
         self._settling = 0
@@ -126,6 +141,7 @@ class ModelBank:
         self._cusum[:] = 0.0
         self._duels[:] = 0.0
         self._ages[:] = 0
+        self._departed = 0
         self._paper_age = 0
         self._unusable = self._samples_per_rev + 1
         self._settling = self._samples_per_rev
@@ -147,6 +163,7 @@ class ModelBank:
             kernels.change_orbits(self.observers, moved, math.cos(angle_rad), math.sin(angle_rad), states)
         self.observers = moved
         self.speed = speed
+        self._alike = alike(moved, self._duration, self.rules.alike_nats_per_rev)
 
     def process(self, xy: Floats, cos: Floats, sin: Floats) -> BankReport:
         """Take in a block of samples.
@@ -204,12 +221,15 @@ class ModelBank:
         kernels.run_free(xy, usable, cos, sin, self.observers, self._states, scores)
         scores[:, :settling] = 0.0
         cusum_verdicts = np.empty(n, dtype=np.int64)
+        suspects = np.empty(n, dtype=np.int64)
         ages = np.zeros(n, dtype=np.int64)
         self._cusum_decision = kernels.decide_by_cusum(
             scores, self._thresholds, self.rules.threshold_nats, self.rules.identity_nats,
-            _LEAD_LIMIT * self.rules.threshold_nats, self._cusum_decision,
-            self._cusum, self._lead, self._duels, self._ages, cusum_verdicts, ages,
+            _LEAD_LIMIT * self.rules.threshold_nats, self._alike, self._cusum_decision,
+            self._cusum, self._lead, self._duels, self._ages, cusum_verdicts, suspects, ages,
         )  # fmt: skip
+        known = np.flatnonzero(suspects == UNDETERMINED)
+        self._departed = n - 1 - int(known[-1]) if len(known) else self._departed + n
         paper_changes = self._paper_changes(paper_verdicts)
         paper_declarations = int(np.count_nonzero(paper_verdicts != UNDETERMINED))
         if self.rules.rule == "paper":
@@ -241,12 +261,17 @@ class ModelBank:
     def _report(self, declarations: tuple[Declaration, ...], paper_declarations: int) -> BankReport:
         lead = self._lead.copy()
         group: tuple[int, ...] = ()
+        departure = None
         decision = self._cusum_decision
+        if decision != UNDETERMINED and decision == self.decision:
+            close = (lead < self.rules.group_nats) | self._alike[decision]
+            close[decision] = True
+            if np.count_nonzero(close) > 1:
+                group = tuple(np.flatnonzero(close).tolist())
+            if self._departed:
+                departure = self._departure(decision)
         if decision != UNDETERMINED:
             lead[decision] = math.inf
-            close = np.flatnonzero(lead < self.rules.group_nats).tolist()
-            if close and decision == self.decision:
-                group = tuple(sorted((decision, *close)))
         probabilities = np.exp(self._log_probability)
         return BankReport(
             decision=self.decision,
@@ -256,4 +281,15 @@ class ModelBank:
             cusum_nats=self._cusum.copy(),
             lead_nats=lead,
             group=group,
+            departure=departure,
         )
+
+    def _departure(self, decision: int) -> Departure:
+        """The departure that the present block ends in."""
+        rivals = ~self._alike[decision]
+        rivals[decision] = False
+        evidence = np.where(rivals, self._cusum, -math.inf)
+        leader = int(np.argmax(evidence))
+        close = rivals & ((evidence > evidence[leader] - self.rules.group_nats) | self._alike[leader])
+        onset = 1 - int(self._ages[leader])
+        return Departure(1 - self._departed, onset, tuple(np.flatnonzero(close).tolist()))

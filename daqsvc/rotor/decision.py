@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -28,8 +28,8 @@ class DecisionRules:
     """Thresholds of both rules.
 
     A mean time between failures belongs into these: a threshold is ln(1 / pi) of the prior pi per
-    decision, so a rarer transition gets a higher one. As a prior it would re-declare the favourite at
-    every sample.
+    decision, so a rarer transition gets a higher one (`from_rates`). As a prior it would re-declare the
+    favourite at every sample.
 
     Attributes:
         rule: the rule whose mode counts as declared.
@@ -37,6 +37,7 @@ class DecisionRules:
         back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
         identity_nats: lead over the other candidates that a change of the decision takes: odds of 20 to 1.
         group_nats: lead below which two modes are not told apart: odds of 150 to 1.
+        alike_nats_per_rev: steady evidence a revolution, by the models, below which two modes never are.
         probability_threshold: conditional probability that declares under the paper's rule.
         priors: probabilities that the paper's rule starts and resets to; equal if not given.
     """
@@ -46,13 +47,16 @@ class DecisionRules:
     back_threshold_nats: float = 25.0
     identity_nats: float = 3.0
     group_nats: float = 5.0
+    alike_nats_per_rev: float = 0.1
     probability_threshold: float = 0.9
     priors: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.rule not in ("cusum", "paper"):
             raise ValueError(f"decision rule {self.rule!r} is unknown; use 'cusum' or 'paper'")
-        for name in ("threshold_nats", "back_threshold_nats", "identity_nats", "group_nats"):
+        for name in (
+            "threshold_nats", "back_threshold_nats", "identity_nats", "group_nats", "alike_nats_per_rev"
+        ):  # fmt: skip
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"decision rule: {name} is {value}; evidence is a finite number above 0")
@@ -61,6 +65,59 @@ class DecisionRules:
                 f"decision rule: probability_threshold is {self.probability_threshold}; "
                 "it must lie in [0.5, 1), so that only one mode can pass it"
             )
+
+    @classmethod
+    def from_rates(
+        cls,
+        *,
+        false_alarms_per_1000_rev: float,
+        mtbf_hours: float,
+        speed_rpm: float,
+        samples_per_rev: float,
+        modes: int,
+        **others: Any,
+    ) -> Self:
+        """Thresholds from how often the bank may be wrong: h = ln(1 / pi), pi per sample and rival mode.
+
+        A CUSUM of log-likelihood ratios crosses h by chance at most once in exp(h) samples on average
+        (Lorden 1971), for each rival. Forward, the wanted rate of false alarms sets pi. Back, a machine
+        heals less often than it fails, and not while it turns: pi is one in a mean time between failures.
+        At 600 rpm, 64 samples a revolution and four modes, 0.02 false alarms in 1000 revolutions and
+        10,000 h make the defaults, 16 nats forward and 25 back.
+
+        The rate is a bound for a machine in its healthy mode; measured rates are a few times lower.
+
+        Args:
+            false_alarms_per_1000_rev: accepted on a healthy machine.
+            mtbf_hours: mean time between failures.
+            speed_rpm: of the shaft; the sign does not matter.
+            samples_per_rev: samples a revolution.
+            modes: number of modes in the bank.
+            **others: further attributes of the rules.
+
+        Raises:
+            ValueError: a figure is not above 0, or there are fewer than two modes.
+        """
+        figures = {
+            "false_alarms_per_1000_rev": false_alarms_per_1000_rev,
+            "mtbf_hours": mtbf_hours,
+            "speed_rpm": abs(speed_rpm),
+            "samples_per_rev": samples_per_rev,
+            "modes - 1": modes - 1,
+        }
+        for name, value in figures.items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"decision rule: {name} is {value}; it must be a finite number above 0")
+        chances_per_rev = samples_per_rev * (modes - 1)
+        forward = math.log(1000.0 * chances_per_rev / false_alarms_per_1000_rev)
+        back = math.log(60.0 * mtbf_hours * abs(speed_rpm) * chances_per_rev)
+        least = math.log(chances_per_rev)
+        if forward <= least:
+            raise ValueError(
+                f"decision rule: {false_alarms_per_1000_rev} false alarms per 1000 revolutions are one in "
+                "every revolution or more; ask for fewer, e.g. 0.02"
+            )
+        return cls(threshold_nats=forward, back_threshold_nats=max(forward, back), **others)
 
     def log_priors(self, names: Sequence[str]) -> Floats:
         """Logarithms of the priors of the named modes, float64 ``[M]``.
@@ -88,6 +145,21 @@ class DecisionRules:
         """Evidence that changes the decision from the row's mode to the column's, float64 ``[M, M]``."""
         back = np.tril(np.ones((count, count), dtype=bool), -1)
         return np.where(back, self.back_threshold_nats, self.threshold_nats)
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """The machine has left the declared mode, and the cause is not yet known.
+
+    Attributes:
+        sample: the sample that brought the evidence, counted from the last one of the block: 0 or less.
+        onset: the first sample of that evidence, on the same count.
+        candidates: indices of the modes that are close to the leading one, or look like it.
+    """
+
+    sample: int
+    onset: int
+    candidates: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)

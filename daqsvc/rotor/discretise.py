@@ -151,7 +151,9 @@ def contact_substeps(rotor: NormalisedRotor, duration: float) -> int:
     return max(1, math.ceil(duration / step * (1.0 - 1e-9)))
 
 
-def discretise(modes: Sequence[BankMode], *, noise: float, duration: float) -> Observers:
+def discretise(
+    modes: Sequence[BankMode], *, noise: float, duration: float, variance_factor: float = 1.0
+) -> Observers:
     """Constants of a bank for one sampling interval, at the speed of its first mode.
 
     Args:
@@ -159,19 +161,24 @@ def discretise(modes: Sequence[BankMode], *, noise: float, duration: float) -> O
         noise: standard deviation of the measured position in clearances, one figure for all modes: a
             noise that differed by mode would be what decides.
         duration: normalised time between samples, omega_s dt.
+        variance_factor: how much larger than their own figure the innovations' variance is taken to be, for
+            models that are known to be wrong by a little; the gains do not change.
 
     Returns:
         Array ``[M]`` of `OBSERVER`.
 
     Raises:
-        ValueError: no modes, a rub observer first, or a noise figure not above 0.
+        ValueError: no modes, a rub observer first, a noise figure not above 0, or a factor below 1.
     """
     if not modes or modes[0].rub:
         raise ValueError("rotor bank: the first mode must be the healthy one, without rub")
+    if not (math.isfinite(variance_factor) and variance_factor >= 1.0):
+        raise ValueError(f"rotor bank: the variance factor is {variance_factor}; it must be 1 or more")
     observers = np.zeros(len(modes), dtype=OBSERVER)
     for observer, mode in zip(observers, modes, strict=True):
         rotor = mode.rotor
         gain, variance = constant_gain(rotor, mode.process_noise, noise, duration)
+        variance *= variance_factor
         observer["gain_x"], observer["gain_v"] = gain
         observer["precision"] = 1.0 / variance
         observer["log_norm"] = math.log(2.0 * math.pi * variance)

@@ -280,8 +280,8 @@ def decide_by_probability(  # noqa: C901 - one recursion: update, declare, hand 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _first_verdict(scores: Floats, k: int, threshold: float, duels: Floats) -> int:
-    """Every mode against every other; the index of one that leads them all by the threshold, or -1."""
+def _first_verdict(scores: Floats, k: int, threshold: float, alike: Flags, duels: Floats) -> int:
+    """Every mode against every other; the index of one that leads all unlike it by the threshold, or -1."""
     count = len(scores)
     winner = UNDETERMINED
     for i in range(count):
@@ -289,8 +289,9 @@ def _first_verdict(scores: Floats, k: int, threshold: float, duels: Floats) -> i
         for j in range(count):
             if i != j:
                 duels[i, j] = max(0.0, duels[i, j] + scores[i, k] - scores[j, k])
-                narrowest = min(narrowest, duels[i, j])
-        if narrowest >= threshold:
+                if not alike[i, j]:
+                    narrowest = min(narrowest, duels[i, j])
+        if narrowest >= threshold and (winner == UNDETERMINED or duels[i, winner] > duels[winner, i]):
             winner = i
     return winner
 
@@ -306,23 +307,30 @@ def _gather(scores: Floats, k: int, current: int, cusum: Floats, ages: Ints) -> 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _next_verdict(current: int, thresholds: Floats, identity_margin: float, cusum: Floats) -> int:
-    """The index of the mode that takes over from the declared one, or -1.
+def _next_verdict(
+    current: int, thresholds: Floats, identity_margin: float, alike: Flags, cusum: Floats
+) -> tuple[int, int]:
+    """The mode with a threshold of evidence against the declared one, and the one that takes over, or -1.
 
     A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
     takes over must lead the rest by the margin; past one and a half thresholds it need not any more.
+    A mode that looks like the declared one cannot take over from it, and one that looks like the
+    leading one does not hold it up.
     """
-    winner, best, second = UNDETERMINED, 0.0, 0.0
+    winner = UNDETERMINED
     for j in range(len(cusum)):
-        if cusum[j] > best:
-            winner, best, second = j, cusum[j], best
-        elif cusum[j] > second:
-            second = cusum[j]
-    if winner == UNDETERMINED or best < thresholds[current, winner]:
-        return UNDETERMINED
+        if cusum[j] > 0.0 and not alike[current, j] and (winner == UNDETERMINED or cusum[j] > cusum[winner]):
+            winner = j
+    if winner == UNDETERMINED or cusum[winner] < thresholds[current, winner]:
+        return UNDETERMINED, UNDETERMINED
+    second = 0.0
+    for j in range(len(cusum)):
+        if j != winner and not alike[winner, j] and not alike[current, j]:
+            second = max(second, cusum[j])
+    best = cusum[winner]
     if best - second < identity_margin and best < _PATIENCE * thresholds[current, winner]:
-        return UNDETERMINED
-    return winner
+        return winner, UNDETERMINED
+    return winner, winner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -332,12 +340,14 @@ def decide_by_cusum(
     first_threshold: float,
     identity_margin: float,
     lead_limit: float,
+    alike: Flags,
     current: int,
     cusum: Floats,
     lead: Floats,
     duels: Floats,
     ages: Ints,
     verdicts: Ints,
+    suspects: Ints,
     onsets: Ints,
 ) -> int:
     """CUSUM of log-likelihood ratios over free-running observers (Page 1954).
@@ -348,13 +358,15 @@ def decide_by_cusum(
         first_threshold: nats by which one mode must lead all others to be the first decision.
         identity_margin: nats by which the next decision must lead the other candidates.
         lead_limit: the lead of the decision over another mode counts up to here.
+        alike: bool ``[M, M]``, pairs that no lead is asked of and no change is made between.
         current: index of the decision before the block, or -1.
         cusum: float64 ``[M]``, evidence of each mode against the decision since its onset, changed in place.
         lead: float64 ``[M]``, evidence of the decision over each mode, changed in place.
         duels: float64 ``[M, M]``, evidence of row over column until there is a decision, changed in place.
         ages: int64 ``[M]``, samples since the onset of each CUSUM, changed in place.
         verdicts: int64 ``[n]``, out: mode declared at each sample, or -1.
-        onsets: int64 ``[n]``, out: where there is a verdict, how many samples its evidence goes back.
+        suspects: int64 ``[n]``, out: leading mode while it has the evidence but not the margin, or -1.
+        onsets: int64 ``[n]``, out: for a verdict or a suspect, how many samples its evidence goes back.
 
     Returns:
         Index of the decision after the block, or -1.
@@ -363,11 +375,16 @@ def decide_by_cusum(
     for k in range(n):
         for j in range(count):
             ages[j] += 1
+        suspects[k] = UNDETERMINED
         if current == UNDETERMINED:
-            winner = _first_verdict(scores, k, first_threshold, duels)
+            winner = _first_verdict(scores, k, first_threshold, alike, duels)
         else:
             _gather(scores, k, current, cusum, ages)
-            winner = _next_verdict(current, thresholds, identity_margin, cusum)
+            suspect, winner = _next_verdict(current, thresholds, identity_margin, alike, cusum)
+            if suspect != UNDETERMINED:
+                onsets[k] = ages[suspect]
+                if winner == UNDETERMINED:
+                    suspects[k] = suspect
             for j in range(count):
                 lead[j] = min(lead_limit, lead[j] + scores[current, k] - scores[j, k])
         verdicts[k] = winner

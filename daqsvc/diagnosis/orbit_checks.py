@@ -1,0 +1,144 @@
+"""Whether probes and keyphasor together show what they are said to: direction, static position, speed."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.rotor.adaptation import SteadyFit, SteadyMotion
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_SIGNIFICANT = 5.0
+"""Standard deviations that a part of the orbit must have to be believed."""
+_CONTACT_FREE = 0.9
+"""An orbit that stays within this part of the clearance is not driven backwards by a rub."""
+_BACKWARD = 2.0
+"""Backward over forward radius from which the orbit as a whole turns backwards."""
+_DC_REVOLUTIONS = 4
+_NO_DC = 0.25
+"""Part of the expected static position below which the probes show none."""
+_SLIP_REVOLUTIONS = 24
+_SLIP = 0.002
+"""Relative difference of orbit's and keyphasor's speed that a real machine cannot have."""
+_UNSTEADY = 0.3
+
+
+class OrbitWatch:
+    """Fits the orbit revolution by revolution and says what cannot be true of it.
+
+    Args:
+        noise: standard deviation of the measured position, in clearances.
+        rest: expected static position, in clearances; 0 if none is to be seen.
+        probes: names of the two probes.
+        keyphasor: name of the keyphasor.
+    """
+
+    def __init__(self, *, noise: float, rest: complex, probes: tuple[str, str], keyphasor: str) -> None:
+        self._noise = noise
+        self._expected_rest = rest
+        self._pair = f"{probes[0]} and {probes[1]}"
+        self._keyphasor = keyphasor
+        self._static_seen = rest == 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the orbit, for instance after a long gap."""
+        self._fit = SteadyFit()
+        self._covered = 0
+        self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
+
+    def add(self, xy: Floats, cos: Floats, sin: Floats, revolution: int) -> None:
+        """Take in a block.
+
+        Args:
+            xy: float64 ``[n, 2]``, position in clearances; NaN where missing.
+            cos: float64 ``[n]``, cosine of the shaft angle; NaN where not known.
+            sin: float64 ``[n]``, its sine.
+            revolution: samples in a revolution.
+        """
+        self._fit.add(xy, cos, sin)
+        self._covered += len(xy)
+        if self._covered < revolution:
+            return
+        if self._fit.samples > revolution // 2:
+            self._motions.append(self._fit.solve())
+        self._fit, self._covered = SteadyFit(), 0
+
+    def doubt(self) -> str:
+        """What cannot be true, with the remedy; empty if nothing is wrong."""
+        return self._direction() or self._static_position() or self._slip()
+
+    def _sigma(self, motions: list[SteadyMotion]) -> float:
+        """Standard deviation of a mean of one part, complex, over several revolutions."""
+        return self._noise * math.sqrt(2.0 / sum(motion.samples for motion in motions))
+
+    def _direction(self) -> str:
+        motions = list(self._motions)[-2:]
+        if not motions:
+            return ""
+        forward = _radius([motion.forward for motion in motions])
+        backward = _radius([motion.backward for motion in motions])
+        rest = _radius([motion.rest for motion in motions])
+        if backward < max(_BACKWARD * forward, _SIGNIFICANT * self._sigma(motions)):
+            return ""
+        if forward + backward + rest > _CONTACT_FREE:
+            return ""
+        return (
+            f"{self._pair}: the orbit turns against the stated rotation (1X radius {backward:.3g} clearances "
+            f"backward, {forward:.3g} forward); x and y are swapped, or the sign of the speed is wrong: "
+            "correct angle_deg of the probes or the direction of rotation"
+        )
+
+    def _static_position(self) -> str:
+        motions = list(self._motions)
+        if self._static_seen or len(motions) < _DC_REVOLUTIONS:
+            return ""
+        expected = abs(self._expected_rest)
+        if expected < 2.0 * _SIGNIFICANT * self._sigma(motions):
+            return ""
+        seen = _radius([motion.rest for motion in motions])
+        if seen >= _NO_DC * expected:
+            self._static_seen = True
+            return ""
+        return (
+            f"{self._pair}: no static position ({seen:.2g} clearances where the sag makes {expected:.2g}); "
+            "if the probes are AC-coupled write ac_coupled = true for both, "
+            "else correct static_sag_um of the rotor or zero_v of the probes"
+        )
+
+    def _slip(self) -> str:
+        motions = list(self._motions)
+        if len(motions) < _SLIP_REVOLUTIONS:
+            return ""
+        forward = np.array([motion.forward for motion in motions])
+        radius = np.abs(forward)
+        sigma = self._sigma(motions[:1])
+        if np.ptp(radius) > max(_UNSTEADY * radius.mean(), _SIGNIFICANT * sigma):
+            return ""
+        first, second, third = np.split(forward, 3)
+        turns = np.angle([np.vdot(first, second), np.vdot(second, third)])
+        revolutions = len(forward) // 3
+        sigma_turn = sigma / float(radius.mean()) / math.sqrt(revolutions)
+        slip = float(turns.mean()) / revolutions / math.tau
+        # A machine that changes turns its orbit once, between two of the thirds; a slip goes on.
+        lasting = np.ptp(turns) < max(0.5 * abs(turns.mean()), 2.0 * sigma_turn) and turns.prod() > 0.0
+        if abs(slip) < _SLIP or not lasting or abs(turns.sum()) < _SIGNIFICANT * sigma_turn:
+            return ""
+        return (
+            f"{self._pair}: the orbit turns {100.0 * abs(slip):.2g} % {'faster' if slip > 0.0 else 'slower'} "
+            f"than {self._keyphasor} says; they do not see the same shaft, or pulses are miscounted: "
+            "check the keyphasor's channel and its threshold"
+        )
+
+
+def _radius(parts: Sequence[complex]) -> float:
+    return abs(sum(parts)) / len(parts)

@@ -1,0 +1,113 @@
+"""The modes of a rotor bank in physical terms, and the models that they stand for."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+from daqsvc.rotor.discretise import BankMode
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daqsvc.diagnosis.record import Severity
+    from daqsvc.rotor.model import RotorParameters
+
+Fault = Literal["unbalance", "damping_loss", "static_load", "stiffness_loss", "rub"]
+
+
+@dataclass(frozen=True, slots=True)
+class RotorMode:
+    """A mode of the rotor: what differs from the healthy one, at one level.
+
+    Attributes:
+        name: name of the mode.
+        damping_ratio: zeta in this mode; the healthy one if None.
+        severity: how bad it is.
+        rub: whether the shaft can touch its housing, so that the observer includes the contact.
+        fault: what the mode is called; told from what differs if None (`fault_of`).
+        unbalance_ratio: eccentricity over the healthy one.
+        stiffness_ratio: k, stiffness over the healthy one.
+        static_load_um: additional static load towards +x and +y, as the sag of the healthy shaft under it.
+    """
+
+    name: str
+    damping_ratio: float | None = None
+    severity: Severity = "normal"
+    rub: bool = False
+    fault: Fault | None = None
+    unbalance_ratio: float = 1.0
+    stiffness_ratio: float = 1.0
+    static_load_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.unbalance_ratio) and self.unbalance_ratio >= 0.0):
+            raise ValueError(
+                f"mode {self.name!r}: unbalance_ratio is {self.unbalance_ratio}; it must be 0 or above"
+            )
+
+
+def fault_of(mode: RotorMode, rotor: RotorParameters) -> Fault | Literal["normal"]:
+    """What a mode is in the words of a verdict.
+
+    Where several things differ, the one that a person would be told first: a rub before what led to it,
+    and an external cause before damping, which often only follows.
+
+    Args:
+        mode: the mode.
+        rotor: the healthy rotor.
+    """
+    less_damping = mode.damping_ratio is not None and mode.damping_ratio < rotor.damping_ratio
+    differs: dict[Fault, bool] = {
+        "rub": mode.rub,
+        "static_load": any(mode.static_load_um),
+        "stiffness_loss": mode.stiffness_ratio != 1.0,
+        "unbalance": mode.unbalance_ratio != 1.0,
+        "damping_loss": less_damping,
+    }
+    told = (fault for fault, does in differs.items() if does)
+    return mode.fault or next(told, None) or "normal"
+
+
+def bank_modes(
+    modes: Sequence[RotorMode],
+    rotor: RotorParameters,
+    speed_rpm: float,
+    *,
+    process_noise: float = 1e-4,
+    rub_process_noise: float = 0.1,
+    ac_coupled: bool = False,
+) -> tuple[BankMode, ...]:
+    """The models of a bank.
+
+    Args:
+        modes: the modes, healthy first.
+        rotor: the healthy rotor; exponent and friction are those of the rub observers.
+        speed_rpm: speed of the shaft; negative if it turns clockwise.
+        process_noise: power spectral density q of the linear observers, normalised.
+        rub_process_noise: that of the rub observers.
+        ac_coupled: whether the probes show no static position, so that every orbit lies about 0.
+
+    Raises:
+        ValueError: a figure is outside what the model can mean, or a mode differs in nothing that AC-coupled
+            probes show.
+    """
+    made = []
+    for mode in modes:
+        if ac_coupled and any(mode.static_load_um):
+            raise ValueError(
+                f"mode {mode.name!r} is a static load of {list(mode.static_load_um)} um, but the probes are "
+                "AC-coupled and show no static position; use DC-coupled probes, or remove the mode"
+            )
+        healthy = rotor.normalised(speed_rpm, mode.damping_ratio)
+        x, y = (load / rotor.clearance_um for load in mode.static_load_um)
+        changed = replace(
+            healthy,
+            e=healthy.e * mode.unbalance_ratio,
+            k=healthy.k * mode.stiffness_ratio,
+            load_x=0.0 if ac_coupled else healthy.load_x + x,
+            g=0.0 if ac_coupled else healthy.g - y,
+        )
+        made.append(BankMode(mode.name, changed, rub_process_noise if mode.rub else process_noise, mode.rub))
+    return tuple(made)

@@ -1,0 +1,118 @@
+"""A bank made to fit its own machine: orbit and rest measured over healthy revolutions.
+
+No machine file knows the unbalance to a few per cent, and the bank takes the difference for a fault. What
+it measures while the machine is healthy goes into every mode as what healthy is, so that a fault is a
+change from there.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.rotor.discretise import BankMode
+
+    Complex = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+VARIANCE_FACTOR = 1.5
+"""How much larger than their own figure the innovations' variance is taken to be after an adaptation: room
+for what orbit and rest do not put right, natural frequency and damping that are off by a few per cent."""
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyMotion:
+    """The steady motion z = forward exp(i theta) + backward exp(-i theta) + rest, in clearances.
+
+    Attributes:
+        forward: radius of the part that turns with the shaft.
+        backward: radius of the part that turns against it; 0 on the isotropic rotor of the models.
+        rest: centre.
+        samples: number of samples that it was fitted to.
+    """
+
+    forward: complex
+    backward: complex
+    rest: complex
+    samples: int
+
+
+class SteadyFit:
+    """Least squares of z on {exp(i theta), exp(-i theta), 1}, gathered block by block."""
+
+    def __init__(self) -> None:
+        self._normal = np.zeros((3, 3), dtype=np.complex128)
+        self._moment = np.zeros(3, dtype=np.complex128)
+        self.samples = 0
+
+    def add(self, xy: Floats, cos: Floats, sin: Floats) -> None:
+        """Take in a block; a sample with anything that is not finite is left out.
+
+        Args:
+            xy: float64 ``[n, 2]``, position.
+            cos: float64 ``[n]``, cosine of the shaft angle.
+            sin: float64 ``[n]``, its sine.
+        """
+        known = np.isfinite(xy).all(axis=1) & np.isfinite(cos) & np.isfinite(sin)
+        turn = cos[known] + 1j * sin[known]
+        A = np.column_stack((turn, turn.conj(), np.ones_like(turn)))
+        self._normal += A.conj().T @ A
+        self._moment += A.conj().T @ (xy[known, 0] + 1j * xy[known, 1])
+        self.samples += len(turn)
+
+    def solve(self) -> SteadyMotion:
+        """The motion that fits best.
+
+        Raises:
+            ValueError: the samples do not cover enough of a revolution to tell the three parts apart.
+        """
+        if self.samples < 3 or np.linalg.cond(self._normal) > 1e6:
+            raise ValueError(f"{self.samples} samples do not cover a revolution; take more of them")
+        forward, backward, rest = np.linalg.solve(self._normal, self._moment).tolist()
+        return SteadyMotion(forward, backward, rest, self.samples)
+
+
+def adapted(modes: Sequence[BankMode], motion: SteadyMotion, speed: float) -> tuple[BankMode, ...]:
+    """The same modes about the machine as it was measured: complex unbalance and static load of all.
+
+    Args:
+        modes: the hypotheses, healthy first.
+        motion: the healthy machine's.
+        speed: normalised speed that it was measured at.
+
+    Raises:
+        ValueError: the healthy mode has no unbalance, or the machine showed none, so that there is no phase
+            to take over.
+    """
+    healthy = modes[0].rotor
+    modelled = healthy.orbit(speed)
+    if not modelled or not motion.forward:
+        raise ValueError(
+            f"rotor bank: an orbit of {abs(motion.forward):.3g} clearances cannot be compared with one of "
+            f"{abs(modelled):.3g}; give the rotor the unbalance that it has"
+        )
+    ratio = motion.forward / modelled
+    load = healthy.k * (motion.rest - healthy.rest)
+    return tuple(
+        replace(
+            mode,
+            rotor=replace(
+                mode.rotor,
+                e=mode.rotor.e * abs(ratio),
+                heavy_spot_rad=math.remainder(mode.rotor.heavy_spot_rad + cmath.phase(ratio), math.tau),
+                g=mode.rotor.g - load.imag,
+                load_x=mode.rotor.load_x + load.real,
+            ),
+        )
+        for mode in modes
+    )
