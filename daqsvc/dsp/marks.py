@@ -1,0 +1,351 @@
+"""Edges of a keyphasor, and which of them mark a revolution: one pulse a turn, its edge is angle zero."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+
+Edge = Literal["rising", "falling"]
+
+_ABOVE_MINUS_ONE = math.nextafter(-1.0, 0.0)
+_TOLERANCE = 0.2
+"""An edge may come this part of a revolution early or late."""
+_REJECTED_IN_A_ROW = 3
+"""So many edges out of place, but in step with each other, are right and the line is wrong."""
+_MIN_LOCK_EDGES = 2
+_FREE_LOCK_EDGES = 4
+"""So many edges in step make a lock where the speed is not known beforehand."""
+_ALIAS_EDGES = 8
+"""So many edges in step at a part of the period (or at a multiple, half of them) unmask a wrong lock."""
+_MIN_BEND_EDGES = 4
+_BEND_DOUBT = 4.0
+"""A curvature of twice its standard deviation is half believed."""
+_EDGE_FLOOR_REV = 1e-6
+"""No edge is known better than this."""
+_FOLLOWED_REVOLUTIONS = 4.0
+"""So long without an edge the acceleration is carried on; then the speed is held."""
+_FORGOTTEN_REVOLUTIONS = 32.0
+"""After so long without an edge there is no counting of revolutions any more."""
+
+
+@dataclass(slots=True)
+class EdgeCounts:
+    """What became of the pulses since the start.
+
+    Attributes:
+        accepted: edges that marked a revolution.
+        missing: revolutions without an edge, found out at the next one.
+        rejected: edges that came where none can be: second pulses, noise.
+    """
+
+    accepted: int = 0
+    missing: int = 0
+    rejected: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Angle zero at ``index + fraction`` samples since the start.
+
+    Attributes:
+        index: first sample at or after the mark.
+        fraction: from there back to the mark, in samples, -1 to 0.
+        revolution: count of revolutions at the mark.
+    """
+
+    index: int
+    fraction: float
+    revolution: int = 0
+
+    def samples_before(self, other: Mark) -> float:
+        """Samples from here to ``other``."""
+        return (other.index - self.index) + (other.fraction - self.fraction)
+
+    def later(self, samples: float) -> Mark:
+        """The place so many samples after this one (before it, if negative)."""
+        later = Mark.at(self.fraction + samples)
+        return Mark(self.index + later.index, later.fraction)
+
+    @classmethod
+    def at(cls, sample: float) -> Mark:
+        """A place in samples since the start."""
+        index = math.ceil(sample)
+        return cls(index, sample - index)
+
+
+class EdgeFinder:
+    """Finds the edges of a pulse train over blocks of samples.
+
+    An edge is where the voltage crosses the threshold, interpolated linearly between two samples; the next
+    one counts only after the voltage has been back by the hysteresis.
+
+    Args:
+        threshold: level that marks the edge, in the unit of the samples.
+        hysteresis: how far the signal must return past the threshold before it can make another edge.
+        edge: whether the rising or the falling edge counts.
+
+    Raises:
+        ValueError: a figure cannot be.
+    """
+
+    def __init__(self, threshold: float, hysteresis: float, edge: Edge) -> None:
+        if not math.isfinite(threshold):
+            raise ValueError(f"keyphasor: the threshold is {threshold}; it must be a finite voltage")
+        if not (math.isfinite(hysteresis) and hysteresis >= 0.0):
+            raise ValueError(f"keyphasor: the hysteresis is {hysteresis}; it must be 0 or above")
+        if edge not in ("rising", "falling"):
+            raise ValueError(f"keyphasor: edge {edge!r} is unknown; use 'rising' or 'falling'")
+        self._sign = 1.0 if edge == "rising" else -1.0
+        self._threshold = self._sign * threshold
+        self._rearm = self._threshold - hysteresis
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the sample before; the next edge must be seen to rise."""
+        self._last = math.nan
+        self._armed = False
+
+    def find(self, samples: Floats) -> list[tuple[int, float]]:
+        """Edges as (first sample past the threshold, samples from there to the crossing, -1 to 0).
+
+        Args:
+            samples: float64 ``[n]``; NaN where missing.
+        """
+        signal = self._sign * np.where(np.isfinite(samples), samples, np.nan)
+        before = np.concatenate(([self._last], signal[:-1])) if len(signal) else signal
+        # +1 past the threshold, -1 back past the hysteresis, 0 says nothing: carry the last word on.
+        word = (signal >= self._threshold).astype(np.int8) - (signal < self._rearm).astype(np.int8)
+        spoken = np.flatnonzero(word)
+        previous = np.concatenate(([-1 if self._armed else 1], word[spoken]))
+        found = []
+        for sample in spoken[(previous[1:] > 0) & (previous[:-1] < 0)].tolist():
+            low, high = float(before[sample]), float(signal[sample])
+            # Without the sample before it the edge could lie anywhere in the gap: it marks nothing.
+            if low < self._threshold:
+                found.append((sample, max(-(high - self._threshold) / (high - low), _ABOVE_MINUS_ONE)))
+        if len(signal):
+            self._armed = bool(previous[-1] < 0)
+            self._last = float(signal[-1])
+        return found
+
+
+class MarkLine:
+    """Decides which edges mark a revolution, and where the shaft is after the last of them.
+
+    The shaft follows a parabola in time through the last edges, so that a steady acceleration leaves no
+    lag. Its coefficients are medians over pairs and triples of edges (Theil-Sen), so that a wrong edge does
+    not bend it; its curvature counts as far as it stands out from the scatter of the edges.
+
+    An edge marks a revolution if it lies within a fifth of a revolution of where the parabola, or the
+    revolution before, has it. Edges out of place that keep step with each other start a new line.
+
+    Args:
+        period_samples: expected samples per revolution.
+        period_range: shortest and longest period at which a line may start, in samples. Without it the
+            speed is taken as known to a fifth, and two edges make a line; with it, four in step do.
+        line_edges: edges that the parabola goes through.
+
+    Raises:
+        ValueError: a figure cannot be.
+
+    Attributes:
+        counts: what became of the edges.
+        marks: the last edges of the line, oldest first.
+        number: counts the lines; it changes when the edges begin to be numbered anew.
+        period: samples per revolution at the last edge; the expected ones before there is any line.
+    """
+
+    def __init__(
+        self, period_samples: float, period_range: tuple[float, float] | None = None, line_edges: int = 8
+    ) -> None:
+        if not (math.isfinite(period_samples) and period_samples > 2.0):
+            raise ValueError(
+                f"keyphasor: {period_samples} samples per revolution; more than 2 are needed to see a pulse"
+            )
+        if line_edges < _MIN_LOCK_EDGES:
+            raise ValueError(f"keyphasor: a line through {line_edges} edges; it takes at least 2")
+        shortest, longest = period_range or (
+            (1.0 - _TOLERANCE) * period_samples,
+            (1.0 + _TOLERANCE) * period_samples,
+        )
+        if period_range is not None and not 2.0 < shortest < longest < math.inf:
+            raise ValueError(
+                f"keyphasor: a period between {shortest} and {longest} samples cannot be searched; "
+                "the shortest must be above 2 and below the longest"
+            )
+        self._any_speed = period_range is not None
+        self._range = (shortest, longest)
+        self.counts = EdgeCounts()
+        self.marks: deque[Mark] = deque(maxlen=line_edges)
+        self.number = 0
+        self.period = period_samples
+        self._nominal_period = period_samples
+        self._crossings: deque[Mark] = deque(maxlen=_ALIAS_EDGES + 1)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the edges; the counts go on."""
+        self.period = self._nominal_period
+        self._forget()
+
+    @property
+    def locked(self) -> bool:
+        """Whether there is a line."""
+        return len(self.marks) >= _MIN_LOCK_EDGES
+
+    def turns(self, since: Floats) -> Floats:
+        """Revolutions since the last mark.
+
+        Args:
+            since: float64 ``[n]``, samples since the last mark.
+        """
+        # Past the hold the parabola goes on as its tangent: an acceleration cannot be relied on for long.
+        bent = np.minimum(since, self._hold)
+        turns: Floats = self._offset + self._rate * since + self._bend * bent * (2.0 * since - bent)
+        return turns
+
+    def judge(self, index: int, fraction: float) -> bool:
+        """Take in an edge; True if it marks a revolution."""
+        mark = Mark(index, fraction)
+        self._crossings.append(mark)
+        if self.locked and self.marks[-1].samples_before(mark) > _FORGOTTEN_REVOLUTIONS * self.period:
+            self._forget()
+        if not self.marks:
+            if self._any_speed:
+                return self._propose(mark, _FREE_LOCK_EDGES)
+            self._take(mark)
+            return True
+        if (whole := self._whole_turns(mark)) == 0:
+            self.counts.rejected += 1
+            if not self._propose(mark, _REJECTED_IN_A_ROW) and self._any_speed:
+                self._divide()
+            return False
+        self.counts.missing += whole - 1
+        self._take(replace(mark, revolution=self.marks[-1].revolution + whole))
+        if self._any_speed:
+            self._multiply()
+        return True
+
+    def _whole_turns(self, mark: Mark) -> int:
+        """Revolutions from the last mark to this edge; 0 if it is out of place."""
+        since = self.marks[-1].samples_before(mark)
+        turns = float(self.turns(np.array([since]))[0])
+        whole = round(turns)
+        if whole >= 1 and abs(turns - whole) <= _TOLERANCE:
+            return whole
+        if not self.locked:
+            return 0
+        # At the start of a run-up the last revolution knows better than all of them.
+        before, last = self.marks[-2], self.marks[-1]
+        lasted = before.samples_before(last) / (last.revolution - before.revolution)
+        return int(abs(since / lasted - 1.0) <= _TOLERANCE)
+
+    def _take(self, mark: Mark) -> None:
+        was_locked = self.locked
+        self.counts.accepted += 1
+        self._proposed.clear()
+        self.marks.append(mark)
+        self.number += self.locked and not was_locked
+        self._fit()
+
+    def _propose(self, mark: Mark, enough: int) -> bool:
+        """Remember an edge that has no place; enough of them in step start a line."""
+        self._proposed.append(mark)
+        if len(self._proposed) < enough:
+            return False
+        if not self._in_step(self._proposed):
+            self._proposed.pop(0)
+            return False
+        if not self.marks:
+            self.counts.accepted += enough
+        self._start(self._proposed)
+        return True
+
+    def _in_step(self, marks: list[Mark]) -> bool:
+        gaps = [a.samples_before(b) for a, b in itertools.pairwise(marks)]
+        mean = sum(gaps) / len(gaps)
+        shortest, longest = self._range
+        in_step = all(abs(gap - mean) <= _TOLERANCE * mean for gap in gaps)
+        return in_step and shortest <= mean <= longest
+
+    def _divide(self) -> None:
+        """Start anew if the edges keep step at a part of the period: the line had skipped some."""
+        if len(self._crossings) > _ALIAS_EDGES and self._in_step(list(self._crossings)):
+            self._start(list(self._crossings))
+
+    def _multiply(self) -> None:
+        """Start anew if the edges keep step at a multiple of the period: the line had one too many."""
+        last = list(self.marks)[-(_ALIAS_EDGES // 2) - 1 :]
+        turns = {b.revolution - a.revolution for a, b in itertools.pairwise(last)}
+        if len(last) > _ALIAS_EDGES // 2 and len(turns) == 1 and turns != {1} and self._in_step(last):
+            self._start(last)
+
+    def _start(self, marks: list[Mark]) -> None:
+        marks = [replace(mark, revolution=revolution) for revolution, mark in enumerate(marks)]
+        self._forget()
+        self.marks.extend(marks)
+        self.number += 1
+        self._fit()
+
+    def _forget(self) -> None:
+        self.marks.clear()
+        self._crossings.clear()
+        self._proposed: list[Mark] = []
+        self._rate, self._bend, self._offset, self._hold = 1.0 / self.period, 0.0, 0.0, 0.0
+
+    def _fit(self) -> None:
+        """Parabola through the edges: revolutions over samples, both from the last edge."""
+        if not self.locked:
+            return
+        last = self.marks[-1]
+        turns = np.array([mark.revolution - last.revolution for mark in self.marks], dtype=np.float64)
+        since = np.array([-mark.samples_before(last) for mark in self.marks])
+        i, j = _choices(len(since), 2)
+        self._bend = _believable_bend(since, turns)
+        straight = turns - self._bend * since**2
+        self._rate = float(np.median((straight[j] - straight[i]) / (since[j] - since[i])))
+        self._offset = float(np.median(straight - self._rate * since))
+        self.period = 1.0 / self._rate
+        self._hold = _FOLLOWED_REVOLUTIONS * self.period
+        if self._bend < 0.0:
+            # Deceleration may at most halve the speed.
+            self._hold = min(self._hold, -0.25 * self._rate / self._bend)
+
+
+@lru_cache(maxsize=32)
+def _choices(n: int, of: int) -> Ints:
+    """All choices of ``of`` out of ``n`` points, in order: int64 ``[of, choices]``."""
+    return np.array(list(itertools.combinations(range(n), of)), dtype=np.int64).T
+
+
+def _believable_bend(since: Floats, turns: Floats) -> float:
+    """Curvature in revolutions per sample squared, as far as it stands out from the scatter."""
+    n = len(since)
+    if n < _MIN_BEND_EDGES:
+        return 0.0
+    i, j, k = _choices(n, 3)
+    late = (turns[k] - turns[j]) / (since[k] - since[j])
+    early = (turns[j] - turns[i]) / (since[j] - since[i])
+    bend = float(np.median((late - early) / (since[k] - since[i])))
+    i, j = _choices(n, 2)
+    straight = turns - bend * since**2
+    rate = float(np.median((straight[j] - straight[i]) / (since[j] - since[i])))
+    scatter = straight - rate * since
+    scatter -= np.median(scatter)
+    edge = 1.4826 * float(np.median(np.abs(scatter))) * math.sqrt(n / (n - 3)) + _EDGE_FLOOR_REV
+    # Standard deviation of the curvature of a least-squares parabola through n evenly spaced points.
+    spacing = -float(since[0]) / (n - 1)
+    deviation = edge / (spacing**2 * math.sqrt(n * (n**2 - 1) * (n**2 - 4) / 180.0))
+    return bend / (1.0 + _BEND_DOUBT * (deviation / bend) ** 2) if bend else 0.0
