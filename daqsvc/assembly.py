@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 DRIVERS = "daqsvc.drivers"
 _NS_PER_MS = 1_000_000
+_UM_PER_UNIT = {"um": 1.0, "mm": 1000.0, "mil": 25.4}
 
 
 class AssemblyError(Exception):
@@ -182,12 +183,13 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
         sensor = machine.sensor(name)
         assert isinstance(sensor, ProximityProbe)  # noqa: S101 - and two proximity probes
         angle_deg = default_deg if sensor.angle_deg is None else sensor.angle_deg
-        return Probe(name, _column(machine, sensor), angle_deg)
+        return Probe(name, _column(machine, sensor), angle_deg, _UM_PER_UNIT[sensor.unit])
 
+    rate_hz = machine.streams[keyphasor.stream].rate_hz
     return RotorBankDetector(
         machine=machine.machine.name,
         stream=keyphasor.stream,
-        rate_hz=machine.streams[keyphasor.stream].rate_hz,
+        rate_hz=rate_hz,
         speed_rpm=machine.machine.speed_rpm,
         probes=(probe(bank.probes[0], 0.0), probe(bank.probes[1], 90.0)),
         keyphasor=KeyphasorProbe(
@@ -205,16 +207,37 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
             clearance_um=rotor.clearance_um,
             static_sag_um=rotor.static_sag_um,
             contact_stiffness=rotor.contact_stiffness,
+            contact_radius_um=rotor.contact_radius_um,
+            static_load_x_um=rotor.static_load_x_um,
         ),
-        modes=[RotorMode(m.name, m.damping_ratio, m.severity, m.rub) for m in bank.modes],
+        modes=[
+            RotorMode(
+                mode.name,
+                mode.damping_ratio,
+                mode.severity,
+                mode.rub,
+                fault=mode.fault,
+                unbalance_ratio=mode.unbalance_ratio,
+                stiffness_ratio=mode.stiffness_ratio,
+                static_load_um=mode.static_load_um,
+            )
+            for mode in bank.modes
+        ],
         noise_um=bank.noise_um,
         process_noise=bank.process_noise,
         rub_process_noise=bank.rub_process_noise,
-        rules=DecisionRules(
+        rules=DecisionRules.from_rates(
             rule=bank.rule,
             threshold_nats=bank.threshold_nats,
             back_threshold_nats=bank.back_threshold_nats,
+            false_alarms_per_1000_rev=bank.false_alarms_per_1000_rev,
+            mtbf_hours=bank.mtbf_hours,
+            speed_rpm=machine.machine.speed_rpm,
+            samples_per_rev=60.0 * rate_hz / machine.machine.speed_rpm,
+            modes=len(bank.modes),
         ),
+        calibrate_revolutions=bank.calibrate_revolutions,
+        ac_coupled=machine.ac_coupled,
     )
 
 

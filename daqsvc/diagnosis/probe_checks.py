@@ -27,13 +27,15 @@ class Probe:
 
     Attributes:
         name: name of the sensor.
-        column: its column in the stream, micrometres from the shaft-centred position.
+        column: its column in the stream, counted from the shaft-centred position.
         angle_deg: where it points, from +x against the clock.
+        um_per_unit: micrometres in a unit of the column.
     """
 
     name: str
     column: int
     angle_deg: float
+    um_per_unit: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,6 +133,7 @@ class RotorBankDetector:
                 "the orbit needs two probes 30 to 150 degrees apart"
             )
         angles = np.radians([probe.angle_deg for probe in probes])
+        self._units = np.array([probes[0].um_per_unit, probes[1].um_per_unit, 1.0])
         self._to_xy = np.linalg.inv(np.vstack((np.cos(angles), np.sin(angles)))) / rotor.clearance_um
         self._bank_modes = bank_modes(
             self._modes,
@@ -209,7 +210,7 @@ class RotorBankDetector:
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
         samples = np.asarray(window.samples, dtype=np.float64)[:, self._columns]
-        samples = np.where(np.isfinite(samples), samples, np.nan)
+        samples = np.where(np.isfinite(samples), samples, np.nan) * self._units
         first_index = window.first_index
         gap = 0 if self._next_index is None else first_index - self._next_index
         if 0 < gap <= self._nominal_period:

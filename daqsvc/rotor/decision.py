@@ -70,8 +70,8 @@ class DecisionRules:
     def from_rates(
         cls,
         *,
-        false_alarms_per_1000_rev: float,
-        mtbf_hours: float,
+        false_alarms_per_1000_rev: float | None,
+        mtbf_hours: float | None,
         speed_rpm: float,
         samples_per_rev: float,
         modes: int,
@@ -79,45 +79,37 @@ class DecisionRules:
     ) -> Self:
         """Thresholds from how often the bank may be wrong: h = ln(1 / pi), pi per sample and rival mode.
 
-        A CUSUM of log-likelihood ratios crosses h by chance at most once in exp(h) samples on average
-        (Lorden 1971), for each rival. Forward, the wanted rate of false alarms sets pi. Back, a machine
-        heals less often than it fails, and not while it turns: pi is one in a mean time between failures.
-        At 600 rpm, 64 samples a revolution and four modes, 0.02 false alarms in 1000 revolutions and
-        10,000 h make the defaults, 16 nats forward and 25 back.
+        A CUSUM of log-likelihood ratios crosses h by chance once in exp(h) samples on average or less
+        often (Lorden 1971), for each rival. Forward, the wanted rate of false alarms sets pi. Back, a
+        machine does not heal while it turns: pi is one in a mean time between failures. At 600 rpm, 64
+        samples a revolution and four modes, 0.02 false alarms in 1000 revolutions and 10,000 h make the
+        defaults, 16 nats forward and 25 back.
 
-        The rate is a bound for a machine in its healthy mode; measured rates are a few times lower.
+        The rate is a bound for a machine that is as its healthy mode says.
 
         Args:
-            false_alarms_per_1000_rev: accepted on a healthy machine.
-            mtbf_hours: mean time between failures.
+            false_alarms_per_1000_rev: accepted on a healthy machine; None to leave ``threshold_nats``.
+            mtbf_hours: mean time between failures; None to leave ``back_threshold_nats``.
             speed_rpm: of the shaft; the sign does not matter.
             samples_per_rev: samples a revolution.
             modes: number of modes in the bank.
             **others: further attributes of the rules.
 
         Raises:
-            ValueError: a figure is not above 0, or there are fewer than two modes.
+            ValueError: a figure is not above 0, or the rate is so high that no evidence would be needed.
         """
-        figures = {
-            "false_alarms_per_1000_rev": false_alarms_per_1000_rev,
-            "mtbf_hours": mtbf_hours,
-            "speed_rpm": abs(speed_rpm),
-            "samples_per_rev": samples_per_rev,
-            "modes - 1": modes - 1,
-        }
-        for name, value in figures.items():
-            if not (math.isfinite(value) and value > 0.0):
+        given = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev, "mtbf_hours": mtbf_hours}
+        for name, value in given.items():
+            if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"decision rule: {name} is {value}; it must be a finite number above 0")
         chances_per_rev = samples_per_rev * (modes - 1)
-        forward = math.log(1000.0 * chances_per_rev / false_alarms_per_1000_rev)
-        back = math.log(60.0 * mtbf_hours * abs(speed_rpm) * chances_per_rev)
-        least = math.log(chances_per_rev)
-        if forward <= least:
-            raise ValueError(
-                f"decision rule: {false_alarms_per_1000_rev} false alarms per 1000 revolutions are one in "
-                "every revolution or more; ask for fewer, e.g. 0.02"
-            )
-        return cls(threshold_nats=forward, back_threshold_nats=max(forward, back), **others)
+        thresholds: dict[str, float] = {}
+        if false_alarms_per_1000_rev is not None:
+            thresholds["threshold_nats"] = math.log(1000.0 * chances_per_rev / false_alarms_per_1000_rev)
+        if mtbf_hours is not None:
+            revolutions = 60.0 * mtbf_hours * abs(speed_rpm)
+            thresholds["back_threshold_nats"] = math.log(revolutions * chances_per_rev)
+        return cls(**(others | thresholds))
 
     def log_priors(self, names: Sequence[str]) -> Floats:
         """Logarithms of the priors of the named modes, float64 ``[M]``.

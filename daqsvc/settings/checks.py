@@ -28,6 +28,7 @@ from daqsvc.settings.layout_checks import (
     check_voltages,
     unique,
 )
+from daqsvc.settings.mode_checks import mode_checks
 from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
@@ -94,7 +95,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield _rotor(draft)
             yield _bank_sensors(draft, bank)
             yield _bank_geometry(draft, bank)
-            yield _modes(bank)
+            yield from mode_checks(draft, bank)
     with suppress(UnusableValueError):
         for index, alarm in enumerate(draft.alarms):
             at = ("alarms", index)
@@ -244,17 +245,6 @@ def _bank_geometry(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
                 "direction of the motion only",
                 "correct angle_deg of the sensors, or take probes that are some 90 deg apart",
             )
-
-
-def _modes(bank: RotorBank) -> Iterator[Finding]:
-    at: KeyPath = ("pipeline", "rotor_bank", "modes")
-    if bank.modes[0].severity != "normal":
-        yield Finding(
-            (*at, 0, "severity"),
-            "the first mode is the healthy one",
-            'write severity = "normal", or put the healthy mode first',
-        )
-    yield from unique([mode.name for mode in bank.modes], at, "mode")
 
 
 def _setpoints(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.buses import Stream
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
+    from daqsvc.settings.pipeline import Mode, RotorBank
 
 COLUMNS = 100
 _INDENT = "  "
@@ -134,6 +135,8 @@ def _sensor(sensor: Sensor) -> Sequence[str]:
 def _sensor_details(sensor: Sensor) -> Iterator[str]:
     if isinstance(sensor, ProximityProbe):
         yield f"gap OK {sensor.gap_ok_v[0]:g} to {sensor.gap_ok_v[1]:g} V"
+    if isinstance(sensor, ProximityProbe) and sensor.ac_coupled:
+        yield "AC-coupled"
     if isinstance(sensor, ProximityProbe | Accelerometer) and sensor.angle_deg is not None:
         yield f"at {sensor.angle_deg:g} deg"
     if isinstance(sensor, Keyphasor):
@@ -155,16 +158,35 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         yield "levels", text
     bank = pipeline.rotor_bank
     if bank is not None:
-        modes = ", ".join(
-            f"{mode.name} (zeta {mode.damping_ratio:g}{', rub' if mode.rub else ''}: {mode.severity})"
-            for mode in bank.modes
-        )
         text = (
             f"{bank.probes[0]}, {bank.probes[1]} and {bank.keyphasor}; noise {bank.noise_um:g} um; "
-            f"rule {bank.rule}, {bank.threshold_nats:g} nats forward, {bank.back_threshold_nats:g} back; "
-            f"modes {modes}"
+            f"rule {bank.rule}, {_thresholds(bank)}; "
         )
+        if bank.calibrate_revolutions:
+            text += f"unbalance and sag from the first {bank.calibrate_revolutions} revolutions; "
+        text += f"modes {', '.join(map(_mode, bank.modes))}"
         yield "rotor-bank", text
+
+
+def _thresholds(bank: RotorBank) -> str:
+    forward, back = f"{bank.threshold_nats:g} nats forward", f"{bank.back_threshold_nats:g} back"
+    if bank.false_alarms_per_1000_rev is not None:
+        forward = f"at most {bank.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions"
+    if bank.mtbf_hours is not None:
+        back = f"MTBF {bank.mtbf_hours:g} h"
+    return f"{forward}, {back}"
+
+
+def _mode(mode: Mode) -> str:
+    words = {
+        "damping_ratio": f"zeta {mode.damping_ratio:g}" if mode.damping_ratio is not None else "",
+        "unbalance_ratio": f"unbalance x {mode.unbalance_ratio:g}",
+        "stiffness_ratio": f"stiffness x {mode.stiffness_ratio:g}",
+        "static_load_um": f"static load {mode.static_load_um[0]:g}, {mode.static_load_um[1]:g} um",
+        "rub": "rub",
+    }
+    differs = ", ".join(words[key] for key in mode.differs) or "as stated"
+    return f"{mode.name} ({differs}: {mode.severity})"
 
 
 _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay")

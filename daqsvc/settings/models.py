@@ -89,6 +89,12 @@ class Rotor(Section):
     contact_stiffness: Annotated[
         Positive, Field(description="K* = K_beta / (M c omega_s^2), dimensionless", examples=[30.0])
     ]
+    contact_radius_um: Positive = Field(
+        default=25_000.0, description="radius of the surface that rubs; sets how fast it slides"
+    )
+    static_load_x_um: float = Field(
+        default=0.0, description="sag of the healthy shaft under its static load, towards +x"
+    )
 
 
 class Machine(Section):
@@ -250,6 +256,14 @@ class MachineFile(Section):
     def detectors(self) -> tuple[str, ...]:
         """Names of the detectors that an alarm can follow."""
         return () if self.pipeline.rotor_bank is None else (ROTOR_BANK,)
+
+    @property
+    def ac_coupled(self) -> bool:
+        """Whether a probe of the rotor bank shows motion only, so that the bank sees no static position."""
+        bank = self.pipeline.rotor_bank
+        probes = () if bank is None else bank.probes
+        named = (sensor for sensor in self.sensors if sensor.name in probes)
+        return any(sensor.ac_coupled for sensor in named if isinstance(sensor, ProximityProbe))
 
     @property
     def mqtt_client_id(self) -> str:

@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import DampingRatio, Name, Positive, Section
+from daqsvc.settings.section import DampingRatio, Name, NotNegative, Positive, Section
 
 Severity = Literal["normal", "alert", "danger"]
+
+Fault = Literal["unbalance", "damping_loss", "static_load", "stiffness_loss", "rub"]
 
 ROTOR_BANK = "rotor-bank"
 """Name of the rotor's model bank as a detector."""
@@ -36,12 +38,32 @@ class Levels(Section):
 
 
 class Mode(Section):
-    """A state of the rotor that the bank has a model for."""
+    """A state of the rotor that the bank has a model for: what differs from [machine.rotor], at one level."""
 
     name: Annotated[Name, Field(description="name of the mode", examples=["F1"])]
-    damping_ratio: Annotated[DampingRatio, Field(description="the rotor's damping in it", examples=[0.1])]
     severity: Annotated[Severity, Field(description="how bad it is", examples=["alert"])]
-    rub: bool = Field(default=False, description="whether the rotor touches the stator in it")
+    fault: Fault | None = Field(default=None, description="what it is; told from what differs if absent")
+    damping_ratio: DampingRatio | None = Field(
+        default=None, description="the rotor's damping in it; that of [machine.rotor] if absent"
+    )
+    unbalance_ratio: NotNegative = Field(default=1.0, description="eccentricity over the healthy one")
+    stiffness_ratio: Positive = Field(default=1.0, description="stiffness of the shaft over the healthy one")
+    static_load_um: Annotated[tuple[float, float], Field(strict=False)] = Field(
+        default=(0.0, 0.0), description="additional sag towards +x and +y, of the healthy shaft"
+    )
+    rub: bool = Field(default=False, description="whether the rotor can touch the stator in it")
+
+    @property
+    def differs(self) -> tuple[str, ...]:
+        """Keys of the model that this mode sets, in the order of the file's format."""
+        ordinary = {
+            "unbalance_ratio": 1.0,
+            "stiffness_ratio": 1.0,
+            "static_load_um": (0.0, 0.0),
+            "rub": False,
+        }
+        told = [key for key, value in ordinary.items() if getattr(self, key) != value]
+        return tuple(["damping_ratio", *told] if self.damping_ratio is not None else told)
 
 
 class RotorBank(Section):
@@ -60,6 +82,16 @@ class RotorBank(Section):
     )
     threshold_nats: Positive = Field(default=16.0, description="evidence that declares a worse mode")
     back_threshold_nats: Positive = Field(default=25.0, description="evidence that declares a healthier mode")
+    false_alarms_per_1000_rev: Positive | None = Field(
+        default=None, description="accepted on a healthy machine, in place of threshold_nats"
+    )
+    mtbf_hours: Positive | None = Field(
+        default=None, description="mean time between failures, in place of back_threshold_nats"
+    )
+    calibrate_revolutions: Annotated[int, Field(ge=0, le=100_000)] = Field(
+        default=0,
+        description="healthy revolutions that unbalance and sag are measured over; 0 trusts the file",
+    )
     modes: Annotated[
         tuple[Mode, ...],
         Field(

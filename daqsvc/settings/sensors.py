@@ -77,6 +77,9 @@ class ProximityProbe(BaseSensor):
         ),
     ]
     angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
+    ac_coupled: bool = Field(
+        default=False, description="says that it shows motion only, not the static position of the shaft"
+    )
 
 
 class Accelerometer(BaseSensor):
