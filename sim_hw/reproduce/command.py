@@ -1,0 +1,153 @@
+"""``daqsvc reproduce``: the paper's experiments from scratch, and what they came to."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim_hw.demo import arguments as arguments_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sim_hw.reproduce.results import Findings
+
+EXIT_FAILED = 1
+SEED = 1
+SNR_DB = 0.0
+MOST_DB = 40.0
+DPI = 110
+
+
+class ReproduceCommand:
+    """The verb ``reproduce`` (entry-point group ``daqsvc.commands``)."""
+
+    help = "run the paper's experiments: figures, and what it states against what comes out"
+    description = (
+        "Run the paper's experiments from scratch, in less than two minutes. Writes its figures (fig4.png to "
+        "fig7.png) and a table of what the paper states against what was obtained (results.md, results.csv), "
+        "and prints the table."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument(
+            "--out",
+            type=Path,
+            required=True,
+            metavar="DIR",
+            help="directory for figures and tables; made if new",
+        )
+        parser.add_argument(
+            "--seed", type=arguments_of.whole, default=SEED, metavar="N", help=f"of the sensor noise ({SEED})"
+        )
+        parser.add_argument(
+            "--snr-db",
+            type=snr_db,
+            default=SNR_DB,
+            metavar="DB",
+            help=f"signal to noise of the probes in the figures; the paper has -5 to 5 dB ({SNR_DB:g})",
+        )
+        parser.add_argument(
+            "--json", action="store_true", help="print one JSON object for each row of the table"
+        )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
+
+        start_logging(verbose=False)
+        try:
+            import matplotlib.figure  # noqa: F401, PLC0415 - is it there, before minutes are spent?
+        except ModuleNotFoundError as error:
+            return _fail(f"the figures need {error.name}; install it with: pip install 'daqsvc[plot]'")
+        out: Path = arguments.out
+        if problem := _cannot_write_into(out):
+            return _fail(problem)
+        prepare_kernel_cache()
+        try:
+            _reproduce(out, arguments.seed, arguments.snr_db, as_json=arguments.json)
+        except BrokenPipeError:
+            raise  # of our output: the command line knows what to do
+        except OSError as error:
+            return _fail(
+                f"{error.filename or out} cannot be written: {error.strerror}; free it, or name another --out"
+            )
+        return 0
+
+
+def snr_db(text: str) -> float:
+    """A signal-to-noise ratio at which the figures show something."""
+    value = arguments_of.decibels(text)
+    if abs(value) > MOST_DB:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from -{MOST_DB:g} to {MOST_DB:g} dB")
+    return value
+
+
+def _fail(message: str) -> int:
+    print(f"daqsvc reproduce: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    return EXIT_FAILED
+
+
+def _cannot_write_into(out: Path) -> str | None:
+    """Why nothing can be written into a directory, which is made if it is new; None if it can."""
+    if out.exists() and not out.is_dir():
+        return f"--out {out} is not a directory; name another, it is made if it does not exist"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        return f"--out {out} cannot be written: {error.strerror}; name a directory that can"
+    return None
+
+
+def _reproduce(out: Path, seed: int, snr_db: float, *, as_json: bool) -> None:
+    from sim_hw.reproduce import results  # noqa: PLC0415
+    from sim_hw.reproduce.registry import STUDIES  # noqa: PLC0415
+
+    rows: list[results.Row] = []
+    for study in STUDIES:
+        _note(f"{study.title} ...")
+        findings = study.run(seed, snr_db)
+        rows += findings.rows
+        _draw(out, findings)
+    heading = (
+        f"Written by `daqsvc reproduce --seed {seed} --snr-db {snr_db:g}`. Lengths are in clearances; the "
+        "second (s) is the paper's unit of normalised time, 1/omega_s."
+    )
+    results.write_markdown(out / "results.md", rows, heading=heading)
+    results.write_csv(out / "results.csv", rows)
+    if as_json:
+        for row in rows:
+            _print(json.dumps(row.as_json()))
+    else:
+        _print(results.as_text(rows))
+    _note(f"figures and tables are in {out}")
+
+
+def _draw(out: Path, findings: Findings) -> None:
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    for name, draw in findings.figures.items():
+        # No pyplot: nothing global, no display.
+        figure = Figure(layout="constrained")
+        draw(figure)
+        figure.savefig(out / f"{name}.png", dpi=DPI, metadata=_METADATA)
+
+
+_METADATA: Mapping[str, str | None] = {"Software": None}
+
+
+def _note(message: str) -> None:
+    """What goes on, for a person who watches."""
+    if sys.stderr.isatty():
+        print(f"daqsvc reproduce: {message}", file=sys.stderr)  # noqa: T201
+
+
+def _print(text: str) -> None:
+    print(text)  # noqa: T201 - this is the output
