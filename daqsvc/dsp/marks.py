@@ -29,11 +29,13 @@ _FREE_LOCK_EDGES = 4
 """So many edges in step make a lock where the speed is not known beforehand."""
 _ALIAS_EDGES = 8
 """So many edges in step at a part of the period (or at a multiple, half of them) unmask a wrong lock."""
-_MIN_BEND_EDGES = 4
-_BEND_DOUBT = 4.0
-"""A curvature of twice its standard deviation is half believed."""
-_EDGE_FLOOR_REV = 1e-6
-"""No edge is known better than this."""
+_MIN_BEND_EDGES = 3
+_BEND_EDGES = 1.5
+"""The curvature is taken from so many times the edges that the line goes through."""
+_BEND_DOUBT = 3.0
+"""A curvature of so many standard deviations is half believed."""
+_QUARTILE = 1.15
+"""Upper quartile of the absolute deviation from the mean, in standard deviations."""
 _FOLLOWED_REVOLUTIONS = 4.0
 """So long without an edge the acceleration is carried on; then the speed is held."""
 _FORGOTTEN_REVOLUTIONS = 32.0
@@ -145,8 +147,8 @@ class MarkLine:
     """Decides which edges mark a revolution, and where the shaft is after the last of them.
 
     The shaft follows a parabola in time through the last edges, so that a steady acceleration leaves no
-    lag. Its coefficients are medians over pairs and triples of edges (Theil-Sen), so that a wrong edge does
-    not bend it; its curvature counts as far as it stands out from the scatter of the edges.
+    lag. It goes through most of the edges and leaves out the rest, so that a wrong one does not bend it;
+    its curvature counts as far as it stands out from their scatter.
 
     An edge marks a revolution if it lies within a fifth of a revolution of where the parabola, or the
     revolution before, has it. Edges out of place that keep step with each other start a new line.
@@ -188,7 +190,8 @@ class MarkLine:
         self._any_speed = period_range is not None
         self._range = (shortest, longest)
         self.counts = EdgeCounts()
-        self.marks: deque[Mark] = deque(maxlen=line_edges)
+        self._line_edges = line_edges
+        self.marks: deque[Mark] = deque(maxlen=math.floor(_BEND_EDGES * line_edges))
         self.number = 0
         self.period = period_samples
         self._nominal_period = period_samples
@@ -312,11 +315,9 @@ class MarkLine:
         last = self.marks[-1]
         turns = np.array([mark.revolution - last.revolution for mark in self.marks], dtype=np.float64)
         since = np.array([-mark.samples_before(last) for mark in self.marks])
-        i, j = _choices(len(since), 2)
         self._bend = _believable_bend(since, turns)
-        straight = turns - self._bend * since**2
-        self._rate = float(np.median((straight[j] - straight[i]) / (since[j] - since[i])))
-        self._offset = float(np.median(straight - self._rate * since))
+        near = slice(-self._line_edges, None)
+        self._offset, self._rate = _line(since[near], (turns - self._bend * since**2)[near])
         self.period = 1.0 / self._rate
         self._hold = _FOLLOWED_REVOLUTIONS * self.period
         if self._bend < 0.0:
@@ -325,9 +326,23 @@ class MarkLine:
 
 
 @lru_cache(maxsize=32)
-def _choices(n: int, of: int) -> Ints:
-    """All choices of ``of`` out of ``n`` points, in order: int64 ``[of, choices]``."""
-    return np.array(list(itertools.combinations(range(n), of)), dtype=np.int64).T
+def _pairs(n: int) -> Ints:
+    """All pairs out of ``n`` points, in order: int64 ``[2, n (n - 1) / 2]``."""
+    return np.array(list(itertools.combinations(range(n), 2)), dtype=np.int64).T
+
+
+@lru_cache(maxsize=32)
+def _triples(n: int) -> Ints:
+    """All triples of different points out of ``n``, in any order: int64 ``[3, n, n - 1, n - 2]``."""
+    triples = np.array(list(itertools.permutations(range(n), 3)), dtype=np.int64)
+    return triples.T.reshape(3, n, n - 1, n - 2)
+
+
+def _line(x: Floats, y: Floats) -> tuple[float, float]:
+    """Offset and slope of the line through most points: medians over pairs (Theil and Sen)."""
+    i, j = _pairs(len(x))
+    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
+    return float(np.median(y - slope * x)), slope
 
 
 def _believable_bend(since: Floats, turns: Floats) -> float:
@@ -335,17 +350,18 @@ def _believable_bend(since: Floats, turns: Floats) -> float:
     n = len(since)
     if n < _MIN_BEND_EDGES:
         return 0.0
-    i, j, k = _choices(n, 3)
+    i, j, k = _triples(n)
     late = (turns[k] - turns[j]) / (since[k] - since[j])
     early = (turns[j] - turns[i]) / (since[j] - since[i])
-    bend = float(np.median((late - early) / (since[k] - since[i])))
-    i, j = _choices(n, 2)
+    # Repeated medians (Siegel 1982) stay right while more than half of the edges are.
+    bend = float(np.median(np.median(np.median((late - early) / (since[k] - since[i]), axis=2), axis=1)))
     straight = turns - bend * since**2
-    rate = float(np.median((straight[j] - straight[i]) / (since[j] - since[i])))
-    scatter = straight - rate * since
-    scatter -= np.median(scatter)
-    edge = 1.4826 * float(np.median(np.abs(scatter))) * math.sqrt(n / (n - 3)) + _EDGE_FLOOR_REV
+    offset, rate = _line(since, straight)
+    # Few edges fit some parabola by chance: until there are more, half a sample is taken as their scatter.
+    chance = 1.0 / (n - 2) ** 2
+    scatter = float(np.quantile(np.abs(straight - offset - rate * since), 0.75))
+    edge = scatter / _QUARTILE * (1.0 + 8.0 * chance) + 0.5 * rate * chance
     # Standard deviation of the curvature of a least-squares parabola through n evenly spaced points.
     spacing = -float(since[0]) / (n - 1)
     deviation = edge / (spacing**2 * math.sqrt(n * (n**2 - 1) * (n**2 - 4) / 180.0))
-    return bend / (1.0 + _BEND_DOUBT * (deviation / bend) ** 2) if bend else 0.0
+    return bend**3 / (bend**2 + (_BEND_DOUBT * deviation) ** 2)
