@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
 NUMERIC = "iuf"
 """Kinds of dtype that samples may have: integers and floats."""
+
+
+MOST_LISTED = 50
+"""Entries of a file that a message names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +60,15 @@ class Contents:
 
     def listing(self) -> str:
         """What the file holds, in words."""
-        return ", ".join(_told(name, values) for name, values in self.entries.items()) or "nothing"
+        told = [_told(name, values) for name, values in self.entries.items()]
+        if len(told) > MOST_LISTED:
+            told[MOST_LISTED:] = [f"and {len(told) - MOST_LISTED} more"]
+        return ", ".join(told) or "nothing"
 
 
 def _told(name: str, values: NDArray[np.generic]) -> str:
+    if not name.isprintable():
+        name = ascii(name)
     if values.ndim > 1:
         return f"{name} ({values.ndim}-D)"
     if values.dtype.kind in NUMERIC and values.size and values.ndim:
@@ -67,6 +76,18 @@ def _told(name: str, values: NDArray[np.generic]) -> str:
     if values.ndim and values.dtype.kind not in NUMERIC:
         return f"{name} (not numeric)"
     return name if values.ndim == 0 else f"{name} (0)"
+
+
+def column_names(headers: Sequence[str]) -> list[str]:
+    """A name for each column: its header, or its number if it has none or shares it with one before."""
+    return [
+        header
+        if header and headers.index(header) == i
+        else str(i)
+        if str(i) not in headers
+        else f"column {i}"
+        for i, header in enumerate(headers)
+    ]
 
 
 def flattened(name: str, value: object) -> Iterator[tuple[str, NDArray[np.generic]]]:

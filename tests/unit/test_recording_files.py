@@ -257,7 +257,10 @@ class TestMeasured:
 
     def test_accelerometer_on_a_fault_simulator(self):
         (path, *_) = sorted((DATA / "adi_cbm" / "Data_ADXL356C").glob("1800_GoB*.csv.gz"))
-        recording = load_recording(path, {"x": "1", "y": "2", "z": "3"}, 20_000)
+        recording = load_recording(path)
+        assert recording.names == ("1", "2", "3")
+        assert recording.rate_hz == pytest.approx(20_000)
+        assert recording.rate_source == "derived from time column '0', read as seconds"
         assert recording.samples.shape == (40_000, 3)
         assert recording.samples.mean(axis=0) == pytest.approx([0.9] * 3, abs=0.05)
 
@@ -265,6 +268,8 @@ class TestMeasured:
         recording = load_recording(DATA / "ross" / "A1_healthy_e0p1.npz", {"x": "x_disc", "y": "y_disc"})
         assert recording.samples.shape == (29_440, 2)
         assert recording.rate_hz == pytest.approx(10_903.4, abs=0.1)
+        assert recording.scalars["omega"] == pytest.approx(535.219, abs=0.001)
+        assert recording.texts["labels"] == "N"
 
     def test_trends_with_a_date_column(self):
         recording = load_recording(DATA / "skab" / "other" / "5.csv", {"i": "Current", "u": "Voltage"}, 1.0)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from daqsvc.recording.contents import Contents
+from daqsvc.recording.contents import Contents, column_names
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -90,12 +90,8 @@ class _Layout:
         self.header_lines = _header_lines(numbers)
         has_samples = self.header_lines < len(rows)
         self.numeric = [i for i in range(self.width) if has_samples and (numbers[-1][i] or not last[i])]
-        self.names = [str(i) for i in range(self.width)]
-        if self.header_lines:
-            for i, name in enumerate(rows[0][: self.width]):
-                # Of several columns under one header only the first has its name; the others have numbers.
-                if name and name not in self.names[:i]:
-                    self.names[i] = name
+        header = rows[0] if self.header_lines else []
+        self.names = column_names([*header[: self.width], *[""] * (self.width - len(header))])
 
     def split(self, line: str) -> list[str]:
         """The cells of a line, without quotes."""

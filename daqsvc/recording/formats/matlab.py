@@ -6,16 +6,25 @@ from typing import TYPE_CHECKING
 
 from daqsvc.recording.contents import Contents, flattened
 from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.formats.mat_structure import check_mat_structure
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
+LEVEL_5 = 1
+"""What SciPy calls the format of MATLAB 5 to 7."""
+
+
 def read_mat(path: Path) -> Contents:
     """All variables; fields of structs have dotted names."""
     from scipy.io import loadmat  # noqa: PLC0415 - slow to import, and only this format needs it
+    from scipy.io.matlab import matfile_version  # noqa: PLC0415
 
     try:
+        level, _ = matfile_version(path)
+        if level == LEVEL_5:
+            check_mat_structure(path)
         variables = loadmat(path, squeeze_me=True, struct_as_record=False)
     except NotImplementedError:
         raise RecordingError(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.recording.contents import Contents
+from daqsvc.recording.contents import Contents, column_names
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -24,15 +24,16 @@ def read_parquet(path: Path) -> Contents:
         import pyarrow.parquet as pq  # noqa: PLC0415 - an extra, and only this format needs it
     except ModuleNotFoundError as error:
         raise RecordingError(
-            f"{path} is a Parquet file, and to read it {error.name} is needed; "
+            f"{path} is a Parquet file, and reading it needs pyarrow; "
             "install it with: pip install 'daqsvc[parquet]'"
         ) from error
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
         metadata = file.schema_arrow.metadata or {}
         table = file.read()
-    entries: dict[str, NDArray[np.generic]] = {}
-    for i, (name, column) in enumerate(zip(table.column_names, table.columns, strict=True)):
-        entries[str(i) if name in entries else name] = _array(column)
+    entries = {
+        name: _array(column)
+        for name, column in zip(column_names(table.column_names), table.columns, strict=True)
+    }
     for key, value in metadata.items():
         name, text = key.decode(), value.decode()
         if name not in OF_LIBRARIES:
