@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
+from daqsvc.commands.detectability import DetectabilityCommand
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -187,7 +188,11 @@ def start_logging(*, verbose: bool) -> None:
 
 def commands() -> dict[str, Command]:
     """Every verb there is, by name."""
-    known: dict[str, Command] = {"run": RunCommand(), "check": CheckCommand()}
+    known: dict[str, Command] = {
+        "run": RunCommand(),
+        "check": CheckCommand(),
+        "detectability": DetectabilityCommand(load, prepare_kernel_cache),
+    }
     for point in entry_points(group=COMMANDS):
         try:
             known[point.name] = point.load()()

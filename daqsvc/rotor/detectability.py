@@ -47,10 +47,10 @@ class PairEvidence:
         truth: name of the mode that the machine is in.
         rival: name of the other mode.
         nats_per_rev: expected evidence of the truth over the rival in a revolution, steady state.
-        delay_rev: expected revolutions from an abrupt change, rival to truth, to the threshold; infinite
-            if it is never reached.
+        delay_rev: revolutions in which half of all abrupt changes from the rival to the truth have gathered a
+            threshold of evidence; infinite if they never do, or if the two look the same.
         threshold_nats: that threshold.
-        simulated: whether these two figures are from simulated runs (a mean, a median) or computed.
+        simulated: whether these two figures are from simulated runs or computed.
     """
 
     truth: str
@@ -132,14 +132,16 @@ def detectability(
     threshold_nats: float | Floats,
     variance_factor: float = 1.0,
     process_noise: float | None = None,
+    ac_coupled: bool = False,
     within_rev: float = 100.0,
     calibration_rev: float = 50.0,
     seed: int = 0,
 ) -> Detectability:
     """What a bank can tell apart, and how soon.
 
-    The delay is that of the CUSUM of the expected log-likelihood ratio, transient included: a change
-    shows only as the orbits drift apart, so that the evidence grows with the third power of time first.
+    The delay counts the transient: a change shows only as the orbits drift apart, so that the evidence grows
+    with the third power of time first. It is that of one mode against the other; the bank names the mode
+    when it also leads all the rest.
 
     Args:
         modes: the hypotheses, healthiest first; the first one's speed is everybody's.
@@ -150,6 +152,7 @@ def detectability(
         variance_factor: how much larger the bank takes the variance of its innovations to be.
         process_noise: power spectral density q of the machine's own acceleration noise, normalised; that
             of the healthy mode's observer if not given, which is mostly more than a machine has.
+        ac_coupled: whether the probes show no static position, so that a static load cannot be seen.
         within_rev: delay for which the smallest visible change is computed, revolutions.
         calibration_rev: revolutions of the synchronous vector's baseline.
         seed: seed of the simulated runs of modes that rub.
@@ -169,10 +172,22 @@ def detectability(
         return Axis(mode, noise=noise, duration=duration, process_noise=q, variance_factor=variance_factor)
 
     axes = [axis(mode) for mode in modes]
-    rubs = simulate_rubs(modes, noise=noise, duration=duration, process_noise=q, seed=seed)
+    rubs = simulate_rubs(
+        modes,
+        noise=noise,
+        duration=duration,
+        process_noise=q,
+        variance_factor=variance_factor,
+        seed=seed,
+    )
     rates = _steady_rates(modes, axes, rubs, per_rev)
     thresholds = np.broadcast_to(np.asarray(threshold_nats, dtype=np.float64), rates.shape)
     delays = _delays(modes, axes, rubs, thresholds, per_rev)
+    ambiguities = tuple(_ambiguities(modes, axes, rates))
+    names = [mode.name for mode in modes]
+    for ambiguity in ambiguities:
+        i, j = (names.index(name) for name in ambiguity.modes)
+        delays[i, j] = delays[j, i] = math.inf
     pairs = tuple(
         PairEvidence(
             truth=modes[j].name,
@@ -185,19 +200,20 @@ def detectability(
         for j, i in itertools.permutations(range(len(modes)), 2)
     )
     return Detectability(
-        modes=tuple(mode.name for mode in modes),
+        modes=tuple(names),
         w=w,
         samples_per_rev=per_rev,
         noise=noise,
         process_noise=q,
         pairs=pairs,
-        ambiguities=tuple(_ambiguities(modes, axes, rates)),
+        ambiguities=ambiguities,
         smallest=smallest_changes(
             modes[0],
             axis,
             threshold_nats=float(thresholds[0, 1:].max()),
             within_rev=within_rev,
             calibration_rev=calibration_rev,
+            ac_coupled=ac_coupled,
         ),
         within_rev=within_rev,
         calibration_rev=calibration_rev,

@@ -86,7 +86,13 @@ _END = _RUB_ENDS + _AFTER_REV
 
 
 def simulate_rubs(
-    modes: Sequence[BankMode], *, noise: float, duration: float, process_noise: float, seed: int
+    modes: Sequence[BankMode],
+    *,
+    noise: float,
+    duration: float,
+    process_noise: float,
+    variance_factor: float = 1.0,
+    seed: int,
 ) -> list[RubPair]:
     """Run every pair of modes of which one rubs; none if no mode does.
 
@@ -96,6 +102,7 @@ def simulate_rubs(
         duration: normalised time between samples, omega_s dt. Where that is more samples than a bank needs,
             as many are averaged to one as leave enough of them.
         process_noise: power spectral density q of the machine's own acceleration noise, normalised.
+        variance_factor: how much larger the bank takes the variance of its innovations to be.
         seed: seed of the noise and of the shaft angles.
 
     Raises:
@@ -126,7 +133,7 @@ def simulate_rubs(
     motion.run(rubs, z[begins:ends], angle[begins:ends])
     motion.run(others, z[ends:], angle[ends:])
     z += noise * (rng.standard_normal(z.shape) + 1j * rng.standard_normal(z.shape))
-    observers = discretise(modes, noise=noise, duration=duration)
+    observers = discretise(modes, noise=noise, duration=duration, variance_factor=variance_factor)
     return [
         RubPair(i, j, _log_likelihood_ratios(observers[[0, i, j]], z[:, p], angle[:, p]), per_rev)
         for p, (i, j) in enumerate(pairs)

@@ -78,6 +78,7 @@ def smallest_changes(
     threshold_nats: float,
     within_rev: float,
     calibration_rev: float,
+    ac_coupled: bool = False,
 ) -> tuple[SmallestChange, ...]:
     """The smallest visible change of every kind, at the healthy mode's speed.
 
@@ -87,12 +88,16 @@ def smallest_changes(
         threshold_nats: evidence that declares a change.
         within_rev: revolutions in which half of all changes are to be declared by a matching mode.
         calibration_rev: revolutions of the synchronous vector's baseline.
+        ac_coupled: whether the probes show no static position.
     """
     before = axis(healthy)
     rotor = healthy.rotor
     needed = within_rev * 2.0 * math.pi / abs(rotor.w) / before.duration
     found = []
     for kind in _KINDS:
+        if ac_coupled and kind.fault == "static_load":
+            found.append(SmallestChange(fault=kind.fault, healthy=0.0, by_bank=None, by_vector=None))
+            continue
         quantities, normal = kind.quantities(rotor), kind.healthy(rotor)
         changed = [kind.rotor(rotor, float(quantity)) for quantity in quantities]
         afters = [axis(replace(healthy, rotor=candidate)) for candidate in changed]

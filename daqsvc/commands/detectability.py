@@ -1,0 +1,136 @@
+"""``daqsvc detectability MACHINE``: what a machine's rotor bank can tell apart, before anything breaks."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daqsvc.rotor.detectability import Detectability
+    from daqsvc.settings import MachineFile
+
+_FAILED = 1
+_BAD_FILE = 2
+
+
+class DetectabilityCommand:
+    """``daqsvc detectability MACHINE``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+        prepare_kernel_cache: says where compiled kernels are kept.
+    """
+
+    help = "say what the rotor bank of a machine can tell apart, how soon, and from which change on"
+    description = (
+        "Say, before any fault happens, what the rotor bank of a machine file can tell apart: evidence "
+        "between every two modes in nats a revolution, expected delay of its alarms, smallest visible "
+        "change of every kind, and which modes look the same at this speed."
+    )
+
+    def __init__(
+        self, load: Callable[[Path], MachineFile | None], prepare_kernel_cache: Callable[[], None]
+    ) -> None:
+        self._load = load
+        self._prepare_kernel_cache = prepare_kernel_cache
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `Command.add_arguments`."""
+        parser.add_argument("file", type=Path, metavar="MACHINE", help="the machine file (TOML)")
+        parser.add_argument(
+            "--speed-rpm", type=_positive, metavar="N", help="another speed than the machine file's"
+        )
+        parser.add_argument(
+            "--false-alarms-per-1000-rev",
+            type=_positive,
+            metavar="R",
+            help="set the threshold by the false alarms to accept on a healthy machine, not by the file",
+        )
+        parser.add_argument(
+            "--process-noise",
+            type=_positive,
+            metavar="Q",
+            help="how much the machine itself shakes at random: power spectral density of the acceleration, "
+            "normalised (default: process_noise of the file, mostly more than a machine has)",
+        )
+        parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `Command.run`."""
+        machine = self._load(arguments.file)
+        if machine is None:
+            return _BAD_FILE
+        if machine.pipeline.rotor_bank is None:
+            _complain(
+                f"{arguments.file}: there is no [pipeline.rotor_bank], whose modes could be told apart; "
+                "add one, with [machine.rotor] for the rotor that it watches"
+            )
+            return _BAD_FILE
+        self._prepare_kernel_cache()
+        from daqsvc.assembly import AssemblyError  # noqa: PLC0415 - it brings the kernels' compiler
+        from daqsvc.commands.detectability_report import as_json, as_text  # noqa: PLC0415
+
+        machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
+        try:
+            found = _foresee(machine, arguments.process_noise)
+        except (AssemblyError, ValueError) as error:
+            _complain(f"{arguments.file}: {error}")
+            return _FAILED
+        print(json.dumps(as_json(found, machine)) if arguments.json else as_text(found, machine))  # noqa: T201
+        return 0
+
+
+def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability:
+    """Detectability of the bank that the service would run for this machine file."""
+    from daqsvc.assembly import detectors  # noqa: PLC0415
+    from daqsvc.diagnosis.rotor_bank import RotorBankDetector  # noqa: PLC0415
+    from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
+    from daqsvc.rotor.detectability import detectability  # noqa: PLC0415
+
+    (detector,) = (made for made in detectors(machine) if isinstance(made, RotorBankDetector))
+    bank = machine.pipeline.rotor_bank
+    calibrates = bank is not None and bank.calibrate_revolutions > 0
+    return detectability(
+        detector.bank_modes,
+        noise=detector.noise,
+        duration=detector.duration,
+        threshold_nats=detector.rules.thresholds(len(detector.bank_modes)),
+        variance_factor=VARIANCE_FACTOR if calibrates else 1.0,
+        process_noise=process_noise,
+        ac_coupled=machine.ac_coupled,
+    )
+
+
+def _varied(
+    machine: MachineFile, speed_rpm: float | None, false_alarms_per_1000_rev: float | None
+) -> MachineFile:
+    """The machine file at another speed or rate of false alarms."""
+    if speed_rpm is not None:
+        at_speed = machine.machine.model_copy(update={"speed_rpm": speed_rpm})
+        machine = machine.model_copy(update={"machine": at_speed})
+    if false_alarms_per_1000_rev is not None and machine.pipeline.rotor_bank is not None:
+        update = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev}
+        bank = machine.pipeline.rotor_bank.model_copy(update=update)
+        pipeline = machine.pipeline.model_copy(update={"rotor_bank": bank})
+        machine = machine.model_copy(update={"pipeline": pipeline})
+    return machine
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
+
+
+def _complain(message: str) -> None:
+    print(message, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
