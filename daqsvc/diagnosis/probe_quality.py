@@ -1,0 +1,133 @@
+"""What the revolutions of two probes are worth, one by one: missing, standing still, dead, clipped.
+
+A revolution that is worth nothing must not reach the synchronous vectors: a dead probe makes a straight orbit
+and a clipped one makes harmonics, and both look like a fault of the machine.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.diagnosis.probe_checks import Verdict, clipped_at, stands_still
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.diagnosis.probe_checks import Probe
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+POOLED_REVOLUTIONS = 4
+"""Clipping is looked for in so many revolutions together as well: in noise it shows in some of them only."""
+_MISSING = 0.25
+"""Part of a revolution's samples that may be missing."""
+_DEAD = 0.05
+"""A probe that moves less than this part of what it must is dead."""
+_BELIEVED = 0.1
+"""A motion is known well enough to call a probe dead if its uncertainty is below this part of the other's."""
+_SURE = 3.0
+
+
+class RevolutionJudge:
+    """Looks at the samples of one revolution after the other.
+
+    Args:
+        probes: the two probes, in the order of the columns.
+    """
+
+    def __init__(self, probes: tuple[Probe, Probe]) -> None:
+        self._probes = probes
+        self._pool: deque[Floats] = deque(maxlen=POOLED_REVOLUTIONS)
+
+    def reset(self) -> None:
+        """Forget the revolutions before a gap."""
+        self._pool.clear()
+
+    def judge(self, samples: Floats, least_motion_um: float) -> Verdict:
+        """What a revolution is worth.
+
+        Args:
+            samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
+            least_motion_um: standard deviation that each probe must show at least.
+        """
+        there = np.isfinite(samples).all(axis=1)
+        n, missing = len(samples), int(np.count_nonzero(~there))
+        if not n or missing > _MISSING * n:
+            worst = int(np.isfinite(samples).sum(axis=0).argmin())
+            return Verdict(
+                "missing",
+                f"{self._probes[worst].name}: {missing} of the {n} samples of a revolution are missing; "
+                "check the bus and the device",
+            )
+        known = samples[there]
+        self._pool.append(known)
+        pooled = np.concatenate(self._pool)
+        deviations = known.std(axis=0)
+        for column, probe in enumerate(self._probes):
+            if stands_still(known[:, column : column + 1]):
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
+                    "check the probe, its cable and driver",
+                )
+            least = max(least_motion_um, _DEAD * float(deviations[1 - column]))
+            if deviations[column] < least:
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: moved by {deviations[column]:.3g} um rms in a revolution, at least "
+                    f"{least:.3g} um is expected; check the probe, its cable and driver",
+                )
+            for signal in (known[:, column], pooled[:, column]):
+                if (clipped := clipped_at(signal)) is not None:
+                    return Verdict(
+                        "not_ok",
+                        f"{probe.name}: clipped at {clipped:.6g} um; "
+                        "check the gap and the range of the converter",
+                    )
+        return Verdict()
+
+
+def seen_by(vector: Complexes, axis_deg: float) -> float:
+    """1X amplitude that a probe sees.
+
+    Args:
+        vector: complex128 ``[5]``, synchronous vector.
+        axis_deg: where the probe points.
+    """
+    axis = cmath.exp(-1j * math.radians(axis_deg))
+    return float(abs(vector[1] * axis + np.conj(vector[2] * axis)))
+
+
+def blind_probe(
+    vector: Complexes, deviation_um: float, probes: Sequence[Probe], axes_deg: Sequence[float]
+) -> str:
+    """Whether one probe does not see the whirl that the other sees, so that the orbit is a line along it.
+
+    No shaft moves so: a probe that still shows noise, but no 1X, is not connected.
+
+    Args:
+        vector: complex128 ``[5]``, mean synchronous vector in um.
+        deviation_um: standard deviation of one component of it.
+        probes: the two probes.
+        axes_deg: where they point, in the coordinates of the vector.
+
+    Returns:
+        What is wrong and what to do; empty if nothing is.
+    """
+    amplitudes = [seen_by(vector, axis) for axis in axes_deg]
+    deaf, seeing = (0, 1) if amplitudes[0] < amplitudes[1] else (1, 0)
+    doubt = _SURE * math.sqrt(2.0) * deviation_um
+    if doubt > _BELIEVED * amplitudes[seeing] or amplitudes[deaf] > max(_DEAD * amplitudes[seeing], doubt):
+        return ""
+    return (
+        f"{probes[deaf].name}: sees no 1X ({amplitudes[deaf]:.2g} um) where {probes[seeing].name} sees "
+        f"{amplitudes[seeing]:.3g} um; check the probe, its cable and driver"
+    )
