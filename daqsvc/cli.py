@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
+from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 
 if TYPE_CHECKING:
@@ -191,6 +192,7 @@ def commands() -> dict[str, Command]:
     known: dict[str, Command] = {
         "run": RunCommand(),
         "check": CheckCommand(),
+        "analyze": AnalyzeCommand(load, prepare_kernel_cache),
         "detectability": DetectabilityCommand(load, prepare_kernel_cache),
     }
     for point in entry_points(group=COMMANDS):

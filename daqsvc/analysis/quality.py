@@ -1,0 +1,240 @@
+"""What is wrong with the samples of a recording, before anybody makes a diagnosis of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daqsvc.analysis.setup import RefusedError
+from daqsvc.diagnosis.probe_checks import clipped_at
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.dsp.marks import EdgeCounts
+
+    Floats = NDArray[np.float64]
+
+_LEAST_ORBIT_UM = 0.01
+_MOST_ORBIT_UM = 10_000.0
+_MOST_CLEARANCES = 20.0
+_CLIPPED = 1 / 16
+"""Part of a revolution at an extreme value from which on a probe may be clipped."""
+_LEAST_CLIPPED_REVOLUTIONS = 3
+_NO_MEAN = 1e-3
+"""A mean position within this part of the 1X amplitude is none."""
+_MOST_UNUSABLE = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class DataQuality:
+    """What is known against the samples.
+
+    Attributes:
+        samples: of a channel.
+        missing: samples that are not there (NaN), by channel.
+        infinite: samples that are infinite, by channel; they count as missing.
+        clipped: samples at the end of the probe's range in clipped revolutions, by channel.
+        unusable_revolutions: revolutions that could not be fitted.
+        keyphasor: what became of its pulses; None without one.
+        problems: what a person should know, in sentences.
+    """
+
+    samples: int
+    missing: Mapping[str, int] = field(default_factory=dict)
+    infinite: Mapping[str, int] = field(default_factory=dict)
+    clipped: Mapping[str, int] = field(default_factory=dict)
+    unusable_revolutions: int = 0
+    keyphasor: EdgeCounts | None = None
+    problems: tuple[str, ...] = ()
+
+    def with_problem(self, problem: str) -> DataQuality:
+        """The same with one more problem."""
+        return replace(self, problems=(*self.problems, problem))
+
+    def as_json(self) -> dict[str, Any]:
+        """For the output."""
+        marks = self.keyphasor
+        return {
+            "samples": self.samples,
+            "missing": dict(self.missing),
+            "infinite": dict(self.infinite),
+            "clipped": dict(self.clipped),
+            "unusable_revolutions": self.unusable_revolutions,
+            "keyphasor": None
+            if marks is None
+            else {"accepted": marks.accepted, "missing": marks.missing, "rejected": marks.rejected},
+            "problems": list(self.problems),
+        }
+
+
+def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
+    """Missing and infinite samples by channel.
+
+    Args:
+        names: of the channels.
+        samples: float64 ``[n, channels]`` as they were recorded.
+    """
+    missing, infinite = np.isnan(samples).sum(axis=0), np.isinf(samples).sum(axis=0)
+    quality = DataQuality(
+        len(samples),
+        missing=dict(zip(names, missing.tolist(), strict=True)),
+        infinite=dict(zip(names, infinite.tolist(), strict=True)),
+        clipped=dict.fromkeys(names, 0),
+    )
+    for name in names:
+        if quality.infinite[name]:
+            quality = quality.with_problem(
+                f"{name}: {quality.infinite[name]} infinite samples are taken as missing"
+            )
+    return quality
+
+
+def refuse_unreadable(names: Sequence[str], samples: Floats) -> None:
+    """Refuse channels without any reading, and probes that never move.
+
+    Args:
+        names: of the channels.
+        samples: float64 ``[n, channels]``, NaN where missing.
+
+    Raises:
+        RefusedError: a channel holds nothing, or one value only.
+    """
+    for name, signal in zip(names, samples.T, strict=True):
+        there = signal[np.isfinite(signal)]
+        if len(there) <= len(signal) * (1.0 - _MOST_UNUSABLE):
+            raise RefusedError(
+                f"{name}: {len(signal) - len(there)} of {len(signal)} samples are missing or infinite, more "
+                "than half; repair the recording, or map another channel with --map"
+            )
+        if float(there.min()) == float(there.max()):
+            raise RefusedError(
+                f"{name} is dead: all samples are {there[0]:.6g}; check the probe, its cable and driver"
+            )
+
+
+def refuse_stuck(
+    quality: DataQuality, probes: Sequence[str], samples: Floats, period_samples: float
+) -> DataQuality:
+    """Refuse probes that stand still or are clipped, revolution by revolution.
+
+    Args:
+        quality: what is known so far.
+        probes: names of the probes.
+        samples: float64 ``[n, probes]`` in um, NaN where missing.
+        period_samples: samples per revolution.
+
+    Returns:
+        The quality with the clipped samples counted.
+
+    Raises:
+        RefusedError: a probe repeats one value through whole revolutions, or is clipped in some.
+    """
+    revolution = max(4, round(period_samples))
+    count = len(samples) // revolution
+    for column, name in enumerate(probes):
+        signal = np.ascontiguousarray(samples[: count * revolution, column]).reshape(count, revolution)
+        there = np.isfinite(signal)
+        low = np.where(there, signal, np.inf).min(axis=1, initial=np.inf)
+        high = np.where(there, signal, -np.inf).max(axis=1, initial=-np.inf)
+        seen = there.sum(axis=1)
+        still = np.flatnonzero((low == high) & (seen > revolution // 2))
+        if len(still) >= _LEAST_CLIPPED_REVOLUTIONS:
+            first = int(still[0])
+            raise RefusedError(
+                f"{name} is dead in {len(still)} of {count} revolutions, the first is revolution {first + 1} "
+                f"(all samples are {low[first]:.6g} um); check the probe, its cable and driver, or give only "
+                f"the {first * revolution} samples before"
+            )
+        at_end = np.maximum(
+            (signal == low[:, np.newaxis]).sum(axis=1), (signal == high[:, np.newaxis]).sum(axis=1)
+        )
+        suspects = np.flatnonzero(at_end >= max(3.0, _CLIPPED * revolution))
+        clipped = [(int(i), at) for i in suspects if (at := clipped_at(signal[i][there[i]])) is not None]
+        if len(clipped) >= _LEAST_CLIPPED_REVOLUTIONS:
+            samples_at = sum(int((signal[i] == at).sum()) for i, at in clipped)
+            first, at = clipped[0]
+            raise ClippedError(
+                f"{name} is clipped at {at:.6g} um in {len(clipped)} of {count} revolutions, the first is "
+                f"revolution {first + 1}; check the gap and the range of the converter",
+                replace(quality, clipped={**quality.clipped, name: samples_at}),
+            )
+    return quality
+
+
+class ClippedError(RefusedError):
+    """A probe is clipped.
+
+    Attributes:
+        quality: with the clipped samples counted.
+    """
+
+    def __init__(self, message: str, quality: DataQuality) -> None:
+        super().__init__(message)
+        self.quality = quality
+
+
+def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
+    """Refuse orbits of a size that no rotor has: the unit must be wrong.
+
+    Args:
+        samples: float64 ``[n, 2]`` in um, NaN where missing.
+        clearance_um: radial clearance, if known.
+        unit: what the samples were said to be in.
+
+    Raises:
+        RefusedError: the orbit is too small or too large.
+    """
+    spread = np.nanpercentile(samples, [1.0, 99.0], axis=0)
+    radius_um = float((spread[1] - spread[0]).max()) / 2.0
+    most_um = _MOST_ORBIT_UM
+    than = f"{most_um / 1000:g} mm"
+    if clearance_um is not None and _MOST_CLEARANCES * clearance_um < most_um:
+        most_um = _MOST_CLEARANCES * clearance_um
+        than = f"{_MOST_CLEARANCES:g} times the clearance of {clearance_um:g} um"
+    if radius_um > most_um:
+        raise RefusedError(
+            f"the orbit has a radius of {radius_um:.3g} um, more than {than}: the unit {unit!r} looks wrong; "
+            "correct --unit (m, mm, um or mil)"
+        )
+    if radius_um < _LEAST_ORBIT_UM:
+        raise RefusedError(
+            f"the orbit has a radius of {radius_um:.3g} um, less than {_LEAST_ORBIT_UM:g} um: the unit "
+            f"{unit!r} looks wrong; correct --unit (m, mm, um or mil)"
+        )
+
+
+def refuse_gaps(unusable: int, revolutions: int, why: str) -> None:
+    """Refuse a recording most revolutions of which cannot be judged.
+
+    Args:
+        unusable: revolutions that cannot.
+        revolutions: all of them.
+        why: the last reason.
+
+    Raises:
+        RefusedError: more than half of them, or there is none at all.
+    """
+    if not revolutions:
+        raise RefusedError("no whole revolution was found; check the speed and the keyphasor")
+    if unusable > _MOST_UNUSABLE * revolutions:
+        raise RefusedError(
+            f"{unusable} of {revolutions} revolutions cannot be judged: {why or 'samples are missing'}"
+        )
+
+
+def lacks_mean(samples: Floats) -> bool:
+    """Whether both probes swing about zero through the whole recording, as AC-coupled ones do.
+
+    Args:
+        samples: float64 ``[n, 2]`` in um, NaN where missing.
+    """
+    mean, deviation = np.nanmean(samples, axis=0), np.nanstd(samples, axis=0)
+    # Noise leaves something of a mean even where there is none.
+    allowed = math.sqrt(2.0) * deviation * _NO_MEAN + 3.0 * deviation / math.sqrt(len(samples))
+    return bool((np.abs(mean) < allowed).all())

@@ -1,0 +1,280 @@
+"""The verdict about a recording, as data, as a JSON object and in words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+
+from daqsvc.rotor.signatures import RotorFault
+from daqsvc.rotor.synchronous import HARMONICS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.analysis.quality import DataQuality
+    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.identify import Identification
+    from daqsvc.rotor.synchronous import SynchronousVectors
+    from daqsvc.rotor.watch import WatchReport
+
+VERDICTS: tuple[RotorFault, ...] = get_args(RotorFault)
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A place in a recording.
+
+    Attributes:
+        sample: samples before it.
+        seconds: time before it.
+        revolution: whole revolutions before it.
+    """
+
+    sample: int
+    seconds: float
+    revolution: int
+
+    def as_json(self) -> dict[str, Any]:
+        """For the output."""
+        return {"sample": self.sample, "seconds": self.seconds, "revolution": self.revolution}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A change of what is said about the machine, at the end of a revolution.
+
+    Attributes:
+        revolution: the revolution.
+        verdict: most likely; None between a departure and the first look at it.
+        group: all that cannot be told apart.
+        named: whether two looks agree.
+        probabilities: of that look.
+    """
+
+    revolution: int
+    verdict: RotorFault | None
+    group: tuple[RotorFault, ...] = ()
+    named: bool = False
+    probabilities: Mapping[RotorFault, float] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """For the output."""
+        return {
+            "revolution": self.revolution,
+            "verdict": self.verdict,
+            "group": list(self.group),
+            "named": self.named,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """What the verdict was made of, for figures.
+
+    Attributes:
+        vectors: of all revolutions.
+        reports: one for each revolution that could be fitted.
+    """
+
+    vectors: SynchronousVectors
+    reports: tuple[WatchReport, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotorAnalysis:
+    """What a recording says about a rotor.
+
+    Attributes:
+        recording: name of the recording.
+        quality: what is known against its samples.
+        refused: why it cannot be judged; None if it can.
+        verdict: the fault, the most likely one of ``group``; None if refused.
+        group: all that the evidence cannot tell apart, the most likely first.
+        named: whether two looks in a row agreed, or the machine is normal.
+        probabilities: of every verdict.
+        evidence: nats of every hypothesis over "normal".
+        severity: modulus of the change over the healthy whirl's amplitude.
+        level: how large the fault is, in its own terms.
+        identification: what the last look saw; None while the machine is healthy.
+        onset: estimated begin of the change.
+        departure: where the alarm is raised.
+        declaration: where the final group was first named.
+        false_alarms_per_1000_rev: the rate that the threshold is set for.
+        threshold_nats: of the departure test.
+        calibration: the healthy baseline; None if there is none.
+        speed_rpm: mean shaft speed, negative if clockwise; None if not known.
+        revolutions: whole revolutions in the recording.
+        history: every change of what was said.
+        trace: what it was made of; None if refused before.
+    """
+
+    recording: str
+    quality: DataQuality
+    refused: str | None = None
+    verdict: RotorFault | None = None
+    group: tuple[RotorFault, ...] = ()
+    named: bool = False
+    probabilities: Mapping[RotorFault, float] = field(default_factory=dict)
+    evidence: Mapping[RotorFault, float] = field(default_factory=dict)
+    severity: float | None = None
+    level: Mapping[str, Any] = field(default_factory=dict)
+    identification: Identification | None = None
+    onset: Instant | None = None
+    departure: Instant | None = None
+    declaration: Instant | None = None
+    false_alarms_per_1000_rev: float
+    threshold_nats: float
+    calibration: Calibration | None = None
+    speed_rpm: float | None = None
+    revolutions: int = 0
+    history: tuple[Step, ...] = ()
+    trace: Trace | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """A JSON object: all figures finite, lengths in um."""
+        change = None if self.identification is None else self.identification.change
+        found: dict[str, Any] = finite(
+            {
+                "recording": self.recording,
+                "verdict": self.verdict,
+                "group": list(self.group),
+                "named": self.named,
+                "probabilities": {name: self.probabilities.get(name, 0.0) for name in VERDICTS}
+                if self.probabilities
+                else {},
+                "evidence": dict(self.evidence),
+                "severity": self.severity,
+                "level": dict(self.level),
+                "change_um": None
+                if change is None
+                else {
+                    str(order): [value.real, value.imag]
+                    for order, value in zip(HARMONICS, change.tolist(), strict=True)
+                },
+                "onset": _json_of(self.onset),
+                "departure": _json_of(self.departure),
+                "declaration": _json_of(self.declaration),
+                "false_alarms_per_1000_rev": self.false_alarms_per_1000_rev,
+                "threshold_nats": self.threshold_nats,
+                "calibration": None if self.calibration is None else calibration_json(self.calibration),
+                "speed_rpm": self.speed_rpm,
+                "revolutions": self.revolutions,
+                "data_quality": self.quality.as_json(),
+                "refused": self.refused,
+                "history": [step.as_json() for step in self.history],
+            }
+        )
+        return found
+
+    def describe(self) -> str:
+        """A few lines for a person."""
+        lines = [f"{self.recording}: {self._headline()}"]
+        if self.departure is not None and self.onset is not None:
+            lines.append(f"changed at {_told(self.onset)}; alarm at {_told(self.departure)}" + self._named())
+        if self.identification is not None and self.calibration is not None:
+            lines.append(self._change())
+        if self.calibration is not None:
+            was = self.calibration
+            lines.append(
+                f"healthy: 1X {was.amplitude_um:.4g} um at {_degrees(was.baseline[1]):.0f} degrees, "
+                f"{was.revolutions} revolutions at {abs(was.speed_rpm):.1f} rpm, noise {was.noise_um:.3g} um "
+                f"({was.snr_db:.0f} dB); it {was.describe()}"
+            )
+        bad = [
+            f"{count} {what} samples of {name}"
+            for what, counts in (("missing", self.quality.missing), ("infinite", self.quality.infinite))
+            for name, count in counts.items()
+            if count
+        ]
+        if self.quality.unusable_revolutions and self.refused is None:
+            bad.append(f"{self.quality.unusable_revolutions} of {self.revolutions} revolutions unusable")
+        if bad:
+            lines.append(f"data: {', '.join(bad)}")
+        lines += self.quality.problems
+        return "\n  ".join(lines)
+
+    def _headline(self) -> str:
+        if self.refused is not None:
+            return f"not judged: {self.refused}"
+        if self.verdict is None:
+            return "changed, but no revolution after the change can be judged"
+        said = " or ".join(_words(name) for name in self.group)
+        chance = self.probabilities.get(self.verdict, 0.0)
+        if self.verdict == "normal":
+            return f"normal through {self.revolutions} revolutions"
+        if not self.named:
+            said += " (not yet settled)"
+        elif len(self.group) > 1:
+            said += f" (cannot be told apart; {_words(self.verdict)} {_percent(chance)})"
+        else:
+            said += f" ({_percent(chance)})"
+        return said
+
+    def _named(self) -> str:
+        return f"; named at {_told(self.declaration)}" if self.declaration is not None else "; not named"
+
+    def _change(self) -> str:
+        assert self.identification is not None  # noqa: S101 - asked before
+        assert self.calibration is not None  # noqa: S101 - asked before
+        change, now = self.identification.change, self.calibration.baseline + self.identification.change
+        level = "".join(f", {_words(key)} {_figure(value)}" for key, value in self.level.items())
+        return (
+            f"severity {self.identification.severity:.3g} of the healthy whirl{level}; 1X is "
+            f"{abs(now[1]):.4g} um at {_degrees(now[1]):.0f} degrees, the mean position moved by {abs(change[0]):.3g} um, "
+            f"backward 1X by {abs(change[2]):.3g}, 2X by {abs(change[3]):.3g} um"
+        )
+
+
+def calibration_json(calibration: Calibration) -> dict[str, Any]:
+    """A calibration for the output."""
+    return {
+        "revolutions": calibration.revolutions,
+        "speed_rpm": calibration.speed_rpm,
+        "amplitude_um": calibration.amplitude_um,
+        "phase_deg": _degrees(calibration.baseline[1]),
+        "ellipticity": calibration.ellipticity,
+        "noise_um": calibration.noise_um,
+        "snr_db": calibration.snr_db,
+        "laval": calibration.laval,
+        "verdict": calibration.describe(),
+    }
+
+
+def finite(value: Any) -> Any:
+    """The same with every NaN and infinity as None, and NumPy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {key: finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(part) for part in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _json_of(instant: Instant | None) -> dict[str, Any] | None:
+    return None if instant is None else instant.as_json()
+
+
+def _told(instant: Instant) -> str:
+    return f"revolution {instant.revolution} (sample {instant.sample}, {instant.seconds:.3f} s)"
+
+
+def _degrees(vector: complex) -> float:
+    return math.degrees(math.atan2(vector.imag, vector.real))
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _percent(probability: float) -> str:
+    return "above 99.9 %" if probability > 0.999 else f"{100.0 * probability:.1f} %"
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

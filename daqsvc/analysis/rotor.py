@@ -1,0 +1,435 @@
+"""From a recording of two proximity probes and what is known about the rotor to a verdict.
+
+`analyse` is a pure function: it reads nothing but its arguments and keeps nothing. The detector inside is
+the one that watches the machine live.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.analysis import quality as checks
+from daqsvc.analysis.quality import ClippedError, DataQuality
+from daqsvc.analysis.result import Instant, RotorAnalysis, Step, Trace
+from daqsvc.analysis.setup import RefusedError
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
+from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
+from daqsvc.dsp.marks import EdgeFinder
+from daqsvc.dsp.orbit_speed import estimate_speed
+from daqsvc.recording.channels import to_um
+from daqsvc.rotor.calibration import Calibration, compensated
+from daqsvc.rotor.departure import threshold_for
+from daqsvc.rotor.signatures import likelihoods
+from daqsvc.rotor.synchronous import SynchronousVectors
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.analysis.setup import Keyphasor, RotorSetup
+    from daqsvc.recording.recording import Recording
+    from daqsvc.rotor.identify import Identification
+    from daqsvc.rotor.signatures import RotorFault
+    from daqsvc.rotor.watch import WatchReport
+
+    Floats = NDArray[np.float64]
+
+LEAST_JUDGED = 3
+"""Revolutions that must be left to judge after those that calibrate."""
+
+_FIXED_SPEED_TURN = 0.05
+"""What a wrong speed may turn the angle by during calibration, in revolutions."""
+_SIGNIFICANT = 5.0
+"""Standard deviations from which on a speed differs."""
+_RELEVANT_TURN = 0.001
+"""What it must turn the angle by, to the end of the recording, for a difference to matter."""
+_WINDOW_REVOLUTIONS = 256
+"""Revolutions handed to the detector at a time: often enough to see it get on."""
+_HYSTERESIS = 0.2
+"""Of the keyphasor's range from low to high."""
+_LEAST_PULSES = 4
+_OFF_NOMINAL = 0.05
+_SEEN = 128
+"""Revolutions that say what a healthy machine looks like at the end."""
+
+
+@dataclass(slots=True)
+class _Watched:
+    """What the detector says of every revolution that it could fit."""
+
+    reports: list[WatchReport] = field(default_factory=list)
+    vectors: list[SynchronousVectors] = field(default_factory=list)
+
+    def take(self, report: WatchReport, vectors: SynchronousVectors) -> None:
+        """The detector's listener."""
+        self.reports.append(report)
+        self.vectors.append(vectors)
+
+    def joined(self) -> SynchronousVectors:
+        return SynchronousVectors.joined(self.vectors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Speed:
+    """Speed that the detector starts from, and the keyphasor's threshold and hysteresis if there is one."""
+
+    rpm: float
+    keyphasor: KeyphasorProbe | None = None
+
+
+def analyse(
+    recording: Recording, setup: RotorSetup, progress: Callable[[int, int], None] | None = None
+) -> RotorAnalysis:
+    """Judge a recording.
+
+    The first revolutions are the healthy machine, unless ``setup`` has a calibration.
+
+    Args:
+        recording: with the channels of ``setup.columns``, by their names there.
+        setup: what is known.
+        progress: told the samples done and to do, now and then.
+
+    Returns:
+        The verdict; a recording that cannot be judged has ``refused`` say why. Never raises on bad data.
+    """
+    quality = checks.count_bad(recording.names, recording.samples)
+    watched = _Watched()
+    try:
+        return _judge(recording, setup, quality, watched, progress)
+    except RefusedError as error:
+        if isinstance(error, ClippedError):
+            quality = error.quality
+        return RotorAnalysis(
+            recording=str(recording.source),
+            quality=quality,
+            refused=str(error),
+            false_alarms_per_1000_rev=setup.rules.false_alarms_per_1000_rev,
+            threshold_nats=threshold_for(setup.rules.false_alarms_per_1000_rev),
+            speed_rpm=setup.speed_rpm,
+            revolutions=len(watched.reports),
+        )
+
+
+def refused(source: str, setup: RotorSetup, why: str) -> RotorAnalysis:
+    """The verdict about a recording that cannot even be read."""
+    return RotorAnalysis(
+        recording=source,
+        quality=DataQuality(0),
+        refused=why,
+        false_alarms_per_1000_rev=setup.rules.false_alarms_per_1000_rev,
+        threshold_nats=threshold_for(setup.rules.false_alarms_per_1000_rev),
+    )
+
+
+def _judge(
+    recording: Recording,
+    setup: RotorSetup,
+    quality: DataQuality,
+    watched: _Watched,
+    progress: Callable[[int, int], None] | None,
+) -> RotorAnalysis:
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    samples = samples[:, [recording.names.index(name) for name in setup.columns]]
+    samples[:, :2] = to_um(samples[:, :2], setup.unit)
+    checks.refuse_unreadable(tuple(setup.columns), samples)
+    checks.refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
+    speed, quality = _speed(recording, setup, samples, quality)
+    period = 60.0 * recording.rate_hz / abs(speed.rpm)
+    quality = checks.refuse_stuck(quality, setup.probes, samples[:, :2], period)
+    ac_coupled = setup.ac_coupled or checks.lacks_mean(samples[:, :2])
+    if ac_coupled and not setup.ac_coupled:
+        quality = quality.with_problem(
+            "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss "
+            "cannot be seen"
+        )
+    detector = RotorSynchronousDetector(
+        machine="recording",
+        stream=str(recording.source),
+        rate_hz=recording.rate_hz,
+        speed_rpm=speed.rpm,
+        probes=(Probe(setup.probes[0], 0, 0.0), Probe(setup.probes[1], 1, 90.0)),
+        reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
+        rotor=setup.rotor,
+        rules=setup.rules,
+        calibration=setup.calibration,
+        ac_coupled=ac_coupled,
+        listener=watched.take,
+    )
+    complaints = _feed(detector, samples, recording.rate_hz, period, progress)
+    reading = _Reading(
+        recording, setup, detector, tuple(watched.reports), watched.joined(), tuple(complaints)
+    )
+    return reading.verdict(quality)
+
+
+def _speed(
+    recording: Recording, setup: RotorSetup, samples: Floats, quality: DataQuality
+) -> tuple[_Speed, DataQuality]:
+    """Speed to start from; refuses a stated one that the orbit contradicts."""
+    if setup.keyphasor is not None:
+        return _keyphasor_speed(recording, setup, setup.keyphasor, samples[:, 2], quality)
+    assert setup.speed_rpm is not None  # noqa: S101 - see RotorSetup
+    revolutions = len(samples) * abs(setup.speed_rpm) / 60.0 / recording.rate_hz
+    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    if revolutions < needed:
+        raise RefusedError(_too_short(revolutions, needed, setup))
+    if setup.follow_orbit:
+        return _Speed(setup.speed_rpm), quality
+    return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
+
+
+def _too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:
+    made_of = (
+        f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
+        if setup.calibration is None
+        else "to judge"
+    )
+    return (
+        f"the recording is too short: {revolutions:.1f} revolutions, at least {needed} are needed "
+        f"({made_of}); give a longer one, or fewer --calibrate-revs"
+    )
+
+
+def _fixed_speed(
+    recording: Recording, setup: RotorSetup, stated_rpm: float, samples: Floats, quality: DataQuality
+) -> tuple[_Speed, DataQuality]:
+    """The stated speed if the orbit of the first revolutions has it, made exact where that is significant."""
+    calibrating = setup.rules.calibrate_revolutions
+    begin = math.ceil(calibrating * 60.0 * recording.rate_hz / abs(stated_rpm))
+    try:
+        found = estimate_speed(samples[:begin, :2], recording.rate_hz, stated_rpm)
+    except ValueError as error:
+        raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
+    off = found.speed_rpm / stated_rpm - 1.0
+    significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
+    if significant and abs(off) * calibrating > _FIXED_SPEED_TURN:
+        raise RefusedError(
+            f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
+            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, or use a keyphasor"
+        )
+    revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
+    if significant and abs(off) * revolutions > _RELEVANT_TURN:
+        quality = quality.with_problem(
+            f"the speed is {abs(found.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
+            "the former is used"
+        )
+        return _Speed(found.speed_rpm), quality
+    return _Speed(stated_rpm), quality
+
+
+def _keyphasor_speed(
+    recording: Recording, setup: RotorSetup, keyphasor: Keyphasor, marker: Floats, quality: DataQuality
+) -> tuple[_Speed, DataQuality]:
+    low, high = (float(value) for value in np.nanpercentile(marker, [0.1, 99.9]))
+    threshold = (low + high) / 2.0 if keyphasor.threshold is None else keyphasor.threshold
+    hysteresis = _HYSTERESIS * (high - low)
+    edges = EdgeFinder(threshold, hysteresis, keyphasor.edge).find(marker)
+    if len(edges) < _LEAST_PULSES:
+        raise RefusedError(
+            f"keyphasor {keyphasor.name}: {len(edges)} pulses cross {threshold:.4g}; the channel lies "
+            f"between {low:.4g} and {high:.4g}: correct --keyphasor-threshold, or name another channel"
+        )
+    places = np.array([sample + fraction for sample, fraction in edges])
+    found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
+    rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
+    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    if len(edges) - 1 < needed:
+        raise RefusedError(_too_short(len(edges) - 1, needed, setup))
+    if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:
+        quality = quality.with_problem(
+            f"keyphasor {keyphasor.name} says {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
+            "the keyphasor decides"
+        )
+    probe = KeyphasorProbe(keyphasor.name, 2, threshold, hysteresis, keyphasor.edge)
+    return _Speed(rpm, probe), quality
+
+
+def _feed(
+    detector: RotorSynchronousDetector,
+    samples: Floats,
+    rate_hz: float,
+    period_samples: float,
+    progress: Callable[[int, int], None] | None,
+) -> list[str]:
+    """Hand the recording to the detector in windows; what it complains of, each once."""
+    complaints: dict[str, None] = {}
+    length = max(1, round(_WINDOW_REVOLUTIONS * period_samples / detector.block)) * detector.block
+    period_ns = NS_PER_S / rate_hz
+    for begin in range(0, len(samples), length):
+        part = samples[begin : begin + length].astype(np.float32)
+        end = begin + len(part)
+        for said in detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns)):
+            if said.quality != "good":
+                complaints.setdefault(said.reason)
+        if progress is not None:
+            progress(end, len(samples))
+        if detector.refused:
+            raise RefusedError(detector.refused)
+    return list(complaints)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """A recording, and what the detector has made of it."""
+
+    recording: Recording
+    setup: RotorSetup
+    detector: RotorSynchronousDetector
+    reports: tuple[WatchReport, ...]
+    vectors: SynchronousVectors
+    complaints: tuple[str, ...]
+
+    def verdict(self, quality: DataQuality) -> RotorAnalysis:
+        watch = self.detector.watch
+        unusable = watch.revolutions - len(self.vectors)
+        quality = replace(
+            quality,
+            unusable_revolutions=unusable,
+            keyphasor=self.detector.edges if self.setup.keyphasor is not None else None,
+        )
+        checks.refuse_gaps(unusable, watch.revolutions, self.complaints[-1] if self.complaints else "")
+        for complaint in self.complaints:
+            quality = quality.with_problem(complaint)
+        calibration = watch.calibration
+        calibrated = 0 if self.setup.calibration is not None else self.setup.rules.calibrate_revolutions
+        if calibration is None:
+            raise RefusedError(_too_short(len(self.vectors), calibrated + LEAST_JUDGED, self.setup))
+        last = self._last_look()
+        steps = history(self.reports, last)
+        departed = self._departed()
+        threshold = threshold_for(self.setup.rules.false_alarms_per_1000_rev)
+        analysis = RotorAnalysis(
+            recording=str(self.recording.source),
+            quality=quality,
+            verdict="normal",
+            group=("normal",),
+            named=True,
+            false_alarms_per_1000_rev=self.setup.rules.false_alarms_per_1000_rev,
+            threshold_nats=threshold,
+            calibration=calibration,
+            speed_rpm=math.copysign(
+                60.0 * self.recording.rate_hz / float(self.vectors.period_samples.mean()),
+                self.setup.speed_rpm or 1.0,
+            ),
+            revolutions=watch.revolutions,
+            history=steps,
+            trace=Trace(self.vectors, self.reports),
+        )
+        if departed is None or (last is not None and last.verdict == "normal"):
+            evidence = self._healthy_evidence(calibration, calibrated)
+            chances = posterior(
+                {name: nats - threshold * (name != "normal") for name, nats in evidence.items()}
+            )
+            return replace(analysis, evidence=evidence, probabilities=chances)
+        analysis = replace(analysis, onset=self._onset(departed), departure=self._end_of(departed))
+        if last is None:
+            return replace(analysis, verdict=None, group=(), named=False)
+        return replace(
+            analysis,
+            verdict=last.verdict,
+            group=last.group,
+            named=last.named,
+            probabilities=last.probabilities,
+            evidence=last.evidence,
+            severity=last.severity,
+            identification=last,
+            declaration=self._declared(departed, last),
+        )
+
+    def _departed(self) -> WatchReport | None:
+        """The report that raised the alarm which is still up."""
+        found = None
+        for report in self.reports:
+            if report.state != "departed":
+                found = None
+            elif report.departed and found is None:
+                found = report
+        return found
+
+    def _last_look(self) -> Identification | None:
+        """The last look; one more at the end of the recording, unless the last revolution had one."""
+        if not self.reports or self.reports[-1].state != "departed":
+            return None
+        if self.reports[-1].looked:
+            return self.reports[-1].identification
+        return self.detector.watch.finish()
+
+    def _declared(self, departed: WatchReport, last: Identification) -> Instant | None:
+        if not last.named:
+            return None
+        for report in self.reports:
+            said = report.identification
+            if report.revolution < departed.revolution or said is None or not report.looked:
+                continue
+            if said.named and set(said.group) == set(last.group):
+                return self._end_of(report)
+        return self._end_of(self.reports[-1])
+
+    def _onset(self, departed: WatchReport) -> Instant:
+        """Where the revolution begins that the change is estimated to begin with."""
+        first = departed.onset_revolution or departed.revolution
+        numbers = [report.revolution for report in self.reports]
+        place = min(bisect.bisect_left(numbers, first), len(numbers) - 1)
+        begin = self.reports[place].end_index - round(float(self.vectors.period_samples[place]))
+        return self._instant(max(0, begin), first - 1)
+
+    def _end_of(self, report: WatchReport) -> Instant:
+        return self._instant(report.end_index, report.revolution)
+
+    def _instant(self, sample: int, revolution: int) -> Instant:
+        return Instant(sample, sample / self.recording.rate_hz, revolution)
+
+    def _healthy_evidence(self, calibration: Calibration, calibrated: int) -> Mapping[RotorFault, float]:
+        """What the last revolutions of a machine that has not departed say for every hypothesis."""
+        recent = self.vectors[max(calibrated, len(self.vectors) - _SEEN) :]
+        if not len(recent):
+            return {}
+        rate_hz = self.recording.rate_hz
+        moved, speed = compensated(recent, calibration.rotor, calibration.speed_rad_s, rate_hz)
+        change = moved.mean(axis=0) - calibration.baseline
+        variance = calibration.spread.of_means(
+            float(len(recent)), calibration.revolutions, float(speed.mean())
+        )
+        return likelihoods(change, variance, calibration.healthy, calibration.baseline + change)
+
+
+def history(reports: Sequence[WatchReport], last: Identification | None) -> tuple[Step, ...]:
+    """Every change of what the watch said, and at the end the last look if it said something else."""
+    steps: list[Step] = []
+    for report in reports:
+        before = steps[-1] if steps else None
+        said = report.identification
+        if report.departed and (before is None or before.verdict == "normal"):
+            steps.append(Step(report.revolution, None))
+        elif report.state == "watching" and before is not None and before.verdict != "normal":
+            steps.append(Step(report.revolution, "normal", ("normal",), named=True))
+        elif report.looked and said is not None:
+            _add_look(steps, report.revolution, said)
+    if last is not None and reports:
+        _add_look(steps, reports[-1].revolution, last)
+    return tuple(steps)
+
+
+def _add_look(steps: list[Step], revolution: int, said: Identification) -> None:
+    before = steps[-1] if steps else None
+    if before is None or (before.verdict, before.group, before.named) != (
+        said.verdict,
+        said.group,
+        said.named,
+    ):
+        steps.append(Step(revolution, said.verdict, said.group, said.named, said.probabilities))
+
+
+def posterior(evidence: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
+    """Probabilities of hypotheses, equally likely before, with this evidence in nats."""
+    top = max(evidence.values(), default=0.0)
+    weights = {name: math.exp(nats - top) for name, nats in evidence.items()}
+    return {name: weight / math.fsum(weights.values()) for name, weight in weights.items()}
