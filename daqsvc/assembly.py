@@ -10,7 +10,11 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
+from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.watch import WatchRules
 from daqsvc.settings.models import (
     Accelerometer,
     CanBus,
@@ -31,7 +35,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.diagnosis.detector import Detector
-    from daqsvc.settings.models import MachineFile, RotorBank, Sensor
+    from daqsvc.diagnosis.rotor_synchronous import SpeedReference
+    from daqsvc.settings.models import MachineFile, RotorBank, RotorSynchronous, Sensor
     from drivers.base import Driver
 
 DRIVERS = "daqsvc.drivers"
@@ -143,6 +148,8 @@ def detectors(machine: MachineFile) -> list[Detector]:
                 )
     if machine.pipeline.rotor_bank is not None:
         made.append(_rotor_bank(machine, machine.pipeline.rotor_bank))
+    if machine.pipeline.rotor_synchronous is not None:
+        made.append(_rotor_synchronous(machine, machine.pipeline.rotor_synchronous))
     return made
 
 
@@ -166,39 +173,21 @@ def _gap_check(sensor: Sensor) -> GapCheck | None:
 
 def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
     # Here, not above: the kernels bring a compiler, which costs a second that `daqsvc check` need not wait.
-    from daqsvc.diagnosis.rotor_bank import (  # noqa: PLC0415
-        KeyphasorProbe,
-        Probe,
-        RotorBankDetector,
-        RotorMode,
-    )
+    from daqsvc.diagnosis.rotor_bank import RotorBankDetector, RotorMode  # noqa: PLC0415
     from daqsvc.rotor.decision import DecisionRules  # noqa: PLC0415
     from daqsvc.rotor.model import RotorParameters  # noqa: PLC0415
 
-    rotor, keyphasor = machine.machine.rotor, machine.sensor(bank.keyphasor)
-    assert rotor is not None  # noqa: S101 - settings/checks.py: a rotor bank needs [machine.rotor]
-    assert isinstance(keyphasor, Keyphasor)  # noqa: S101 - and a keyphasor
-
-    def probe(name: str, default_deg: float) -> Probe:
-        sensor = machine.sensor(name)
-        assert isinstance(sensor, ProximityProbe)  # noqa: S101 - and two proximity probes
-        angle_deg = default_deg if sensor.angle_deg is None else sensor.angle_deg
-        return Probe(name, _column(machine, sensor), angle_deg, _UM_PER_UNIT[sensor.unit])
-
-    rate_hz = machine.streams[keyphasor.stream].rate_hz
+    rotor = machine.machine.rotor
+    assert rotor is not None  # noqa: S101 - settings/rotor_checks.py: a rotor bank needs [machine.rotor]
+    stream = machine.sensor(bank.keyphasor).stream
+    rate_hz = machine.streams[stream].rate_hz
     return RotorBankDetector(
         machine=machine.machine.name,
-        stream=keyphasor.stream,
+        stream=stream,
         rate_hz=rate_hz,
         speed_rpm=machine.machine.speed_rpm,
-        probes=(probe(bank.probes[0], 0.0), probe(bank.probes[1], 90.0)),
-        keyphasor=KeyphasorProbe(
-            keyphasor.name,
-            _column(machine, keyphasor),
-            keyphasor.threshold_v,
-            keyphasor.hysteresis_v,
-            keyphasor.edge,
-        ),
+        probes=_probes(machine, bank.probes),
+        keyphasor=_keyphasor(machine, bank.keyphasor),
         rotor=RotorParameters(
             natural_frequency_hz=rotor.natural_frequency_hz,
             damping_ratio=rotor.damping_ratio,
@@ -239,6 +228,57 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
         calibrate_revolutions=bank.calibrate_revolutions,
         ac_coupled=machine.ac_coupled,
     )
+
+
+def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous) -> Detector:
+    rotor = machine.machine.rotor
+    assert rotor is not None  # noqa: S101 - settings/rotor_checks.py: it needs [machine.rotor]
+    stream = machine.sensor(given.probes[0]).stream
+    reference: SpeedReference
+    if given.reference == "keyphasor":
+        assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
+        reference = _keyphasor(machine, given.keyphasor)
+    else:
+        reference = given.reference
+    return RotorSynchronousDetector(
+        machine=machine.machine.name,
+        stream=stream,
+        rate_hz=machine.streams[stream].rate_hz,
+        speed_rpm=machine.machine.speed_rpm,
+        probes=_probes(machine, given.probes),
+        reference=reference,
+        rotor=LavalRotor(
+            natural_frequency_hz=rotor.natural_frequency_hz,
+            damping_ratio=rotor.damping_ratio,
+            natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
+            damping_tolerance=given.damping_tolerance_percent / 100.0,
+            clearance_um=rotor.clearance_um,
+            static_sag_um=rotor.static_sag_um,
+        ),
+        rules=WatchRules(
+            calibrate_revolutions=given.calibrate_revolutions,
+            false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
+            probe_drift_um=given.probe_drift_um,
+        ),
+        ac_coupled=machine.ac_coupled,
+    )
+
+
+def _probes(machine: MachineFile, names: tuple[str, str]) -> tuple[Probe, Probe]:
+    def probe(name: str) -> Probe:
+        sensor = machine.sensor(name)
+        assert isinstance(sensor, ProximityProbe)  # noqa: S101 - settings/rotor_checks.py
+        assert sensor.angle_deg is not None  # noqa: S101 - settings/rotor_checks.py
+        return Probe(name, _column(machine, sensor), sensor.angle_deg, _UM_PER_UNIT[sensor.unit])
+
+    return probe(names[0]), probe(names[1])
+
+
+def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
+    sensor = machine.sensor(name)
+    assert isinstance(sensor, Keyphasor)  # noqa: S101 - settings/rotor_checks.py
+    column = _column(machine, sensor)
+    return KeyphasorProbe(name, column, sensor.threshold_v, sensor.hysteresis_v, sensor.edge)
 
 
 def alarm_rules(machine: MachineFile) -> list[LevelRule | DiagnosisRule]:

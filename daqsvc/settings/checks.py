@@ -28,9 +28,8 @@ from daqsvc.settings.layout_checks import (
     check_voltages,
     unique,
 )
-from daqsvc.settings.mode_checks import mode_checks
-from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.rotor_checks import check_alarm_detector, rotor_checks
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
@@ -38,10 +37,8 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.dbc import DbcMessage
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
-    from daqsvc.settings.pipeline import RotorBank
     from daqsvc.settings.problems import KeyPath
 
-_LEAST_PROBE_ANGLE_DEG = 10.0
 _RING_WINDOWS = 2
 _LEAST_WINDOW_SAMPLES = 16
 
@@ -89,13 +86,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
         if draft.pipeline.levels is not None:
             yield _window(draft)
             yield _velocity_band(draft)
-    with suppress(UnusableValueError):
-        if draft.pipeline.rotor_bank is not None:
-            bank = draft.pipeline.rotor_bank
-            yield _rotor(draft)
-            yield _bank_sensors(draft, bank)
-            yield _bank_geometry(draft, bank)
-            yield from mode_checks(draft, bank)
+    yield from rotor_checks(draft)
     with suppress(UnusableValueError):
         for index, alarm in enumerate(draft.alarms):
             at = ("alarms", index)
@@ -104,7 +95,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
                 yield _alarm_sensor(draft, alarm, at)
                 yield _alarm_levels(draft, alarm, at)
             elif isinstance(alarm, DiagnosisAlarm):
-                yield _alarm_detector(draft, alarm, at)
+                yield check_alarm_detector(draft, alarm, at)
     with suppress(UnusableValueError):
         if draft.mqtt is not None:
             yield _transport(draft.mqtt)
@@ -176,77 +167,6 @@ def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
             return
 
 
-def _rotor(draft: MachineFile) -> Iterator[Finding]:
-    if draft.machine.rotor is None:
-        yield Finding(
-            ("pipeline", "rotor_bank"),
-            "the model bank needs the rotor's data",
-            "write a table [machine.rotor], or remove [pipeline.rotor_bank]",
-        )
-
-
-def _bank_sensors(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
-    """The probes and the keyphasor exist, are what they should be, and share a stream."""
-    at: KeyPath = ("pipeline", "rotor_bank")
-    sensors = _named(draft)
-    asked: list[tuple[KeyPath, str, str]] = [
-        ((*at, "probes", 0), bank.probes[0], "proximity"),
-        ((*at, "probes", 1), bank.probes[1], "proximity"),
-        ((*at, "keyphasor"), bank.keyphasor, "keyphasor"),
-    ]
-    for path, name, wanted in asked:
-        if name not in sensors:
-            yield Finding(path, "there is no such sensor", choice(name, sensors))
-        elif sensors[name].type != wanted:
-            suitable = [sensor.name for sensor in draft.sensors if sensor.type == wanted]
-            yield Finding(path, f'must be a sensor of type "{wanted}"', choice(name, suitable))
-    streams = {
-        name: sensors[name].stream
-        for _, name, _ in asked
-        if name in sensors and sensors[name].stream in draft.streams
-    }
-    keyphasor_stream = streams.get(bank.keyphasor)
-    for index, probe in enumerate(bank.probes):
-        if keyphasor_stream is not None and streams.get(probe, keyphasor_stream) != keyphasor_stream:
-            yield Finding(
-                (*at, "probes", index),
-                f'is in stream "{streams[probe]}", but keyphasor "{bank.keyphasor}" is in stream '
-                f'"{keyphasor_stream}"',
-                "take sensors of one stream: their samples must be taken at the same instants",
-            )
-
-
-def _bank_geometry(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
-    """The two probes look at the shaft from directions that tell x from y."""
-    at: KeyPath = ("pipeline", "rotor_bank", "probes")
-    if bank.probes[0] == bank.probes[1]:
-        yield Finding((*at, 1), "is the same probe twice", "name two different probes")
-        return
-    sensors = _named(draft)
-    angles: list[float] = []
-    for index, name in enumerate(bank.probes):
-        probe = sensors.get(name)
-        if probe is None or probe.type != "proximity":
-            return
-        if probe.angle_deg is None:
-            yield Finding(
-                (*at, index),
-                f'sensor "{name}" does not say where it points',
-                f'add angle_deg to the entry "{name}" of sensors, e.g. {90 * index}.0',
-            )
-        else:
-            angles.append(probe.angle_deg)
-    if len(angles) == len(bank.probes):
-        apart = abs(math.degrees(math.asin(math.sin(math.radians(angles[1] - angles[0])))))
-        if apart < _LEAST_PROBE_ANGLE_DEG:
-            yield Finding(
-                at,
-                f"the probes point along one line ({angles[0]:g} and {angles[1]:g} deg): they see one "
-                "direction of the motion only",
-                "correct angle_deg of the sensors, or take probes that are some 90 deg apart",
-            )
-
-
 def _setpoints(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
     setpoints = [level for level in (alarm.alert, alarm.danger) if level is not None]
     if not setpoints:
@@ -296,24 +216,6 @@ def _alarm_levels(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterato
             (*at, "sensor"),
             "nothing measures its level",
             "write a table [pipeline.levels] (it may be empty), or remove the alarm",
-        )
-
-
-def _alarm_detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterator[Finding]:
-    bank = draft.pipeline.rotor_bank
-    if alarm.detector != ROTOR_BANK:
-        yield Finding((*at, "detector"), "there is no such detector", f'write detector = "{ROTOR_BANK}"')
-    elif bank is None:
-        yield Finding(
-            (*at, "detector"),
-            "this detector is not configured",
-            "write a table [pipeline.rotor_bank], or remove the alarm",
-        )
-    elif bank.rule == "paper":
-        yield Finding(
-            (*at, "detector"),
-            'would never raise it: pipeline.rotor_bank.rule = "paper" gives probabilities only',
-            'write rule = "cusum", or remove the alarm',
         )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.alarms import LevelAlarm
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.layout_checks import bus_share, frame_facts
+from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from daqsvc.settings.buses import Stream
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
     from daqsvc.settings.pipeline import Mode, RotorBank
+    from daqsvc.settings.rotor import RotorSynchronous
 
 COLUMNS = 100
 _INDENT = "  "
@@ -166,6 +168,33 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
             text += f"unbalance and sag from the first {bank.calibrate_revolutions} revolutions; "
         text += f"modes {', '.join(map(_mode, bank.modes))}"
         yield "rotor-bank", text
+    if pipeline.rotor_synchronous is not None:
+        yield ROTOR_SYNCHRONOUS, _synchronous(machine, pipeline.rotor_synchronous)
+
+
+def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
+    *others, last = synchronous.sensors
+    angle = {
+        "keyphasor": "angle from the keyphasor",
+        "fixed": f"angle from {machine.machine.speed_rpm:g} rpm, taken as exact",
+        "orbit": f"angle from the orbit's 1X around {machine.machine.speed_rpm:g} rpm",
+    }
+    healthy = (
+        f"the first {synchronous.calibrate_revolutions} revolutions after every start are the healthy state"
+        if synchronous.calibration is None
+        else f"healthy state in {synchronous.calibration}"
+    )
+    parts = [
+        f"{', '.join(others)} and {last}",
+        angle[synchronous.reference],
+        healthy,
+        f"at most {synchronous.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions",
+        f"natural frequency within {synchronous.natural_frequency_tolerance_percent:g} %",
+        f"damping within {synchronous.damping_tolerance_percent:g} %",
+    ]
+    if machine.ac_coupled:
+        parts.append("no mean position from AC-coupled probes, so no static load is seen")
+    return "; ".join(parts)
 
 
 def _thresholds(bank: RotorBank) -> str:

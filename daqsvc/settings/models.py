@@ -26,6 +26,7 @@ from daqsvc.settings.buses import (
     Stream,
 )
 from daqsvc.settings.pipeline import ROTOR_BANK, Levels, Mode, Pipeline, RotorBank
+from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS, RotorSynchronous
 from daqsvc.settings.section import AngleDeg, DampingRatio, Name, Positive, Section
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, Sensor, VelocitySensor
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ROTOR_BANK",
+    "ROTOR_SYNCHRONOUS",
     "Accelerometer",
     "Alarm",
     "Bus",
@@ -62,6 +64,7 @@ __all__ = [
     "ProximityProbe",
     "Rotor",
     "RotorBank",
+    "RotorSynchronous",
     "Sensor",
     "Store",
     "Stream",
@@ -72,7 +75,7 @@ _DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Rotor(Section):
-    """The Laval rotor behind the model bank."""
+    """The Laval rotor behind its detectors."""
 
     natural_frequency_hz: Annotated[
         Positive, Field(description="undamped natural frequency, omega_s / 2 pi", examples=[10.0])
@@ -103,7 +106,7 @@ class Machine(Section):
     name: Annotated[Name, Field(description="name of the machine", examples=["laval-rig"])]
     description: str = Field(default="", description="what a person should know about it")
     speed_rpm: Annotated[Positive, Field(le=1_000_000, description="nominal speed", examples=[600.0])]
-    rotor: Rotor | None = Field(default=None, description="needed by pipeline.rotor_bank")
+    rotor: Rotor | None = Field(default=None, description="needed by the rotor's detectors")
 
 
 def _split_url(url: str) -> SplitResult:
@@ -255,13 +258,17 @@ class MachineFile(Section):
     @property
     def detectors(self) -> tuple[str, ...]:
         """Names of the detectors that an alarm can follow."""
-        return () if self.pipeline.rotor_bank is None else (ROTOR_BANK,)
+        configured = {
+            ROTOR_BANK: self.pipeline.rotor_bank,
+            ROTOR_SYNCHRONOUS: self.pipeline.rotor_synchronous,
+        }
+        return tuple(name for name, section in configured.items() if section is not None)
 
     @property
     def ac_coupled(self) -> bool:
-        """Whether a probe of the rotor bank shows motion only, so that the bank sees no static position."""
-        bank = self.pipeline.rotor_bank
-        probes = () if bank is None else bank.probes
+        """Whether a probe of the rotor shows motion only, so that no detector sees its static position."""
+        detectors = (self.pipeline.rotor_bank, self.pipeline.rotor_synchronous)
+        probes = [name for detector in detectors if detector is not None for name in detector.probes]
         named = (sensor for sensor in self.sensors if sensor.name in probes)
         return any(sensor.ac_coupled for sensor in named if isinstance(sensor, ProximityProbe))
 

@@ -1,4 +1,4 @@
-"""What is computed from the samples: level detectors and the rotor's model bank."""
+"""What is computed from the samples: level detectors, the rotor's model bank, the calibrated rotor."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.rotor import RotorSynchronous  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import DampingRatio, Name, NotNegative, Positive, Section
 
 Severity = Literal["normal", "alert", "danger"]
@@ -111,3 +112,6 @@ class Pipeline(Section):
     )
     levels: Levels | None = Field(default=None, description="level detectors")
     rotor_bank: RotorBank | None = Field(default=None, description="the rotor's model bank")
+    rotor_synchronous: RotorSynchronous | None = Field(
+        default=None, description="the rotor against its own healthy state"
+    )
