@@ -21,6 +21,16 @@ SURE = 0.999
 UNDETERMINED = "undetermined"
 """The decision of a detector that cannot say yet."""
 
+DEPARTURE = "departure"
+"""The decision of a detector that sees a change, but not yet of what."""
+
+_IN_WORDS = {
+    DEPARTURE: "a change, its cause not yet known",
+    "unmodelled": "an unmodelled change",
+    "small_change": "a small change",
+}
+"""Decisions that are no names of a state."""
+
 
 class Finding(NamedTuple):
     """What a rule makes of a diagnosis.
@@ -162,25 +172,41 @@ class _LevelWatch:
 class _DecisionWatch:
     def __init__(self, rule: DiagnosisRule) -> None:
         self._detector = rule.detector
+        self._group: tuple[str, ...] | None = None
 
     def find(self, diagnosis: Diagnosis) -> Finding | None:
         if diagnosis.decision == UNDETERMINED:
             return None
-        return Finding(Level.of(diagnosis.severity), diagnosis.decision, self._sentence(diagnosis))
+        if diagnosis.changed or self._group is None:
+            # A group may flicker with the evidence from statement to statement; only what the detector itself
+            # calls a change makes another finding of it.
+            self._group = diagnosis.group
+        identity = _identity(diagnosis.decision, self._group)
+        return Finding(Level.of(diagnosis.severity), identity, self._sentence(diagnosis))
 
     def hold(self) -> None:
         """The detector itself holds its decision."""
 
     def resume(self, level: Level, cause: Diagnosis) -> str:  # noqa: ARG002  it has no memory of levels
-        return cause.decision if cause.detector == self._detector else ""
+        if cause.detector != self._detector:
+            return ""
+        self._group = cause.group
+        return _identity(cause.decision, cause.group)
 
     @staticmethod
     def _sentence(diagnosis: Diagnosis) -> str:
-        sentence = f"{diagnosis.detector} finds {diagnosis.decision}"
-        probability = diagnosis.probabilities.get(diagnosis.decision)
+        decision = diagnosis.decision
+        sentence = f"{diagnosis.detector} finds {_IN_WORDS.get(decision, decision)}"
+        probability = diagnosis.probabilities.get(decision)
         if probability is not None:
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
-        others = [mode for mode in diagnosis.group if mode != diagnosis.decision]
+        others = [mode for mode in diagnosis.group if mode != decision]
         if others:
-            sentence += f", not told apart from {', '.join(others)}"
+            between = "possible" if decision == DEPARTURE else "not told apart from"
+            sentence += f", {between} {', '.join(others)}"
         return sentence
+
+
+def _identity(decision: str, group: tuple[str, ...]) -> str:
+    """What is found, with what it is not told apart from."""
+    return "|".join([decision, *sorted(set(group) - {decision})])
