@@ -197,8 +197,8 @@ class _DecisionWatch:
     def _sentence(diagnosis: Diagnosis) -> str:
         decision = diagnosis.decision
         sentence = f"{diagnosis.detector} finds {_IN_WORDS.get(decision, decision)}"
-        probability = diagnosis.probabilities.get(decision)
-        if probability is not None:
+        probability = diagnosis.probabilities.get(decision, 0.0)
+        if probability > 0.5:  # a smaller one says less than the words
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         others = [mode for mode in diagnosis.group if mode != decision]
         if others:

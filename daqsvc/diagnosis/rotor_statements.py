@@ -31,7 +31,9 @@ DEPARTURE = "departure"
 _STEADY_S = 1.0
 """While nothing changes a statement is made so often."""
 _LARGE = 1.0
-"""A change larger than this part of the healthy whirl is danger, whatever it is."""
+"""A change larger than this part of the healthy whirl is danger, whatever it is ..."""
+_NO_LONGER_LARGE = 0.8
+"""... until it is smaller than this part."""
 _UNITS = {
     "speed": "rpm",
     "1x.amplitude": "um",
@@ -105,6 +107,7 @@ class Stater:
         }
         self._decision = UNDETERMINED
         self._group: tuple[str, ...] = ()
+        self._large = False
         self._quality: DataQuality = "good"
         self._said_index: int | None = None
 
@@ -135,6 +138,8 @@ class Stater:
         if first_index is None:
             first_index = end_index if self._said_index is None else self._said_index
         self._decision, self._group = decision, group
+        found = None if standing.report is None else standing.report.identification
+        self._large = found is not None and found.severity > (_NO_LONGER_LARGE if self._large else _LARGE)
         self._quality, self._said_index = verdict.quality, end_index
         return self._diagnosis(
             standing, verdict, first_index=min(first_index, end_index), end_index=end_index, t_ns=t_ns,
@@ -165,12 +170,10 @@ class Stater:
             return self._decision, group
         return found.verdict, group
 
-    def _severity(self, standing: Standing) -> Severity:
+    def _severity(self) -> Severity:
         if self._decision in {UNDETERMINED, "normal"}:
             return "normal"
-        found = None if standing.report is None else standing.report.identification
-        large = found is not None and found.severity > _LARGE
-        return "danger" if large or self._decision == "rub" else "alert"
+        return "danger" if self._large or self._decision == "rub" else "alert"
 
     def _diagnosis(
         self,
@@ -194,7 +197,7 @@ class Stater:
             end_index=end_index,
             decision=self._decision,
             changed=changed,
-            severity=self._severity(standing),
+            severity=self._severity(),
             probabilities={} if found is None else {str(k): p for k, p in found.probabilities.items()},
             group=self._group,
             statistics=statistics,
