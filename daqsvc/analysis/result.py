@@ -181,8 +181,9 @@ class RotorAnalysis:
             lines.append(
                 f"healthy: 1X {was.amplitude_um:.4g} um at {_degrees(was.baseline[1]):.0f} degrees, "
                 f"{was.revolutions} revolutions at {abs(was.speed_rpm):.1f} rpm, noise {was.noise_um:.3g} um "
-                f"({was.snr_db:.0f} dB); it {was.describe()}"
+                f"({was.snr_db:.0f} dB)"
             )
+            lines.append(f"the machine {was.describe()}")
         bad = [
             f"{count} {what} samples of {name}"
             for what, counts in (("missing", self.quality.missing), ("infinite", self.quality.infinite))
@@ -223,8 +224,8 @@ class RotorAnalysis:
         level = "".join(f", {_words(key)} {_figure(value)}" for key, value in self.level.items())
         return (
             f"severity {self.identification.severity:.3g} of the healthy whirl{level}; 1X is "
-            f"{abs(now[1]):.4g} um at {_degrees(now[1]):.0f} degrees, the mean position moved by {abs(change[0]):.3g} um, "
-            f"backward 1X by {abs(change[2]):.3g}, 2X by {abs(change[3]):.3g} um"
+            f"{abs(now[1]):.4g} um at {_degrees(now[1]):.0f} degrees, the mean position moved by "
+            f"{abs(change[0]):.3g} um, backward 1X by {abs(change[2]):.3g}, 2X by {abs(change[3]):.3g} um"
         )
 
 

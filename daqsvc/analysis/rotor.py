@@ -18,11 +18,10 @@ from daqsvc.analysis import quality as checks
 from daqsvc.analysis.quality import ClippedError, DataQuality
 from daqsvc.analysis.result import Instant, RotorAnalysis, Step, Trace
 from daqsvc.analysis.setup import RefusedError
+from daqsvc.analysis.speed import LEAST_JUDGED, speed_of, too_short
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
+from daqsvc.diagnosis.probe_checks import Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
-from daqsvc.dsp.marks import EdgeFinder
-from daqsvc.dsp.orbit_speed import estimate_speed
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration import Calibration, compensated
 from daqsvc.rotor.departure import threshold_for
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.setup import Keyphasor, RotorSetup
+    from daqsvc.analysis.setup import RotorSetup
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.identify import Identification
     from daqsvc.rotor.signatures import RotorFault
@@ -42,21 +41,8 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-LEAST_JUDGED = 3
-"""Revolutions that must be left to judge after those that calibrate."""
-
-_FIXED_SPEED_TURN = 0.05
-"""What a wrong speed may turn the angle by during calibration, in revolutions."""
-_SIGNIFICANT = 5.0
-"""Standard deviations from which on a speed differs."""
-_RELEVANT_TURN = 0.001
-"""What it must turn the angle by, to the end of the recording, for a difference to matter."""
 _WINDOW_REVOLUTIONS = 256
 """Revolutions handed to the detector at a time: often enough to see it get on."""
-_HYSTERESIS = 0.2
-"""Of the keyphasor's range from low to high."""
-_LEAST_PULSES = 4
-_OFF_NOMINAL = 0.05
 _SEEN = 128
 """Revolutions that say what a healthy machine looks like at the end."""
 
@@ -75,14 +61,6 @@ class _Watched:
 
     def joined(self) -> SynchronousVectors:
         return SynchronousVectors.joined(self.vectors)
-
-
-@dataclass(frozen=True, slots=True)
-class _Speed:
-    """Speed that the detector starts from, and the keyphasor's threshold and hysteresis if there is one."""
-
-    rpm: float
-    keyphasor: KeyphasorProbe | None = None
 
 
 def analyse(
@@ -141,7 +119,7 @@ def _judge(
     samples[:, :2] = to_um(samples[:, :2], setup.unit)
     checks.refuse_unreadable(tuple(setup.columns), samples)
     checks.refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
-    speed, quality = _speed(recording, setup, samples, quality)
+    speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
     quality = checks.refuse_stuck(quality, setup.probes, samples[:, :2], period)
     ac_coupled = setup.ac_coupled or checks.lacks_mean(samples[:, :2])
@@ -168,88 +146,6 @@ def _judge(
         recording, setup, detector, tuple(watched.reports), watched.joined(), tuple(complaints)
     )
     return reading.verdict(quality)
-
-
-def _speed(
-    recording: Recording, setup: RotorSetup, samples: Floats, quality: DataQuality
-) -> tuple[_Speed, DataQuality]:
-    """Speed to start from; refuses a stated one that the orbit contradicts."""
-    if setup.keyphasor is not None:
-        return _keyphasor_speed(recording, setup, setup.keyphasor, samples[:, 2], quality)
-    assert setup.speed_rpm is not None  # noqa: S101 - see RotorSetup
-    revolutions = len(samples) * abs(setup.speed_rpm) / 60.0 / recording.rate_hz
-    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
-    if revolutions < needed:
-        raise RefusedError(_too_short(revolutions, needed, setup))
-    if setup.follow_orbit:
-        return _Speed(setup.speed_rpm), quality
-    return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
-
-
-def _too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:
-    made_of = (
-        f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
-        if setup.calibration is None
-        else "to judge"
-    )
-    return (
-        f"the recording is too short: {revolutions:.1f} revolutions, at least {needed} are needed "
-        f"({made_of}); give a longer one, or fewer --calibrate-revs"
-    )
-
-
-def _fixed_speed(
-    recording: Recording, setup: RotorSetup, stated_rpm: float, samples: Floats, quality: DataQuality
-) -> tuple[_Speed, DataQuality]:
-    """The stated speed if the orbit of the first revolutions has it, made exact where that is significant."""
-    calibrating = setup.rules.calibrate_revolutions
-    begin = math.ceil(calibrating * 60.0 * recording.rate_hz / abs(stated_rpm))
-    try:
-        found = estimate_speed(samples[:begin, :2], recording.rate_hz, stated_rpm)
-    except ValueError as error:
-        raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
-    off = found.speed_rpm / stated_rpm - 1.0
-    significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
-    if significant and abs(off) * calibrating > _FIXED_SPEED_TURN:
-        raise RefusedError(
-            f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
-            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, or use a keyphasor"
-        )
-    revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
-    if significant and abs(off) * revolutions > _RELEVANT_TURN:
-        quality = quality.with_problem(
-            f"the speed is {abs(found.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
-            "the former is used"
-        )
-        return _Speed(found.speed_rpm), quality
-    return _Speed(stated_rpm), quality
-
-
-def _keyphasor_speed(
-    recording: Recording, setup: RotorSetup, keyphasor: Keyphasor, marker: Floats, quality: DataQuality
-) -> tuple[_Speed, DataQuality]:
-    low, high = (float(value) for value in np.nanpercentile(marker, [0.1, 99.9]))
-    threshold = (low + high) / 2.0 if keyphasor.threshold is None else keyphasor.threshold
-    hysteresis = _HYSTERESIS * (high - low)
-    edges = EdgeFinder(threshold, hysteresis, keyphasor.edge).find(marker)
-    if len(edges) < _LEAST_PULSES:
-        raise RefusedError(
-            f"keyphasor {keyphasor.name}: {len(edges)} pulses cross {threshold:.4g}; the channel lies "
-            f"between {low:.4g} and {high:.4g}: correct --keyphasor-threshold, or name another channel"
-        )
-    places = np.array([sample + fraction for sample, fraction in edges])
-    found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
-    rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
-    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
-    if len(edges) - 1 < needed:
-        raise RefusedError(_too_short(len(edges) - 1, needed, setup))
-    if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:
-        quality = quality.with_problem(
-            f"keyphasor {keyphasor.name} says {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
-            "the keyphasor decides"
-        )
-    probe = KeyphasorProbe(keyphasor.name, 2, threshold, hysteresis, keyphasor.edge)
-    return _Speed(rpm, probe), quality
 
 
 def _feed(
@@ -301,7 +197,7 @@ class _Reading:
         calibration = watch.calibration
         calibrated = 0 if self.setup.calibration is not None else self.setup.rules.calibrate_revolutions
         if calibration is None:
-            raise RefusedError(_too_short(len(self.vectors), calibrated + LEAST_JUDGED, self.setup))
+            raise RefusedError(too_short(len(self.vectors), calibrated + LEAST_JUDGED, self.setup))
         last = self._last_look()
         steps = history(self.reports, last)
         departed = self._departed()

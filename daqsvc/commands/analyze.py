@@ -48,8 +48,8 @@ class AnalyzeCommand:
     description = (
         "Run the detectors of the service over recordings (.npz, .mat, .csv[.gz], .wav, .parquet), faster "
         "than real time, and say which fault the rotor has, what else it might be, since when, and how large "
-        "it is. Either the first file is a machine file (.toml), or options name probes, speed and rotor; the "
-        "first revolutions of a recording are then the healthy machine. Verdicts: normal, unbalance, "
+        "it is. Either the first file is a machine file (.toml), or options name probes, speed and rotor; "
+        "the first revolutions of a recording are then the healthy machine. Verdicts: normal, unbalance, "
         "damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none of these), "
         "small_change (too small for a name)."
     )

@@ -1,0 +1,142 @@
+"""The speed that a recording is cut into revolutions by, and whether the recording agrees with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.analysis.setup import RefusedError
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe
+from daqsvc.dsp.marks import EdgeFinder
+from daqsvc.dsp.orbit_speed import estimate_speed
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.analysis.quality import DataQuality
+    from daqsvc.analysis.setup import Keyphasor, RotorSetup
+    from daqsvc.recording.recording import Recording
+
+    Floats = NDArray[np.float64]
+
+LEAST_JUDGED = 3
+"""Revolutions that must be left to judge after those that calibrate."""
+
+_FIXED_SPEED_TURN = 0.05
+"""What a wrong speed may turn the angle by during calibration, in revolutions."""
+_SIGNIFICANT = 5.0
+"""Standard deviations from which on a speed differs."""
+_RELEVANT_TURN = 0.001
+"""What it must turn the angle by, to the end of the recording, for a difference to matter."""
+_HYSTERESIS = 0.2
+"""Of the keyphasor's range from low to high."""
+_LEAST_PULSES = 4
+_OFF_NOMINAL = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """Speed that the detector starts from, and the keyphasor's threshold and hysteresis if there is one."""
+
+    rpm: float
+    keyphasor: KeyphasorProbe | None = None
+
+
+def speed_of(
+    recording: Recording, setup: RotorSetup, samples: Floats, quality: DataQuality
+) -> tuple[Speed, DataQuality]:
+    """Speed to start from.
+
+    Args:
+        recording: the recording.
+        setup: what is known.
+        samples: float64 ``[n, 2 or 3]``, probes in um and keyphasor, NaN where missing.
+        quality: what is known against the samples so far.
+
+    Returns:
+        The speed, and the quality with what was found beside it.
+
+    Raises:
+        RefusedError: the recording is too short, the orbit contradicts a stated speed, or the keyphasor has
+            no pulses.
+    """
+    if setup.keyphasor is not None:
+        return _keyphasor_speed(recording, setup, setup.keyphasor, samples[:, 2], quality)
+    assert setup.speed_rpm is not None  # noqa: S101 - see RotorSetup
+    revolutions = len(samples) * abs(setup.speed_rpm) / 60.0 / recording.rate_hz
+    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    if revolutions < needed:
+        raise RefusedError(too_short(revolutions, needed, setup))
+    if setup.follow_orbit:
+        return Speed(setup.speed_rpm), quality
+    return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
+
+
+def too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:
+    """Why a recording of so many revolutions is refused."""
+    made_of = (
+        f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
+        if setup.calibration is None
+        else "to judge"
+    )
+    return (
+        f"the recording is too short: {revolutions:.1f} revolutions, at least {needed} are needed "
+        f"({made_of}); give a longer one, or fewer --calibrate-revs"
+    )
+
+
+def _fixed_speed(
+    recording: Recording, setup: RotorSetup, stated_rpm: float, samples: Floats, quality: DataQuality
+) -> tuple[Speed, DataQuality]:
+    """The stated speed if the orbit of the first revolutions has it, made exact where that is significant."""
+    calibrating = setup.rules.calibrate_revolutions
+    begin = math.ceil(calibrating * 60.0 * recording.rate_hz / abs(stated_rpm))
+    try:
+        found = estimate_speed(samples[:begin, :2], recording.rate_hz, stated_rpm)
+    except ValueError as error:
+        raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
+    off = found.speed_rpm / stated_rpm - 1.0
+    significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
+    if significant and abs(off) * calibrating > _FIXED_SPEED_TURN:
+        raise RefusedError(
+            f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
+            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, or use a keyphasor"
+        )
+    revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
+    if significant and abs(off) * revolutions > _RELEVANT_TURN:
+        quality = quality.with_problem(
+            f"the speed is {abs(found.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
+            "the former is used"
+        )
+        return Speed(found.speed_rpm), quality
+    return Speed(stated_rpm), quality
+
+
+def _keyphasor_speed(
+    recording: Recording, setup: RotorSetup, keyphasor: Keyphasor, marker: Floats, quality: DataQuality
+) -> tuple[Speed, DataQuality]:
+    low, high = (float(value) for value in np.nanpercentile(marker, [0.1, 99.9]))
+    threshold = (low + high) / 2.0 if keyphasor.threshold is None else keyphasor.threshold
+    hysteresis = _HYSTERESIS * (high - low)
+    edges = EdgeFinder(threshold, hysteresis, keyphasor.edge).find(marker)
+    if len(edges) < _LEAST_PULSES:
+        raise RefusedError(
+            f"keyphasor {keyphasor.name}: {len(edges)} pulses cross {threshold:.4g}; the channel lies "
+            f"between {low:.4g} and {high:.4g}: correct --keyphasor-threshold, or name another channel"
+        )
+    places = np.array([sample + fraction for sample, fraction in edges])
+    found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
+    rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
+    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    if len(edges) - 1 < needed:
+        raise RefusedError(too_short(len(edges) - 1, needed, setup))
+    if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:
+        quality = quality.with_problem(
+            f"keyphasor {keyphasor.name} says {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
+            "the keyphasor decides"
+        )
+    probe = KeyphasorProbe(keyphasor.name, 2, threshold, hysteresis, keyphasor.edge)
+    return Speed(rpm, probe), quality
