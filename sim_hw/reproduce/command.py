@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import sys
 import tempfile
@@ -12,15 +13,17 @@ from typing import TYPE_CHECKING
 from sim_hw.demo import arguments as arguments_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
-    from sim_hw.reproduce.results import Findings
+    from sim_hw.reproduce.results import Findings, Row
 
 EXIT_FAILED = 1
 SEED = 1
 SNR_DB = 0.0
 MOST_DB = 40.0
 DPI = 110
+_METADATA: Mapping[str, str | None] = {"Software": None}
+"""The same run gives the same bytes, whatever the version of matplotlib calls itself."""
 
 
 class ReproduceCommand:
@@ -61,22 +64,20 @@ class ReproduceCommand:
         from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
 
         start_logging(verbose=False)
-        try:
-            import matplotlib.figure  # noqa: F401, PLC0415 - is it there, before minutes are spent?
-        except ModuleNotFoundError as error:
-            return _fail(f"the figures need {error.name}; install it with: pip install 'daqsvc[plot]'")
+        if importlib.util.find_spec("matplotlib") is None:
+            return _fail("the figures need matplotlib; install it with: pip install 'daqsvc[plot]'")
         out: Path = arguments.out
         if problem := _cannot_write_into(out):
             return _fail(problem)
         prepare_kernel_cache()
         try:
-            _reproduce(out, arguments.seed, arguments.snr_db, as_json=arguments.json)
-        except BrokenPipeError:
-            raise  # of our output: the command line knows what to do
+            rows = _reproduce(out, arguments.seed, arguments.snr_db)
         except OSError as error:
             return _fail(
                 f"{error.filename or out} cannot be written: {error.strerror}; free it, or name another --out"
             )
+        _print(rows, as_json=arguments.json)
+        _note(f"figures and tables are in {out}")
         return 0
 
 
@@ -106,11 +107,12 @@ def _cannot_write_into(out: Path) -> str | None:
     return None
 
 
-def _reproduce(out: Path, seed: int, snr_db: float, *, as_json: bool) -> None:
+def _reproduce(out: Path, seed: int, snr_db: float) -> list[Row]:
+    """Run every study; write figures and tables."""
     from sim_hw.reproduce import results  # noqa: PLC0415
     from sim_hw.reproduce.registry import STUDIES  # noqa: PLC0415
 
-    rows: list[results.Row] = []
+    rows: list[Row] = []
     for study in STUDIES:
         _note(f"{study.title} ...")
         findings = study.run(seed, snr_db)
@@ -122,12 +124,7 @@ def _reproduce(out: Path, seed: int, snr_db: float, *, as_json: bool) -> None:
     )
     results.write_markdown(out / "results.md", rows, heading=heading)
     results.write_csv(out / "results.csv", rows)
-    if as_json:
-        for row in rows:
-            _print(json.dumps(row.as_json()))
-    else:
-        _print(results.as_text(rows))
-    _note(f"figures and tables are in {out}")
+    return rows
 
 
 def _draw(out: Path, findings: Findings) -> None:
@@ -140,14 +137,14 @@ def _draw(out: Path, findings: Findings) -> None:
         figure.savefig(out / f"{name}.png", dpi=DPI, metadata=_METADATA)
 
 
-_METADATA: Mapping[str, str | None] = {"Software": None}
-
-
 def _note(message: str) -> None:
     """What goes on, for a person who watches."""
     if sys.stderr.isatty():
         print(f"daqsvc reproduce: {message}", file=sys.stderr)  # noqa: T201
 
 
-def _print(text: str) -> None:
-    print(text)  # noqa: T201 - this is the output
+def _print(rows: Sequence[Row], *, as_json: bool) -> None:
+    from sim_hw.reproduce.results import as_text  # noqa: PLC0415
+
+    for line in [json.dumps(row.as_json()) for row in rows] if as_json else [as_text(rows)]:
+        print(line)  # noqa: T201 - this is the output

@@ -99,7 +99,7 @@ def as_text(rows: Iterable[Row], width: int | None = None) -> str:
     """
     width = width or shutil.get_terminal_size((110, 24)).columns
     short = (9, 6)
-    free = max(60, width - sum(short) - 2 * (len(HEADINGS) - 1))
+    free = max(30, width - sum(short) - 2 * (len(HEADINGS) - 1))
     long = [int(free * share) for share in _SHARES]
     widths = [short[0], long[0], long[1], short[1], long[2]]
     lines = [_line(HEADINGS, widths), "  ".join("-" * w for w in widths)]

@@ -54,7 +54,7 @@ def _declarations(experiment: Experiment) -> Iterable[Row]:
         figure="6, 7",
         paper=f"a mode is detected when its probability exceeds {THRESHOLD:g}",
         obtained="declarations that name the true mode: "
-        + ", ".join(f"{spoken(mode)} {share:.0%}" for mode, share in shares.items()),
+        + ", ".join(f"{spoken(mode)} {100 * share:.0f} %" for mode, share in shares.items()),
         agrees=min(shares.values()) > THRESHOLD,
         remark=f"a probability of {THRESHOLD:g} is an error of up to one in ten by itself, and the "
         "observers' models are not exact.",
@@ -117,7 +117,7 @@ def _delays(experiment: Experiment) -> Iterable[Row]:
                 f"{in_decibels(snr_db)}: " + " / ".join(f"{delay:.2f}" for delay in medians[snr_db])
                 for snr_db in SNR_DB
             )
-            + f"; found in {min(reached):.1%} of the changes",
+            + f"; found in {100 * min(reached):.1f} % of the changes",
             agrees=min(reached) > 0.99 if rule == "paper" else None,
             remark=f"{draws} draws of the sensor noise each, relative to the AC power of a probe in mode N."
             + (" Soon, but see the wrong ones." if rule == "paper" else ""),

@@ -206,4 +206,6 @@ def _declarations(axes: Axes, experiment: Experiment, change: int) -> None:
             at = 2.0 * math.pi * (experiment.begins_rev[change] + delays[change])
             label = f"{spoken(MODES[change])} declared by {name}: {delays[change]:.2f} rev"
             axes.plot(at, 0.97, marker, color=PROCESS, markersize=7, label=label)
+        else:
+            axes.plot([], [], " ", label=f"{spoken(MODES[change])} not declared by {name}")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
