@@ -297,8 +297,8 @@ def _convergence(experiment: Experiment) -> Iterable[Row]:
         + f"from {found.before:.2f} rms in F1 L2 to {found.after:.2f} rms",
         agrees=abs(found.begins - CONVERGENCE) <= _CONVERGENCE_TOLERANCE
         and found.after < _CONVERGING * found.before,
-        remark=f"begins: RMS over a revolution below {100 * _CONVERGING:.0f} % of that in F1 L2, for the first "
-        "time. The paper gives no gain; this one trusts its model.",
+        remark=f"begins: RMS over a revolution below {100 * _CONVERGING:.0f} % of that in F1 L2, for "
+        "the first time. The paper gives no gain; this one trusts its model.",
         values={
             **({"begins_s": found.begins} if converges else {}),
             "error_before": found.before,
