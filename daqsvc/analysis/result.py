@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from daqsvc.analysis.quality import DataQuality
 from daqsvc.rotor.signatures import RotorFault
 from daqsvc.rotor.synchronous import HARMONICS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.analysis.quality import DataQuality
     from daqsvc.rotor.calibration import Calibration
     from daqsvc.rotor.identify import Identification
     from daqsvc.rotor.synchronous import SynchronousVectors
@@ -125,13 +125,18 @@ class RotorAnalysis:
     onset: Instant | None = None
     departure: Instant | None = None
     declaration: Instant | None = None
-    false_alarms_per_1000_rev: float
-    threshold_nats: float
+    false_alarms_per_1000_rev: float | None = None
+    threshold_nats: float | None = None
     calibration: Calibration | None = None
     speed_rpm: float | None = None
     revolutions: int = 0
     history: tuple[Step, ...] = ()
     trace: Trace | None = None
+
+    @classmethod
+    def not_judged(cls, recording: str, why: str, quality: DataQuality | None = None) -> RotorAnalysis:
+        """The verdict about a recording that cannot be judged."""
+        return cls(recording=recording, quality=quality or DataQuality(0), refused=why)
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite, lengths in um."""
@@ -200,6 +205,8 @@ class RotorAnalysis:
     def _headline(self) -> str:
         if self.refused is not None:
             return f"not judged: {self.refused}"
+        if self.verdict is None and self.departure is None:
+            return "no detector of a rotor fault in the machine file"
         if self.verdict is None:
             return "changed, but no revolution after the change can be judged"
         said = " or ".join(_words(name) for name in self.group)

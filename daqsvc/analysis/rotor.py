@@ -133,7 +133,10 @@ def _judge(
         stream=str(recording.source),
         rate_hz=recording.rate_hz,
         speed_rpm=speed.rpm,
-        probes=(Probe(setup.probes[0], 0, 0.0), Probe(setup.probes[1], 1, 90.0)),
+        probes=(
+            Probe(setup.probes[0], 0, setup.probe_angles_deg[0]),
+            Probe(setup.probes[1], 1, setup.probe_angles_deg[1]),
+        ),
         reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
         rotor=setup.rotor,
         rules=setup.rules,

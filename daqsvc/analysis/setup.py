@@ -31,11 +31,14 @@ class Keyphasor:
         threshold: level that marks the edge, in the unit of the channel; None: half way between the lowest
             and the highest value.
         edge: the edge that marks angle zero.
+        hysteresis: how far the signal must return before there can be another edge; None: a fifth of its
+            range.
     """
 
     name: str
     threshold: float | None = None
     edge: Edge = "rising"
+    hysteresis: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,8 +46,9 @@ class RotorSetup:
     """What `analyse` needs to know.
 
     Attributes:
-        probes: names of the two channels, the second one 90 degrees from the first against the clock.
+        probes: names of the two channels.
         rotor: what is known about the rotor.
+        probe_angles_deg: where they point, from +x against the clock.
         speed_rpm: shaft speed, negative if the shaft turns clockwise; may be None with a keyphasor.
         unit: unit of the probes' samples.
         keyphasor: the keyphasor, if there is one.
@@ -62,6 +66,7 @@ class RotorSetup:
     probes: tuple[str, str]
     rotor: LavalRotor
     speed_rpm: float | None
+    probe_angles_deg: tuple[float, float] = (0.0, 90.0)
     unit: LengthUnit = "um"
     keyphasor: Keyphasor | None = None
     follow_orbit: bool = False

@@ -120,7 +120,7 @@ def _keyphasor_speed(
 ) -> tuple[Speed, DataQuality]:
     low, high = (float(value) for value in np.nanpercentile(marker, [0.1, 99.9]))
     threshold = (low + high) / 2.0 if keyphasor.threshold is None else keyphasor.threshold
-    hysteresis = _HYSTERESIS * (high - low)
+    hysteresis = _HYSTERESIS * (high - low) if keyphasor.hysteresis is None else keyphasor.hysteresis
     edges = EdgeFinder(threshold, hysteresis, keyphasor.edge).find(marker)
     if len(edges) < _LEAST_PULSES:
         raise RefusedError(

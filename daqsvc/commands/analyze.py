@@ -123,7 +123,7 @@ class AnalyzeCommand:
                 probes=arguments.probes,
                 rotor=rotor,
                 speed_rpm=speed.rpm,
-                unit=arguments.unit,
+                unit=arguments.unit or "um",
                 keyphasor=None if keyphasor is None else Keyphasor(keyphasor, arguments.keyphasor_threshold),
                 follow_orbit=speed.orbit or arguments.follow_orbit,
                 rules=rules,
@@ -143,13 +143,18 @@ class AnalyzeCommand:
         self._prepare_kernel_cache()
         from daqsvc.analysis.machine import MachineAnalyst  # noqa: PLC0415
 
-        return MachineAnalyst(
-            machine,
-            channels=arguments.map,
-            rate_hz=arguments.fs,
-            unit=arguments.unit,
-            calibration=arguments.calibration,
-        )
+        try:
+            analyst = MachineAnalyst(
+                machine=machine,
+                channels=arguments.map,
+                rate_hz=arguments.fs,
+                unit=arguments.unit,
+                calibration=_calibration(arguments.calibration),
+            )
+            analyst.check()
+        except (OSError, ValueError) as error:
+            self._parser.error(str(error))
+        return analyst
 
 
 def _outcomes(

@@ -129,7 +129,9 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
         help="which variable of the recordings is which channel or sensor (default: the one of its name)",
     )
     both.add_argument(
-        "--unit", choices=LENGTH_UNITS, default="um", help="unit of the probes' samples (default: um)"
+        "--unit",
+        choices=LENGTH_UNITS,
+        help="unit of the probes' samples (default: um, or the machine file's)",
     )
     both.add_argument(
         "--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it"

@@ -1,0 +1,219 @@
+"""Recordings of a machine that has a machine file: every detector that watches it live judges them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from daqsvc import assembly
+from daqsvc.analysis.bank import bank_analysis
+from daqsvc.analysis.many import Outcome
+from daqsvc.analysis.quality import count_bad
+from daqsvc.analysis.result import RotorAnalysis
+from daqsvc.analysis.rotor import analyse
+from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
+from daqsvc.analysis.statements import Statements, listen
+from daqsvc.recording.channels import UM_PER_UNIT
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import list_channels, load_recording
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.watch import WatchRules
+from daqsvc.settings import load_machine_file, models
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from daqsvc.recording.channels import LengthUnit
+    from daqsvc.recording.recording import Recording
+    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.settings import MachineFile
+
+    Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineAnalyst:
+    """Judges recordings of the machine of a machine file.
+
+    A sensor's samples are the variable that ``channels`` says, else the one with the sensor's name, else the
+    one with its channel's name. Detectors whose sensors the recording lacks are left out. The recording's
+    sampling rate replaces that of the streams.
+
+    Attributes:
+        machine: path of the machine file.
+        channels: which variable of a recording is which sensor or channel.
+        rate_hz: sampling rate; None: what the recording says.
+        unit: unit of the proximity probes in the recording; None: those of the sensors.
+        calibration: the healthy machine, in place of what the machine file says.
+    """
+
+    machine: str
+    channels: Mapping[str, str] = field(default_factory=dict)
+    rate_hz: float | None = None
+    unit: LengthUnit | None = None
+    calibration: Calibration | None = None
+
+    def check(self) -> None:
+        """See whether the map fits the machine.
+
+        Raises:
+            ValueError: it names what is no sensor or channel.
+            MachineFileError: the machine file cannot be used.
+        """
+        machine = load_machine_file(Path(self.machine))
+        known = {name for sensor in machine.sensors for name in (sensor.name, sensor.channel)}
+        if unknown := [name for name in self.channels if name not in known]:
+            raise ValueError(
+                f"--map names {unknown[0]!r}, which is no sensor of {self.machine}; there are "
+                f"{', '.join(sensor.name for sensor in machine.sensors)}"
+            )
+
+    def judge(
+        self, recording: str, figures: str | None, progress: Callable[[int, int], None] | None = None
+    ) -> Outcome:
+        """See `daqsvc.analysis.many.Analyst.judge`."""
+        machine = load_machine_file(Path(self.machine))
+        try:
+            columns = self._columns(machine, recording)
+            loaded = load_recording(recording, columns, self.rate_hz)
+        except (RecordingError, RefusedError) as error:
+            return _outcome(RotorAnalysis.not_judged(recording, str(error)), ())
+        machine = _as_recorded(machine, loaded)
+        analysis: RotorAnalysis | None = None
+        if machine.pipeline.rotor_synchronous is not None:
+            setup = self._setup(machine, machine.pipeline.rotor_synchronous)
+            analysis = analyse(loaded, setup, progress)
+            if figures is not None and analysis.trace is not None:
+                from daqsvc.analysis.plots import draw  # noqa: PLC0415 - brings matplotlib
+
+                draw(loaded, setup, analysis, figures)
+        statements = self._statements(machine, loaded)
+        bank = statements.get(models.ROTOR_BANK)
+        if bank is not None:
+            if figures is not None:
+                from daqsvc.analysis.bank_plots import draw_bank  # noqa: PLC0415 - brings matplotlib
+
+                draw_bank(loaded, bank, f"{figures}-bank")
+            if analysis is None:
+                analysis = bank_analysis(loaded, bank)
+        if analysis is None:
+            analysis = RotorAnalysis(recording=recording, quality=count_bad(loaded.names, loaded.samples))
+        return _outcome(analysis, tuple(statements.values()))
+
+    def _columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
+        """The variable of each sensor that the recording has."""
+        there = list_channels(recording)
+        found = {}
+        for sensor in machine.sensors:
+            mapped = self.channels.get(sensor.name, self.channels.get(sensor.channel))
+            if mapped is not None:
+                found[sensor.name] = mapped
+            elif sensor.name in there:
+                found[sensor.name] = sensor.name
+            elif sensor.channel in there:
+                found[sensor.name] = sensor.channel
+        synchronous, bank = machine.pipeline.rotor_synchronous, machine.pipeline.rotor_bank
+        needed = () if synchronous is None else synchronous.sensors
+        if synchronous is None and bank is not None:
+            needed = (*bank.probes, bank.keyphasor)
+        missing = [name for name in needed if name not in found]
+        if missing or not found:
+            missing = missing or [sensor.name for sensor in machine.sensors]
+            raise RefusedError(
+                f"{recording} has no channel for {', '.join(missing)} of {self.machine}; name its variable, "
+                f"e.g. --map {missing[0]}=VARIABLE. It holds {', '.join(there) or 'no channel'}"
+            )
+        return found
+
+    def _setup(self, machine: MachineFile, given: models.RotorSynchronous) -> RotorSetup:
+        """The calibrated rotor of the machine file, as `analyse` wants it."""
+        rotor = machine.machine.rotor
+        assert rotor is not None  # noqa: S101 - the settings check it
+        x, y = (cast("models.ProximityProbe", machine.sensor(name)) for name in given.probes)
+        keyphasor = None
+        if given.reference == "keyphasor" and given.keyphasor is not None:
+            sensor = cast("models.Keyphasor", machine.sensor(given.keyphasor))
+            keyphasor = Keyphasor(sensor.name, sensor.threshold_v, sensor.edge, sensor.hysteresis_v)
+        return RotorSetup(
+            probes=(x.name, y.name),
+            probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),
+            rotor=LavalRotor(
+                natural_frequency_hz=rotor.natural_frequency_hz,
+                damping_ratio=rotor.damping_ratio,
+                natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
+                damping_tolerance=given.damping_tolerance_percent / 100.0,
+                clearance_um=rotor.clearance_um,
+                static_sag_um=rotor.static_sag_um,
+            ),
+            speed_rpm=machine.machine.speed_rpm,
+            unit=self.unit or x.unit,
+            keyphasor=keyphasor,
+            follow_orbit=given.reference == "orbit",
+            rules=WatchRules(
+                calibrate_revolutions=given.calibrate_revolutions,
+                false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
+                probe_drift_um=given.probe_drift_um,
+                retry=False,
+            ),
+            calibration=self.calibration,
+            ac_coupled=machine.ac_coupled,
+        )
+
+    def _statements(self, machine: MachineFile, recording: Recording) -> dict[str, Statements]:
+        """What the other detectors say, by name."""
+        pipeline = machine.pipeline.model_copy(update={"rotor_synchronous": None})
+        others = machine.model_copy(update={"pipeline": pipeline})
+        streams = {name: self._stream(machine, name, recording) for name in machine.streams}
+        return {
+            detector.name: Statements(
+                detector.name,
+                tuple(listen(detector, streams[detector.stream], recording.rate_hz)),
+                recording.rate_hz,
+                getattr(detector, "faults", {}),
+            )
+            for detector in assembly.detectors(others)
+        }
+
+    def _stream(self, machine: MachineFile, stream: str, recording: Recording) -> Floats:
+        """The recording in columns and units of a stream, float64 ``[n, channels]``; NaN where missing."""
+        names = machine.streams[stream].layout.channel_names
+        samples = np.full((len(recording.samples), len(names)), np.nan)
+        for sensor in machine.sensors:
+            if sensor.stream == stream:
+                column = recording.samples[:, recording.names.index(sensor.name)]
+                if isinstance(sensor, models.ProximityProbe) and self.unit is not None:
+                    column = column * UM_PER_UNIT[self.unit] / UM_PER_UNIT[sensor.unit]
+                samples[:, names.index(sensor.channel)] = column
+        return np.where(np.isfinite(samples), samples, np.nan)
+
+
+def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
+    """The machine with the sensors of a recording only, the detectors that they suffice for, and its rate."""
+    sensors = tuple(sensor for sensor in machine.sensors if sensor.name in recording.names)
+    bank = machine.pipeline.rotor_bank
+    update: dict[str, Any] = {}
+    if bank is not None and not {*bank.probes, bank.keyphasor} <= set(recording.names):
+        update["rotor_bank"] = None
+    streams = {
+        name: stream.model_copy(update={"rate_hz": recording.rate_hz})
+        for name, stream in machine.streams.items()
+    }
+    return machine.model_copy(
+        update={
+            "sensors": sensors,
+            "streams": streams,
+            "pipeline": machine.pipeline.model_copy(update=update),
+        }
+    )
+
+
+def _outcome(analysis: RotorAnalysis, statements: tuple[Statements, ...]) -> Outcome:
+    found = analysis.as_json()
+    found["detectors"] = {said.detector: said.as_json() for said in statements}
+    text = "\n  ".join([analysis.describe(), *(said.describe() for said in statements)])
+    return Outcome(found, text, analysis.refused is not None)
