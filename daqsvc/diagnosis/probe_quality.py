@@ -31,9 +31,11 @@ _MISSING = 0.25
 """Part of a revolution's samples that may be missing."""
 _DEAD = 0.05
 """A probe that moves less than this part of what it must is dead."""
-_BELIEVED = 0.1
-"""A motion is known well enough to call a probe dead if its uncertainty is below this part of the other's."""
 _SURE = 3.0
+_BELIEVED = 0.1
+"""A probe is called blind if its motion is known to this part of the other's ..."""
+_CLEAR = 4.0
+"""... or if it saw so many times the uncertainty when it was calibrated."""
 
 
 class RevolutionJudge:
@@ -64,8 +66,8 @@ class RevolutionJudge:
             worst = int(np.isfinite(samples).sum(axis=0).argmin())
             return Verdict(
                 "missing",
-                f"{self._probes[worst].name}: {missing} of the {n} samples of a revolution are missing; "
-                "check the bus and the device",
+                f"{self._probes[worst].name}: {'all' if missing == n else f'{missing} of {n}'} samples of a "
+                "revolution are missing; check the bus and the device",
             )
         known = samples[there]
         self._pool.append(known)
@@ -107,17 +109,23 @@ def seen_by(vector: Complexes, axis_deg: float) -> float:
 
 
 def blind_probe(
-    vector: Complexes, deviation_um: float, probes: Sequence[Probe], axes_deg: Sequence[float]
+    vector: Complexes,
+    deviation_um: float,
+    probes: Sequence[Probe],
+    axes_deg: Sequence[float],
+    healthy: Complexes | None = None,
 ) -> str:
     """Whether one probe does not see the whirl that the other sees, so that the orbit is a line along it.
 
-    No shaft moves so: a probe that still shows noise, but no 1X, is not connected.
+    No shaft moves so: a probe that still shows noise, but no 1X, is not connected. What it saw when it was
+    calibrated makes that clear in few revolutions.
 
     Args:
         vector: complex128 ``[5]``, mean synchronous vector in um.
         deviation_um: standard deviation of one component of it.
         probes: the two probes.
         axes_deg: where they point, in the coordinates of the vector.
+        healthy: complex128 ``[5]``, the calibrated vector, if there is one.
 
     Returns:
         What is wrong and what to do; empty if nothing is.
@@ -125,7 +133,12 @@ def blind_probe(
     amplitudes = [seen_by(vector, axis) for axis in axes_deg]
     deaf, seeing = (0, 1) if amplitudes[0] < amplitudes[1] else (1, 0)
     doubt = _SURE * math.sqrt(2.0) * deviation_um
-    if doubt > _BELIEVED * amplitudes[seeing] or amplitudes[deaf] > max(_DEAD * amplitudes[seeing], doubt):
+    known_by = amplitudes[seeing] / _CLEAR
+    if healthy is None:
+        known_by = _BELIEVED * amplitudes[seeing]
+    else:
+        known_by = min(known_by, seen_by(healthy, axes_deg[deaf]) / _CLEAR)
+    if doubt > known_by or amplitudes[deaf] > max(_DEAD * amplitudes[seeing], doubt):
         return ""
     return (
         f"{probes[deaf].name}: sees no 1X ({amplitudes[deaf]:.2g} um) where {probes[seeing].name} sees "

@@ -50,6 +50,10 @@ _BLIND_REVOLUTIONS = 8.0
 """So long no revolution may come out, at the stated speed; the cutters need up to five and a half."""
 _ORBIT_LOCK_REVOLUTIONS = 20.0
 """The same of the orbit cutter, which has to find the speed first."""
+_OVERSPEED = 2.0
+"""No machine turns at so many times its stated speed; pulses that say so are noise."""
+_RELOCK_REVOLUTIONS = 16.0
+"""After so long without a shaft angle the keyphasor is looked at as if for the first time."""
 _DOUBTED = 2
 """So many of the last few revolutions must be worth nothing before the statement is not good."""
 _REMEMBERED = 4
@@ -167,6 +171,7 @@ class RotorSynchronousDetector:
         self._cutter_index = 0
         self._held = np.empty((0, 2))
         self._held_index = 0
+        self._untrusted = 0
         self._t_end_ns = 0
         self._period_ns = 0.0
         self._verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
@@ -249,6 +254,7 @@ class RotorSynchronousDetector:
         self._checks.reset()
         self._cutter_index = self._held_index = first_index
         self._held = np.empty((0, 2))
+        self._untrusted = 0
 
     def _step(self, samples: Floats) -> Iterator[Diagnosis]:
         probes = samples[:, :2] * self._um_per_unit
@@ -265,6 +271,9 @@ class RotorSynchronousDetector:
                 said = self._turn(turn, vectors[i : i + 1], trusted=bool(revolutions.trusted[i]))
                 if said is not None:
                     yield said
+        if self._untrusted > _RELOCK_REVOLUTIONS * self._period:
+            # Whatever the cutter has locked to, it is not the shaft: it must look for the shaft anew.
+            self._begin_cutting(self._next_index)
         blind = self._blind()
         if blind.quality != "good":
             said = self._stater.maybe(self._standing(), blind, *self._end(self._next_index))
@@ -295,13 +304,17 @@ class RotorSynchronousDetector:
             nothing = np.full(1, np.nan)
             one = replace(one, vectors=np.full((1, 5), np.nan, dtype=np.complex128), noise=nothing)
         calibrating = self._watch.calibration is None
-        for report in self._watch.take(one):
-            self._report = report
-            if self._listener is not None:
-                self._listener(report, one)
+        reports = self._watch.take(one)
         self._ends.append(self._origin + int(one.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)
+        rejected = calibrating and self._watch.calibration is None and bool(self._refused)
+        if self._report is not None:
+            self._report = replace(self._report, departed=False, looked=False)
+        for report in [] if rejected else reports:
+            self._report = report
+            if self._listener is not None:
+                self._listener(report, one)
         return self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
 
     def _judge_turn(self, raw: Floats, one: SynchronousVectors, *, trusted: bool) -> Verdict:
@@ -310,7 +323,8 @@ class RotorSynchronousDetector:
         least_um = 0.0
         if self._refused and not self._rules.retry:
             return Verdict("not_ok", self._refused)
-        if not trusted:
+        self._untrusted = 0 if trusted else self._untrusted + len(raw)
+        if not trusted or self._speed_rpm * self._period > _OVERSPEED * 60.0 * self._rate_hz:
             return Verdict("missing", self._angle_unknown())
         if calibration is not None:
             verdict = speed_verdict(self._speed_rpm, calibration)

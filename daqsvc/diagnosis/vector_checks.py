@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 SPEED_TOLERANCE = 0.05
 """A revolution at a speed farther from the calibrated one is not judged: its healthy 1X is another."""
-_LENGTHS = (12, 32)
-"""Revolutions that are looked at together; short for what is clear, long for what is noisy."""
+_LENGTHS = (4, 8, 12, 32)
+"""Revolutions looked at together: short for what is clear, before a change gets a name; long for noise."""
+_SLIP_LENGTH = 12
 _VANISHED = 0.05
 _SURE = 6.0
 _SLIP = 0.001
@@ -75,9 +76,12 @@ class VectorChecks:
                 break
             vectors = np.array(list(self._vectors)[-length:])
             deviation = math.sqrt(float(calibration.variance[1]) / length)
-            if reason := blind_probe(vectors.mean(axis=0), deviation, self._probes, self._axes_deg):
-                return Verdict("not_ok", reason)
-            if self._angle_assumed and (reason := self._lost(vectors, deviation, calibration)):
+            reason = blind_probe(
+                vectors.mean(axis=0), deviation, self._probes, self._axes_deg, calibration.baseline
+            )
+            if not reason and self._angle_assumed and length >= _SLIP_LENGTH:
+                reason = self._lost(vectors, deviation, calibration)
+            if reason:
                 return Verdict("not_ok", reason)
         return Verdict()
 
