@@ -202,11 +202,13 @@ class _DecisionWatch:
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         others = [mode for mode in diagnosis.group if mode != decision]
         if others:
-            between = "possible" if decision == DEPARTURE else "not told apart from"
-            sentence += f", {between} {', '.join(others)}"
+            how = "possibly" if decision == DEPARTURE else "not told apart from"
+            sentence += f", {how} {', '.join(others)}"
         return sentence
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:
-    """What is found, with what it is not told apart from."""
+    """What is found, with what it is not told apart from; what a change may be is settled by its name."""
+    if decision == DEPARTURE:
+        return decision
     return "|".join([decision, *sorted(set(group) - {decision})])

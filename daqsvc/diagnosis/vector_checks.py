@@ -30,8 +30,10 @@ _VANISHED = 0.05
 _SURE = 6.0
 _SLIP = 0.001
 """Relative difference of speeds below which a turning 1X may be the machine's own (a thermal bow, a rub)."""
-_EVEN = 0.3
-_STEADY = 1.3
+_EVEN = 0.1
+_STEADY = 1.1
+"""A shaft at another speed turns 1X evenly and leaves it as large as it was; a rotor that swings into a new
+state does neither."""
 
 
 class VectorChecks:
