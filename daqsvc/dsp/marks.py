@@ -24,6 +24,10 @@ _TOLERANCE = 0.2
 """An edge may come this part of a revolution early or late."""
 _REJECTED_IN_A_ROW = 3
 """So many edges out of place, but in step with each other, are right and the line is wrong."""
+_STEP = 0.25
+"""Gaps between edges in step change by no more from one to the next."""
+_ALIAS_STEP = 0.1
+"""The same, where it must not be a second pulse that happens to come half a revolution later."""
 _MIN_LOCK_EDGES = 2
 _FREE_LOCK_EDGES = 4
 """So many edges in step make a lock where the speed is not known beforehand."""
@@ -268,7 +272,7 @@ class MarkLine:
         self._proposed.append(mark)
         if len(self._proposed) < enough:
             return False
-        if not self._in_step(self._proposed):
+        if not self._in_step(self._proposed, _STEP):
             self._proposed.pop(0)
             return False
         if not self.marks:
@@ -276,23 +280,25 @@ class MarkLine:
         self._start(self._proposed)
         return True
 
-    def _in_step(self, marks: list[Mark]) -> bool:
+    def _in_step(self, marks: list[Mark], step: float) -> bool:
+        """Whether the gaps change by at most ``step`` from one to the next, and can be revolutions."""
         gaps = [a.samples_before(b) for a, b in itertools.pairwise(marks)]
-        mean = sum(gaps) / len(gaps)
+        steady = all(max(a / b, b / a) - 1.0 <= step for a, b in itertools.pairwise(gaps))
         shortest, longest = self._range
-        in_step = all(abs(gap - mean) <= _TOLERANCE * mean for gap in gaps)
-        return in_step and shortest <= mean <= longest
+        return steady and shortest <= sum(gaps) / len(gaps) <= longest
 
     def _divide(self) -> None:
         """Start anew if the edges keep step at a part of the period: the line had skipped some."""
-        if len(self._crossings) > _ALIAS_EDGES and self._in_step(list(self._crossings)):
-            self._start(list(self._crossings))
+        last = list(self._crossings)
+        if len(last) > _ALIAS_EDGES and self._in_step(last, _ALIAS_STEP):
+            self._start(last)
 
     def _multiply(self) -> None:
         """Start anew if the edges keep step at a multiple of the period: the line had one too many."""
         last = list(self.marks)[-(_ALIAS_EDGES // 2) - 1 :]
         turns = {b.revolution - a.revolution for a, b in itertools.pairwise(last)}
-        if len(last) > _ALIAS_EDGES // 2 and len(turns) == 1 and turns != {1} and self._in_step(last):
+        several = len(last) > _ALIAS_EDGES // 2 and len(turns) == 1 and turns != {1}
+        if several and self._in_step(last, _STEP):
             self._start(last)
 
     def _start(self, marks: list[Mark]) -> None:

@@ -35,13 +35,16 @@ _UNDECIDED = 0.05
 
 _LOCK_REVOLUTIONS = 16
 _LOCK_SEARCH = 0.04
+"""The expected speed may be wrong by this part of it."""
 _WINDOW_REVOLUTIONS = 30
 _LAG_REVOLUTIONS = 0.113 * _WINDOW_REVOLUTIONS
 """Where a least-squares parabola through the window is free of the cubic term, and best known."""
 _MAX_SCATTER_REV = 0.15
 """Phases that scatter by more about the parabola (0.29 is pure chance) are not those of a shaft."""
 _MAX_DRIFT = 0.1
+"""A speed that has drifted further from the expected one is not followed any more."""
 _MAX_UNMEASURED = 3
+"""So many revolutions without samples, or without phases around them, are bridged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +130,21 @@ class _Line:
 
 def _orbit(xy: Floats) -> tuple[Complexes, NDArray[np.bool_]]:
     """The orbit as x + i y, zero where it is missing, and where it is not."""
-    z: Complexes = xy[:, 0] + 1j * xy[:, 1]
-    valid = np.isfinite(z)
-    return np.where(valid, z, 0.0), valid
+    valid: NDArray[np.bool_] = np.isfinite(xy).all(axis=1)
+    z: Complexes = np.where(valid, xy[:, 0], 0.0) + 1j * np.where(valid, xy[:, 1], 0.0)
+    return z, valid
+
+
+def _project(columns: Complexes, values: Complexes) -> tuple[Complexes, Complexes]:
+    """Least squares: coefficients of the columns ``[n, m]``, and what they leave of the values ``[n]``.
+
+    Without BLAS, whose threads cost more than they save at these sizes.
+    """
+    m = columns.shape[1]
+    # The ridge only matters where orders coincide, as 3X and -2X do at five samples a revolution.
+    gram = np.einsum("ni,nj->ij", columns.conj(), columns) + 1e-9 * len(columns) * np.eye(m)
+    coefficients = np.linalg.solve(gram, np.einsum("ni,n->i", columns.conj(), values))
+    return coefficients, values - np.einsum("ni,i->n", columns, coefficients)
 
 
 def _fit_line(z: Complexes, valid: NDArray[np.bool_], lowest: float, highest: float) -> _Line | None:
@@ -143,23 +158,22 @@ def _fit_line(z: Complexes, valid: NDArray[np.bool_], lowest: float, highest: fl
     measured = z[valid]
     for _ in range(20):
         columns = np.exp(2j * np.pi * frequency * np.outer(t, _ORDERS))
-        # The ridge only matters where orders coincide, as 3X and -2X do at five samples a revolution.
-        gram = columns.conj().T @ columns + 1e-9 * count * np.eye(len(_ORDERS))
-        amplitudes = np.linalg.solve(gram, columns.conj().T @ measured)
-        residual = measured - columns @ amplitudes
+        amplitudes, residual = _project(columns, measured)
         slope = 2j * np.pi * t * (columns[:, 0] * amplitudes[0] - columns[:, 1] * amplitudes[1])
-        slope -= columns @ np.linalg.solve(gram, columns.conj().T @ slope)
-        leverage = float(np.vdot(slope, slope).real)
+        _, slope = _project(columns, slope)
+        leverage = float(np.sum(np.abs(slope) ** 2))
         if leverage == 0.0:
             return None
-        step = float(np.vdot(slope, residual).real) / leverage
+        step = float(np.sum(slope.conj() * residual).real) / leverage
         # Half the width of the line at most: beyond, the slope says nothing.
         frequency += min(max(step, -0.5 / n), 0.5 / n)
         if abs(step) * n < 1e-9:
             break
     spread = np.zeros(n, dtype=np.complex128)
     spread[valid] = residual
-    noise = _noise_beside(spread, frequency) / count
+    # Nothing is measured finer than float32 samples are.
+    finest = float(np.finfo(np.float32).eps * np.sqrt(np.mean(np.abs(measured) ** 2)))
+    noise = _noise_beside(spread, frequency) / count + finest**2
     power = abs(amplitudes[0]) ** 2 + abs(amplitudes[1]) ** 2
     if not lowest <= frequency <= highest or power * count < _LINE_OVER_NOISE * noise:
         return None
@@ -195,7 +209,7 @@ class AngleZero:
     Attributes:
         sample: in samples since the start.
         trusted: whether the revolution that ends there is known.
-        measured: whether that revolution's samples were there.
+        measured: whether that revolution has a phase of its own.
     """
 
     sample: float
@@ -276,10 +290,13 @@ class OrbitPhase:
             self._guess(begin + span)
             self._next = begin + span
             return
-        self._forward = abs(line.amplitudes[0]) >= abs(line.amplitudes[1])
+        forward, backward = line.amplitudes
+        self._forward = abs(forward) >= abs(backward)
         self._period = 1.0 / line.frequency
-        self._parabola = np.array([0.0, line.frequency, 0.0])
-        self._origin = begin
+        # The line's amplitudes are those about the middle of the record.
+        self._origin = math.ceil(begin) + (part.stop - part.start - 1) / 2.0
+        phase = float(np.angle(forward if self._forward else backward.conjugate())) / (2.0 * math.pi)
+        self._parabola = np.array([phase, line.frequency, 0.0])
         while self._next + self._period <= begin + span:
             self._measure()
         self._locked = True
@@ -318,9 +335,8 @@ class OrbitPhase:
         expected = self._turns_at(middle)
         turning = np.exp(2j * np.pi * ((sample[valid] - middle) / self._period + expected))
         columns = np.stack((turning, turning.conj(), np.ones_like(turning)), axis=1)
-        gram = columns.conj().T @ columns + 1e-9 * len(z) * np.eye(3)
-        amplitude = complex(np.linalg.solve(gram, columns.conj().T @ z)[0])
-        off = math.atan2(amplitude.imag, amplitude.real) / (2.0 * math.pi)
+        amplitudes, _ = _project(columns, z)
+        off = float(np.angle(amplitudes[0])) / (2.0 * math.pi)
         self._phases.append((middle, expected + off))
 
     def _fit(self) -> None:
@@ -362,8 +378,11 @@ class OrbitPhase:
         """Give away the zeros up to an angle; the first of a new search ends no known revolution."""
         while self._turn <= turns:
             sample = self._sample_at(self._turn)
-            trusted = known and self._scattered == 0 and self._unmeasured <= _MAX_UNMEASURED
-            self._zero(sample, trusted=trusted)
+            # The revolution that ends here, against the middles of those that were measured.
+            middle = sample - 0.5 * self._period
+            away = min((abs(middle - at) for at, _ in self._phases), default=math.inf) / self._period
+            trusted = known and self._scattered == 0 and away <= _MAX_UNMEASURED
+            self._zero(sample, trusted=trusted, measured=away <= 0.75)
             self._turn += 1
             known = True
 
@@ -372,8 +391,8 @@ class OrbitPhase:
         last = self._held_index - self._period if self._last_zero is None else self._last_zero
         while last + self._period <= end:
             last += self._period
-            self._zero(last, trusted=False)
+            self._zero(last, trusted=False, measured=False)
 
-    def _zero(self, sample: float, *, trusted: bool) -> None:
+    def _zero(self, sample: float, *, trusted: bool, measured: bool) -> None:
         self._last_zero = sample
-        self._zeros.append(AngleZero(sample, trusted, self._unmeasured == 0))
+        self._zeros.append(AngleZero(sample, trusted, measured))

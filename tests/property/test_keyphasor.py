@@ -191,6 +191,115 @@ def test_time_without_edges_is_told():
     assert np.isnan(subject.process(np.full(10, -1.0)).angle_rad).all()
 
 
+def pulses(turns, *, width=0.2):
+    """Pulses with straight flanks two samples long at the whole numbers of a shaft's turns; exact edges."""
+    sample = np.arange(len(turns), dtype=np.float64)
+    whole = np.arange(math.ceil(turns[0]), math.floor(turns[-1]) - 1)
+    signal = np.full(len(turns), -1.0)
+    for rise, fall in zip(
+        np.interp(whole, turns, sample), np.interp(whole + width, turns, sample), strict=True
+    ):
+        near = slice(max(0, int(rise) - 2), int(fall) + 3)
+        there = sample[near]
+        pulse = np.minimum(np.clip(there - rise, -1.0, 1.0), np.clip(fall - there, -1.0, 1.0))
+        signal[near] = np.maximum(signal[near], pulse)
+    return signal
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    slow=st.floats(120.0, 250.0),
+    ratio=st.floats(2.0, 8.0),
+    revolutions=st.integers(80, 200),
+    down=st.booleans(),
+)
+def test_run_up_from_any_speed_leaves_no_lag(slow, ratio, revolutions, down):
+    # Constant acceleration from 1 to `ratio` times the slow speed.
+    begin, end = 1.0 / slow, ratio / slow
+    n = round(2 * revolutions / (begin + end))
+    sample = np.arange(n)
+    turns = 0.3 + begin * sample + 0.5 * (end - begin) / n * sample**2
+    if down:
+        turns = turns[-1] - turns[::-1] + 0.3
+    subject = tracker(50.0, threshold=0.0, hysteresis=0.2, period_range=(10.0, 400.0))
+    track = subject.process(pulses(turns))
+    expected = 2 * math.pi * turns
+    first = int(np.argmin(np.isnan(track.angle_rad)))
+    assert turns[first] < 6
+    # An edge is interpolated on a straight flank, and the shaft's own turning is not straight there.
+    assert angle_error(track.angle_rad[turns > 14], expected[turns > 14]) < 2e-3
+    assert angle_error(track.angle_rad, expected) < 0.1
+    assert subject.counts.rejected == subject.counts.missing == 0
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000), per_rev=st.floats(40.0, 100.0))
+def test_drift_is_followed_without_lag(seed, per_rev):
+    sample = np.arange(round(300 * per_rev))
+    speed = (1.0 + 0.01 * np.sin(2 * math.pi * sample / (100 * per_rev))) / per_rev
+    turns = 0.5 + np.cumsum(speed)
+    noise = 0.03 * np.clip(np.random.default_rng(seed).standard_normal(len(sample)), -3, 3)
+    track = tracker(per_rev, threshold=0.0, hysteresis=0.2).process(pulses(turns) + noise)
+    settled = turns > 14
+    error = np.angle(np.exp(1j * (track.angle_rad - 2 * math.pi * turns)))[settled]
+    # Scatter of the edges, 0.03 samples, and what a straight line through eight edges lags: 1.8 degrees.
+    assert np.degrees(np.abs(error).max()) < 1.2 + 360 * 0.1 / per_rev
+    assert np.degrees(error.std()) < 0.6
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    period=st.floats(40.0, 200.0),
+    early=st.lists(st.floats(-0.15, 0.15), min_size=2, max_size=2),
+    at=st.integers(14, 16),
+)
+def test_two_misplaced_edges_bend_nothing(period, early, at):
+    turns = 0.5 + np.arange(round(25 * period)) / period
+    signal = pulses(turns)
+    sample = np.arange(len(turns))
+    for revolution, off in zip((at, at + 3), early, strict=True):
+        middle = round((revolution - 0.5) * period)
+        near = np.abs(sample - middle) < 0.45 * period
+        signal[near] = np.interp(sample[near] - off * period, sample, signal)
+    track = tracker(period, threshold=0.0, hysteresis=0.2).process(signal)
+    error = np.angle(np.exp(1j * (track.angle_rad - 2 * math.pi * turns)))
+    known = turns > 10
+    assert np.abs(error[known]).max() < 0.03
+
+
+def test_lock_at_a_part_of_the_speed_is_found_out():
+    # Every other pulse missing at first, then all are there.
+    signal = ramps(64.0, 0.5, 40, skip={1, 3, 5, 7, 9})
+    subject = tracker(64.0, threshold=0.0, hysteresis=0.2, period_range=(10.0, 400.0))
+    track = subject.process(signal)
+    assert subject.period_samples == pytest.approx(64.0)
+    sample = np.arange(len(signal))
+    late = sample > 22 * 64
+    assert angle_error(track.angle_rad[late], (2 * math.pi * (sample / 64.0 - 0.5))[late]) < 1e-6
+
+
+def test_lock_at_a_multiple_of_the_speed_is_found_out():
+    # Two pulses a revolution at first, half a revolution apart.
+    signal = np.concatenate((ramps(32.0, 0.5, 6), ramps(64.0, 0.25, 30)))
+    subject = tracker(64.0, threshold=0.0, hysteresis=0.2, period_range=(10.0, 400.0))
+    track = subject.process(signal)
+    assert subject.period_samples == pytest.approx(64.0)
+    sample = np.arange(len(signal))
+    late = sample > 12 * 64
+    assert angle_error(track.angle_rad[late], (2 * math.pi * (sample / 64.0 - 0.25))[late]) < 1e-6
+
+
+def test_revolutions_are_not_counted_through_a_standstill():
+    signal = np.concatenate((ramps(64.0, 0.5, 10), np.full(6400, -1.0), ramps(64.0, 0.2, 10)))
+    subject = tracker(64.0, threshold=0.0, hysteresis=0.2)
+    track = subject.process(signal)
+    assert subject.counts.missing == 0
+    assert subject.counts.accepted == 20
+    sample = np.arange(len(signal)) - 7040
+    late = sample > 2 * 64
+    assert angle_error(track.angle_rad[late], (2 * math.pi * (sample / 64.0 - 0.2))[late]) < 1e-6
+
+
 @pytest.mark.parametrize(
     ("figures", "words"),
     [
@@ -199,6 +308,8 @@ def test_time_without_edges_is_told():
         ({"period": 1.5}, "1.5 samples per revolution"),
         ({"edge": "left"}, "'left'"),
         ({"line_edges": 1}, "through 1 edges"),
+        ({"period_range": (1.0, 64.0)}, "between 1.0 and 64.0 samples"),
+        ({"period_range": (64.0, 32.0)}, "shortest must be above 2"),
     ],
 )
 def test_impossible_figures_are_refused(figures, words):
