@@ -19,9 +19,8 @@ if TYPE_CHECKING:
 
 
 _CLOSED_LIST = (
-    "the rotor bank knows its modes and nothing else: on a machine that does not follow its model to the last "
-    "digit the nearest mode may be the wrong one; add [pipeline.rotor_synchronous] for a verdict that can say "
-    "unmodelled"
+    "the rotor bank knows its modes and nothing else: on a machine that does not follow its model closely, "
+    "the nearest mode may be the wrong one; [pipeline.rotor_synchronous] can say unmodelled"
 )
 
 

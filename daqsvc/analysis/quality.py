@@ -224,7 +224,7 @@ def refuse_gaps(unusable: int, revolutions: int, why: str) -> None:
         raise RefusedError("no whole revolution was found; check the speed and the keyphasor")
     if unusable > _MOST_UNUSABLE * revolutions:
         raise RefusedError(
-            f"{unusable} of {revolutions} revolutions cannot be judged: {why or 'samples are missing'}"
+            f"{why or 'samples are missing'} ({unusable} of {revolutions} revolutions cannot be judged)"
         )
 
 

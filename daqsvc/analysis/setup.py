@@ -86,7 +86,8 @@ class RotorSetup:
                 "speed and angle come either from the keyphasor or from the orbit: leave out --keyphasor or "
                 "--follow-orbit"
             )
-        if len(set(self.columns.values())) < len(self.columns) or self.probes[0] == self.probes[1]:
+        named = [*self.probes, *([self.keyphasor.name] if self.keyphasor is not None else [])]
+        if len({self.channels.get(name, name) for name in named}) < len(named):
             raise ValueError(
                 f"probes {self.probes[0]!r} and {self.probes[1]!r} and the keyphasor must be different "
                 "channels of the recording; correct --probes, --keyphasor or --map"
