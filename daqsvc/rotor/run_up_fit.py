@@ -84,6 +84,22 @@ class RunUpFit:
         """Whether one Laval rotor explains the whole record."""
         return self.fit_error <= LAVAL_LIMIT and self.ellipticity <= LAVAL_LIMIT
 
+    def describe(self) -> str:
+        """The verdict in words."""
+        low, high = self.speed_range_rpm
+        seen = f"from {low:.0f} to {high:.0f} rpm"
+        if self.laval:
+            return (
+                f"one Laval rotor explains the orbit {seen} within {100.0 * self.fit_error:.1f} %: 1X at any "
+                "speed in between follows from it, and loss of damping can be told from unbalance"
+            )
+        limit = f"at most {100.0 * LAVAL_LIMIT:.0f} % each"
+        return (
+            f"no Laval rotor explains the orbit {seen} (unexplained {100.0 * self.fit_error:.0f} %, backward "
+            f"over forward whirl {100.0 * self.ellipticity:.0f} %, {limit}): calibrate at every speed that "
+            "is watched; nothing follows from one speed for another"
+        )
+
     def rotor(self, *, clearance_um: float | None = None, static_sag_um: float | None = None) -> LavalRotor:
         """What is known about the rotor from now on; with wide tolerances if it is no Laval rotor."""
         least = _ROTOR_TOLERANCE if self.laval else _GENERIC_TOLERANCE

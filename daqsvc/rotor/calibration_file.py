@@ -1,0 +1,383 @@
+"""Calibrations on disk: a TOML file that a person can read, and that comes back to the last bit.
+
+`load_calibration` reads the healthy machine at one speed; `load_record` reads everything that a file holds.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from daqsvc.rotor.calibration import Calibration
+from daqsvc.rotor.calibration_reading import CalibrationFileError, Table
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.run_up_fit import RunUpFit
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "CalibrationFileError",
+    "CalibrationRecord",
+    "load_calibration",
+    "load_record",
+    "parse_record",
+    "record_text",
+    "save_calibration",
+    "save_record",
+]
+
+SCHEMA_VERSION = 1
+
+SPEED_TOLERANCE = 0.05
+"""A baseline holds for speeds that differ by no more than this part: beyond, 1X itself is another."""
+
+_COMPONENTS = (
+    "mean_position_um",
+    "forward_1x_um",
+    "backward_1x_um",
+    "forward_2x_um",
+    "backward_2x_um",
+)
+"""Keys of the components of a baseline, in the order of `synchronous.HARMONICS`."""
+_PREAMBLE = """\
+# The healthy machine, as `daqsvc calibrate` saw it. Lengths in um, angles in degrees from the keyphasor's
+# mark in the direction of rotation (x is mirrored if the shaft turns clockwise). +- is a standard deviation.
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationRecord:
+    """What is known about a healthy machine.
+
+    Attributes:
+        rotor: the rotor, as it was given or as the run-up shows it.
+        steady: baselines, one for each speed.
+        steady_sources: the recording that each baseline comes from.
+        run_up: what a run-up showed, if there was one.
+        run_up_source: the recording of it.
+        written: label of the date, ISO 8601; empty if not known.
+    """
+
+    rotor: LavalRotor
+    steady: tuple[Calibration, ...] = ()
+    steady_sources: tuple[str, ...] = ()
+    run_up: RunUpFit | None = None
+    run_up_source: str = ""
+    written: str = ""
+
+    def at(self, speed_rpm: float | None = None) -> Calibration:
+        """The baseline of a speed.
+
+        Args:
+            speed_rpm: shaft speed of either sign; may be left out if there is one baseline only.
+
+        Raises:
+            ValueError: there is none of that speed, or several and no speed was given.
+        """
+        speeds = ", ".join(f"{calibration.speed_rpm:.1f}" for calibration in self.steady)
+        if not self.steady:
+            raise ValueError(
+                "the calibration holds a run-up only and no steady baseline; calibrate again with a "
+                "recording at the speed that is watched"
+            )
+        if speed_rpm is None:
+            if len(self.steady) > 1:
+                raise ValueError(f"the calibration holds baselines at {speeds} rpm; say at which speed")
+            return self.steady[0]
+        nearest = min(self.steady, key=lambda one: abs(one.speed_rpm - abs(speed_rpm)))
+        if abs(abs(speed_rpm) / nearest.speed_rpm - 1.0) > SPEED_TOLERANCE:
+            raise ValueError(
+                f"the calibration holds no baseline within {100.0 * SPEED_TOLERANCE:.0f} % of "
+                f"{abs(speed_rpm):.1f} rpm, but at {speeds} rpm; calibrate at that speed"
+            )
+        return nearest
+
+
+def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibration:
+    """The healthy machine at one speed.
+
+    Args:
+        path: the file.
+        speed_rpm: see `CalibrationRecord.at`.
+
+    Raises:
+        CalibrationFileError: the file cannot be read or used, or has no baseline of that speed.
+    """
+    record = load_record(path)
+    try:
+        return record.at(speed_rpm)
+    except ValueError as error:
+        raise CalibrationFileError(f"{path}: {error}") from None
+
+
+def load_record(path: Path | str) -> CalibrationRecord:
+    """Everything that a file holds.
+
+    Raises:
+        CalibrationFileError: it cannot be read or used; the message names file, key, value and remedy.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CalibrationFileError(
+            f"{path}: {error.strerror}; name a file that daqsvc calibrate wrote"
+        ) from None
+    except UnicodeDecodeError:
+        raise CalibrationFileError(
+            f"{path}: this is no text; name a file that daqsvc calibrate wrote"
+        ) from None
+    return parse_record(text, path)
+
+
+def save_calibration(calibration: Calibration, path: Path | str, *, source: str = "") -> None:
+    """Write the healthy machine at one speed; see `save_record`."""
+    record = CalibrationRecord(rotor=calibration.rotor, steady=(calibration,), steady_sources=(source,))
+    save_record(record, path)
+
+
+def save_record(record: CalibrationRecord, path: Path | str) -> None:
+    """Write everything; a file of that name is replaced as a whole, or not at all.
+
+    Raises:
+        CalibrationFileError: the file cannot be written.
+    """
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    text = record_text(record)
+    try:
+        try:
+            beside.write_text(text, encoding="utf-8")
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+    except OSError as error:
+        raise CalibrationFileError(
+            f"{path}: cannot be written: {error.strerror}; name a file in a directory that can be"
+        ) from None
+
+
+def record_text(record: CalibrationRecord) -> str:
+    """A record as TOML.
+
+    Raises:
+        ValueError: a baseline was made with another rotor than the record's.
+    """
+    return "\n".join(_lines(record)) + "\n"
+
+
+def _lines(record: CalibrationRecord) -> Iterator[str]:
+    yield _PREAMBLE + f"schema_version = {SCHEMA_VERSION}"
+    if record.written:
+        yield f"written = {_quoted(record.written)}"
+    rotor = record.rotor
+    yield "\n[rotor]"
+    yield f"natural_frequency_hz = {rotor.natural_frequency_hz!r}"
+    yield f"natural_frequency_tolerance = {rotor.natural_frequency_tolerance!r}  # relative"
+    yield f"damping_ratio = {rotor.damping_ratio!r}"
+    yield f"damping_tolerance = {rotor.damping_tolerance!r}  # relative"
+    if rotor.clearance_um is not None:
+        yield f"clearance_um = {rotor.clearance_um!r}"
+    if rotor.static_sag_um is not None:
+        yield f"static_sag_um = {rotor.static_sag_um!r}"
+    if record.run_up is not None:
+        yield from _run_up_lines(record.run_up, record.run_up_source)
+    for calibration, source in zip(record.steady, record.steady_sources, strict=True):
+        if calibration.rotor != rotor:
+            raise ValueError(
+                f"the baseline at {calibration.speed_rpm:.1f} rpm was made with {calibration.rotor}, the "
+                f"record has {rotor}; make all baselines of a record with one rotor"
+            )
+        yield from _steady_lines(calibration, source)
+
+
+def _run_up_lines(fit: RunUpFit, source: str) -> Iterator[str]:
+    low, high = fit.speed_range_rpm
+    yield "\n[run_up]"
+    yield f"verdict = {_quoted(fit.describe())}"
+    yield f"source = {_quoted(source)}"
+    yield f"revolutions = {fit.revolutions}"
+    yield f"speed_range_rpm = [{low!r}, {high!r}]"
+    yield f"natural_frequency_hz = {_with(fit.natural_frequency_hz, fit.natural_frequency_uncertainty_hz)}"
+    yield f"damping_ratio = {_with(fit.damping_ratio, fit.damping_uncertainty)}"
+    yield (
+        f"eccentricity_um = {_complex(fit.eccentricity_um)}  # {_polar(fit.eccentricity_um)}, "
+        f"+- {fit.eccentricity_uncertainty_um:.2g} um, {fit.heavy_spot_uncertainty_deg:.2g} degrees"
+    )
+    yield f"centre_um = {_complex(fit.centre_um)}  # +- {fit.centre_uncertainty_um:.2g} each"
+    yield f"centre_uncertainty_um = {fit.centre_uncertainty_um!r}"
+    yield f"ellipticity = {fit.ellipticity!r}  # backward over forward whirl"
+    yield f"noise_um = {fit.noise_um!r}  # standard deviation of a sample of one probe"
+    yield f"fit_error = {fit.fit_error!r}  # of the whirl, not explained by a Laval rotor"
+    rows = ",\n    ".join(f"[{', '.join(repr(float(value)) for value in row)}]" for row in fit.covariance)
+    yield "# of ln natural_frequency_hz, ln damping_ratio, real and imaginary part of ln eccentricity"
+    yield f"covariance = [\n    {rows},\n]"
+
+
+def _steady_lines(calibration: Calibration, source: str) -> Iterator[str]:
+    yield "\n[[steady]]"
+    yield f"verdict = {_quoted(calibration.describe())}"
+    yield f"source = {_quoted(source)}"
+    yield f"speed_rpm = {calibration.speed_rpm!r}"
+    yield f"revolutions = {calibration.revolutions}"
+    yield f"samples_per_rev = {calibration.samples_per_rev!r}"
+    yield (
+        f"noise_variance_um2 = {calibration.noise!r}  # {calibration.noise_um:.3g} um rms of a sample of one "
+        f"probe, SNR {calibration.snr_db:.1f} dB"
+    )
+    yield f"noise_relative_variance = {calibration.noise_variance!r}  # from revolution to revolution"
+    if calibration.fit_error is not None:
+        yield f"fit_error = {calibration.fit_error!r}  # of the run-up"
+    eccentricity = calibration.eccentricity_um
+    yield f"# unbalance, if this is a Laval rotor: eccentricity {_polar(eccentricity)}"
+    for key, value, variance in zip(
+        _COMPONENTS, calibration.baseline.tolist(), calibration.variance.tolist(), strict=True
+    ):
+        deviation = math.sqrt(variance / calibration.revolutions / 2.0)
+        yield (
+            f"{key} = {{ re = {value.real!r}, im = {value.imag!r}, revolution_variance = {variance!r} }}"
+            f"  # {_polar(value)}, +- {deviation:.2g} each"
+        )
+
+
+def parse_record(text: str, path: Path) -> CalibrationRecord:
+    """A record from its text.
+
+    Args:
+        text: TOML.
+        path: the file that messages name.
+
+    Raises:
+        CalibrationFileError: the text cannot be used.
+    """
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CalibrationFileError(
+            f"{path}: this is not TOML: {error}; restore the file, or calibrate again"
+        ) from None
+    table = Table(document, path)
+    version = table.whole("schema_version")
+    if version != SCHEMA_VERSION:
+        raise table.wrong(
+            "schema_version",
+            version,
+            f"this program reads version {SCHEMA_VERSION}; calibrate again with it",
+        )
+    written = table.text("written", default="")
+    rotor = _rotor(table.table("rotor"))
+    run_up, run_up_source = None, ""
+    if (given := table.optional_table("run_up")) is not None:
+        run_up_source = given.text("source", default="")
+        run_up = _run_up(given)
+    steady, sources = [], []
+    for part in table.tables("steady"):
+        sources.append(part.text("source", default=""))
+        steady.append(_steady(part, rotor))
+    if run_up is None and not steady:
+        raise CalibrationFileError(f"{path}: neither [run_up] nor [[steady]] is there; calibrate again")
+    table.nothing_else()
+    return CalibrationRecord(
+        rotor=rotor,
+        steady=tuple(steady),
+        steady_sources=tuple(sources),
+        run_up=run_up,
+        run_up_source=run_up_source,
+        written=written,
+    )
+
+
+def _rotor(table: Table) -> LavalRotor:
+    rotor = LavalRotor(
+        natural_frequency_hz=table.number("natural_frequency_hz", above=0.0),
+        damping_ratio=table.number("damping_ratio", above=0.0, below=1.0),
+        natural_frequency_tolerance=table.number("natural_frequency_tolerance", least=0.0, below=1.0),
+        damping_tolerance=table.number("damping_tolerance", least=0.0, below=1.0),
+        clearance_um=table.optional_number("clearance_um", above=0.0),
+        static_sag_um=table.optional_number("static_sag_um"),
+    )
+    table.nothing_else()
+    return rotor
+
+
+def _run_up(table: Table) -> RunUpFit:
+    table.text("verdict", default="")
+    low, high = table.numbers("speed_range_rpm", 2)
+    if not 0.0 < low < high:
+        raise table.wrong("speed_range_rpm", [low, high], "give the lowest and the highest speed")
+    covariance = table.matrix("covariance", 4)
+    if np.any(np.diag(covariance) < 0.0):
+        raise table.wrong("covariance", np.diag(covariance).tolist(), "no variance can be below 0")
+    fit = RunUpFit(
+        natural_frequency_hz=table.number("natural_frequency_hz", above=0.0),
+        damping_ratio=table.number("damping_ratio", above=0.0, below=1.0),
+        eccentricity_um=table.complex_number("eccentricity_um"),
+        centre_um=table.complex_number("centre_um"),
+        covariance=covariance,
+        centre_uncertainty_um=table.number("centre_uncertainty_um", least=0.0),
+        ellipticity=table.number("ellipticity", least=0.0),
+        noise_um=table.number("noise_um", least=0.0),
+        fit_error=table.number("fit_error", least=0.0),
+        speed_range_rpm=(low, high),
+        revolutions=table.whole("revolutions", least=1),
+    )
+    table.nothing_else()
+    return fit
+
+
+def _steady(table: Table, rotor: LavalRotor) -> Calibration:
+    table.text("verdict", default="")
+    baseline, variance = [], []
+    for key in _COMPONENTS:
+        part = table.table(key)
+        baseline.append(complex(part.number("re"), part.number("im")))
+        variance.append(part.number("revolution_variance", above=0.0))
+        part.nothing_else()
+    calibration = Calibration(
+        rotor=rotor,
+        speed_rpm=table.number("speed_rpm", above=0.0),
+        revolutions=table.whole("revolutions", least=1),
+        baseline=np.array(baseline, dtype=np.complex128),
+        variance=np.array(variance, dtype=np.float64),
+        noise=table.number("noise_variance_um2", above=0.0),
+        noise_variance=table.number("noise_relative_variance", above=0.0),
+        samples_per_rev=table.number("samples_per_rev", above=0.0),
+        fit_error=table.optional_number("fit_error", least=0.0),
+    )
+    table.nothing_else()
+    return calibration
+
+
+def _with(value: float, deviation: float) -> str:
+    return f"{value!r}  # +- {deviation:.2g}"
+
+
+def _complex(value: complex) -> str:
+    return f"{{ re = {value.real!r}, im = {value.imag!r} }}"
+
+
+def _polar(value: complex) -> str:
+    return f"{abs(value):.4g} um at {math.degrees(math.atan2(value.imag, value.real)):.1f} degrees"
+
+
+def _quoted(text: str) -> str:
+    """A TOML basic string."""
+    escaped: list[Any] = []
+    for letter in text:
+        if letter in '"\\':
+            escaped.append(f"\\{letter}")
+        elif ord(letter) < 0x20 or ord(letter) == 0x7F:
+            escaped.append(f"\\u{ord(letter):04x}")
+        elif 0xD800 <= ord(letter) <= 0xDFFF:
+            escaped.append("\ufffd")  # bytes of a file name that are no text
+        else:
+            escaped.append(letter)
+    return f'"{"".join(escaped)}"'
