@@ -13,6 +13,7 @@ from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limit
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.rotor.calibration_file import CalibrationFileError, load_calibration
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.watch import WatchRules
 from daqsvc.settings.models import (
@@ -31,11 +32,13 @@ from drivers.frames import FrameLayout, Kind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.rotor_synchronous import SpeedReference
+    from daqsvc.rotor.calibration import Calibration
     from daqsvc.settings.models import MachineFile, RotorBank, RotorSynchronous, Sensor
     from drivers.base import Driver
 
@@ -126,7 +129,11 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
 
 
 def detectors(machine: MachineFile) -> list[Detector]:
-    """Every detector that the pipeline section asks for."""
+    """Every detector that the pipeline section asks for.
+
+    Raises:
+        AssemblyError: a calibration that the machine file names cannot be used.
+    """
     made: list[Detector] = []
     if machine.pipeline.levels is not None:
         for stream in machine.streams:
@@ -260,8 +267,18 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous) -> Detecto
             false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
             probe_drift_um=given.probe_drift_um,
         ),
+        calibration=None if given.calibration is None else _calibration(machine, given.calibration),
         ac_coupled=machine.ac_coupled,
     )
+
+
+def _calibration(machine: MachineFile, path: Path) -> Calibration:
+    try:
+        return load_calibration(machine.resolve(path), machine.machine.speed_rpm)
+    except CalibrationFileError as error:
+        raise AssemblyError(
+            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(path)!r}: {error}"
+        ) from error
 
 
 def _probes(machine: MachineFile, names: tuple[str, str]) -> tuple[Probe, Probe]:
