@@ -1,0 +1,297 @@
+"""Orders of a shaft without a keyphasor: complex amplitudes of 1X, 2X and 3X, block by block.
+
+The speed comes from the harmonics themselves, so that every block of a recording has the same zero of the
+shaft's angle. Where that zero lies is arbitrary: between two recordings only amplitudes, the phases
+between channels, and those of 2X and 3X against 1X can be compared.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+    Flags: TypeAlias = NDArray[np.bool_]
+    Complexes: TypeAlias = NDArray[np.complex128]
+
+ORDERS = (1, 2, 3)
+"""Orders measured, along the second axis of `OrderVectors.amplitudes`."""
+
+LEAST_REVOLUTIONS = 8
+SPEED_SEARCH = 0.03
+"""The speed is searched within this part of the nominal one."""
+
+_WIDE_SEARCH = 0.1
+"""So far a wrong nominal speed is noticed."""
+_BLOCKS = 12
+_LEAST_BLOCKS = 6
+_LEAST_SAMPLES_PER_REVOLUTION = 10.0
+_LEAST_PRESENT = 0.75
+_CLIPPED_SHARE = 1.0 / 64.0
+_DEAD = 1e-9
+"""Deviation of a channel, as a part of its largest value, below which nothing moves."""
+_LINE_NATS = 12.0
+"""Evidence per channel of one order that is no chance: e^-12 at each of some hundred places."""
+_POINTS_PER_LINE = 16
+
+
+@dataclass(frozen=True, slots=True)
+class OrderVectors:
+    """Orders 1X to 3X of a recording at constant speed.
+
+    Attributes:
+        amplitudes: complex128 ``[blocks, 3, channels]``, peak amplitude of each order in the unit of the
+            samples, about a zero of the shaft's angle that all blocks of the recording have in common.
+        residual_rms: float64 ``[blocks, channels]``, root mean square of what is left beside the mean and the
+            orders.
+        speed_rpm: shaft speed by the harmonics.
+        speed_uncertainty_rpm: its standard deviation.
+        speed_seen: whether any order stands out of the noise; otherwise ``speed_rpm`` is a guess within the
+            search and the uncertainty says so.
+        nominal_rpm: the speed that was stated.
+        revolutions_per_block: shaft revolutions in a block.
+    """
+
+    amplitudes: Complexes
+    residual_rms: Floats
+    speed_rpm: float
+    speed_uncertainty_rpm: float
+    speed_seen: bool
+    nominal_rpm: float
+    revolutions_per_block: int
+
+    def __len__(self) -> int:
+        return len(self.amplitudes)
+
+    @property
+    def revolutions(self) -> int:
+        """Shaft revolutions in all blocks."""
+        return len(self) * self.revolutions_per_block
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return int(self.amplitudes.shape[2])
+
+
+def order_vectors(
+    samples: Floats, rate_hz: float, speed_rpm: float, names: Sequence[str] | None = None
+) -> OrderVectors:
+    """Measure orders 1X to 3X of a machine that turns at a constant, roughly known speed.
+
+    Block by block the mean and the orders are fitted together by least squares, so blocks need not hold
+    whole samples per revolution and may lack some.
+
+    Args:
+        samples: ``[n, channels]`` or ``[n]``, all of one unit; NaN and infinite ones are missing.
+        rate_hz: samples per second.
+        speed_rpm: nominal shaft speed; the true one is searched within 3 % of it.
+        names: what messages call the channels (default: their numbers from 0).
+
+    Raises:
+        ValueError: a channel is dead, clipped or full of gaps, the recording has fewer than 8 revolutions
+            or fewer than 10 samples in each, or its harmonics stand at another speed.
+    """
+    values = np.asarray(samples, dtype=np.float64)
+    values = values[:, np.newaxis] if values.ndim == 1 else values
+    if not (np.isfinite(rate_hz) and np.isfinite(speed_rpm) and rate_hz > 0.0 and speed_rpm != 0.0):
+        raise ValueError(f"a speed of {speed_rpm:g} rpm at {rate_hz:g} Hz: give numbers that are not zero")
+    nominal_hz = abs(speed_rpm) / 60.0
+    _check_length(len(values), rate_hz, nominal_hz)
+    there = np.isfinite(values)
+    values = np.where(there, values, np.nan)
+    for channel in range(values.shape[1]):
+        name = repr(names[channel]) if names is not None else str(channel)
+        _check_channel(values[there[:, channel], channel], len(values), name)
+    present: Flags = np.asarray(there.all(axis=1))
+    centred = np.where(present[:, np.newaxis], values - np.nanmean(values, axis=0), 0.0)
+    speed = _find_speed(centred, rate_hz, nominal_hz)
+    amplitudes, residual, revolutions = _blocks(centred, present, rate_hz, speed.hz)
+    if len(amplitudes) < _LEAST_BLOCKS:
+        raise ValueError(
+            f"only {len(amplitudes)} blocks of {revolutions} revolutions have enough samples; "
+            f"{_LEAST_BLOCKS} are needed: give a recording with fewer gaps"
+        )
+    return OrderVectors(
+        amplitudes=amplitudes,
+        residual_rms=residual,
+        speed_rpm=60.0 * speed.hz,
+        speed_uncertainty_rpm=60.0 * speed.deviation_hz,
+        speed_seen=speed.seen,
+        nominal_rpm=abs(speed_rpm),
+        revolutions_per_block=revolutions,
+    )
+
+
+def _check_length(count: int, rate_hz: float, nominal_hz: float) -> None:
+    revolutions = count * nominal_hz / rate_hz
+    if revolutions < LEAST_REVOLUTIONS:
+        raise ValueError(
+            f"the recording has {revolutions:.1f} revolutions at {60.0 * nominal_hz:g} rpm; "
+            f"at least {LEAST_REVOLUTIONS} are needed: give a longer one"
+        )
+    if rate_hz / nominal_hz < _LEAST_SAMPLES_PER_REVOLUTION:
+        raise ValueError(
+            f"{rate_hz:g} Hz are {rate_hz / nominal_hz:.1f} samples per revolution at {60.0 * nominal_hz:g} "
+            f"rpm; at least {_LEAST_SAMPLES_PER_REVOLUTION:g} are needed: check the rate and the speed"
+        )
+
+
+def _check_channel(values: Floats, count: int, name: str) -> None:
+    if len(values) < _LEAST_PRESENT * count:
+        raise ValueError(
+            f"channel {name}: {count - len(values)} of {count} samples are missing or infinite; "
+            "give a recording with fewer gaps"
+        )
+    low, high = values.min(), values.max()
+    if values.std() <= _DEAD * max(abs(low), abs(high)):
+        raise ValueError(f"channel {name} is dead: every sample is {low:g}; check the sensor and its cable")
+    for extreme in (low, high):
+        share = float((values == extreme).mean())
+        if share >= _CLIPPED_SHARE:
+            raise ValueError(
+                f"channel {name} is clipped: {share:.1%} of its samples are {extreme:g}; widen the range"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _Speed:
+    hz: float
+    deviation_hz: float
+    seen: bool
+
+
+def _find_speed(centred: Floats, rate_hz: float, nominal_hz: float) -> _Speed:
+    """The speed by the lines of 1X, 2X and 3X.
+
+    The periodogram at h f over the noise density beside it, summed over the channels, is the log likelihood
+    of a line there. The strongest line near the nominal 1X is taken first; 2X and 3X refine it where they
+    stand out within one resolution of its multiples. Farther off they are lines of something else (belt,
+    mains, gears), however strong. Without a line of 1X, the strongest sum of all orders decides.
+    """
+    resolution = rate_hz / len(centred)
+    lines = _line_evidence(centred, rate_hz, nominal_hz)
+    threshold = _LINE_NATS + 2.0 * centred.shape[1]
+    near = lines.within(nominal_hz, SPEED_SEARCH * nominal_hz)
+    first = near[np.argmax(lines.nats[0, near])]
+    if lines.nats[0, first] < threshold:
+        first = near[np.argmax(lines.nats[:, near].sum(axis=0))]
+        if (lines.nats[:, first] < threshold).all():
+            _refuse_elsewhere(lines, threshold, nominal_hz)
+            return _Speed(float(lines.hz[first]), SPEED_SEARCH * nominal_hz / np.sqrt(3.0), seen=False)
+    estimates: list[tuple[float, float]] = []
+    for row, order in enumerate(ORDERS):
+        around, deviation = _mean_of(estimates) if estimates else (float(lines.hz[first]), 0.0)
+        reach = max(0.5 * resolution / order, 3.0 * deviation)
+        part = lines.within(around, reach)
+        best = int(part[np.argmax(lines.nats[row, part])])
+        inside = part[0] < best < part[-1] or (row == 0 and best == first)
+        if inside and lines.nats[row, best] > threshold:
+            estimates.append(_vertex(lines.hz, lines.nats[row], best, 0.2 * resolution / order))
+    return _Speed(*_mean_of(estimates), seen=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lines:
+    """Evidence for a line at each order of a speed, summed over the channels.
+
+    Attributes:
+        hz: float64 ``[n]``, speeds.
+        nats: float64 ``[orders, n]``.
+    """
+
+    hz: Floats
+    nats: Floats
+
+    def within(self, hz: float, reach_hz: float) -> NDArray[np.int64]:
+        """Indices of the speeds about one, at least three of them."""
+        reach = max(int(reach_hz / (self.hz[1] - self.hz[0])), 1)
+        middle = int(np.clip(np.searchsorted(self.hz, hz), 1, len(self.hz) - 2))
+        return np.arange(max(middle - reach, 0), min(middle + reach + 1, len(self.hz)))
+
+
+def _line_evidence(centred: Floats, rate_hz: float, nominal_hz: float) -> _Lines:
+    n = len(centred)
+    resolution = rate_hz / n
+    # A Hann window keeps strong lines elsewhere out; it widens a line by half.
+    window = np.hanning(n)[:, np.newaxis]
+    size = 1 << (n * _POINTS_PER_LINE - 1).bit_length()
+    highest = int((ORDERS[-1] * 1.25 * nominal_hz + 12.0 * resolution) * size / rate_hz) + 2
+    power = np.abs(np.fft.rfft(centred * window, size, axis=0)[:highest]) ** 2
+    frequency = np.arange(len(power)) * rate_hz / size
+    hz = np.arange((1.0 - _WIDE_SEARCH) * nominal_hz, (1.0 + _WIDE_SEARCH) * nominal_hz, rate_hz / size / 3)
+    nats = np.zeros((len(ORDERS), len(hz)))
+    for row, order in enumerate(ORDERS):
+        reach = max(0.25 * nominal_hz, 12.0 * resolution, order * _WIDE_SEARCH * nominal_hz)
+        # Exponential variables: their median is ln 2 of their mean, and lines do not touch it.
+        noise = np.median(power[np.abs(frequency - order * nominal_hz) < reach], axis=0) / np.log(2.0)
+        noise = np.maximum(noise, 1e-12 * power.max(axis=0) + np.finfo(np.float64).tiny)
+        for channel in range(power.shape[1]):
+            nats[row] += np.interp(order * hz, frequency, power[:, channel]) / noise[channel]
+    return _Lines(hz, nats)
+
+
+def _vertex(grid: Floats, nats: Floats, best: int, reach_hz: float) -> tuple[float, float]:
+    """Vertex of a parabola through a peak of the log likelihood, and the deviation by its curvature."""
+    reach = max(1, int(reach_hz / (grid[1] - grid[0])))
+    part = slice(max(best - reach, 0), best + reach + 1)
+    bend, slope, _ = np.polyfit(grid[part] - grid[best], nats[part], 2)
+    if bend >= 0.0:
+        return float(grid[best]), reach_hz
+    shift = float(np.clip(-slope / (2.0 * bend), -reach_hz, reach_hz))
+    return float(grid[best]) + shift, float(1.0 / np.sqrt(-2.0 * bend))
+
+
+def _mean_of(estimates: list[tuple[float, float]]) -> tuple[float, float]:
+    """Weighted mean and its deviation, which grows (Birge) where the estimates contradict each other."""
+    values, deviations = np.array(estimates).T
+    weights = deviations**-2.0
+    mean = float((weights * values).sum() / weights.sum())
+    excess = float((weights * (values - mean) ** 2).sum() / max(len(values) - 1, 1))
+    return mean, float(np.sqrt(max(excess, 1.0) / weights.sum()))
+
+
+def _refuse_elsewhere(lines: _Lines, threshold: float, nominal_hz: float) -> None:
+    """Refuse a nominal speed beside which 1X and another order stand elsewhere together."""
+    stands = lines.nats > threshold
+    together = stands[0] & (stands[1] | stands[2])
+    if together.any():
+        found = 60.0 * float(lines.hz[np.argmax(np.where(together, lines.nats.sum(axis=0), 0.0))])
+        raise ValueError(
+            f"the shaft turns at {found:.0f} rpm by its harmonics, not at {60.0 * nominal_hz:g} rpm "
+            f"(+-{SPEED_SEARCH:.0%}): correct the speed"
+        )
+
+
+def _blocks(
+    centred: Floats, present: Flags, rate_hz: float, speed_hz: float
+) -> tuple[Complexes, Floats, int]:
+    """Fit block after block: amplitudes, residuals, and the revolutions in each."""
+    turn = rate_hz / speed_hz
+    revolutions = max(1, int(len(centred) / turn) // _BLOCKS)
+    edges = np.round(np.arange(int(len(centred) / (turn * revolutions)) + 1) * turn * revolutions)
+    edges = np.minimum(edges, len(centred)).astype(np.int64)
+    orders = np.array([0, *ORDERS, *(-order for order in ORDERS)])
+    amplitudes, residual = [], []
+    for first, end in itertools.pairwise(edges):
+        there = np.flatnonzero(present[first:end]) + first
+        if len(there) < _LEAST_PRESENT * (end - first):
+            continue
+        basis = np.exp(2j * np.pi * speed_hz / rate_hz * np.outer(there, orders))
+        gram = basis.conj().T @ basis
+        fit = np.linalg.solve(gram, basis.conj().T @ centred[there])
+        rest = centred[there] - (basis @ fit).real
+        amplitudes.append(2.0 * fit[1 : 1 + len(ORDERS)])
+        residual.append(np.sqrt((rest**2).mean(axis=0)))
+    channels = centred.shape[1]
+    if not amplitudes:
+        return np.empty((0, len(ORDERS), channels), np.complex128), np.empty((0, channels)), revolutions
+    return np.stack(amplitudes), np.stack(residual), revolutions
