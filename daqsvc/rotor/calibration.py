@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.departure import Spread
+from daqsvc.rotor.healthy import Healthy
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
-from daqsvc.rotor.signatures import Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -141,8 +141,8 @@ class Calibration:
             )
         smallest = math.sqrt(20.0 * float(self.variance.mean()) / self.revolutions)
         said.append(
-            f"after {self.revolutions} revolutions the smallest change that can be seen is {smallest:.2g} um, "
-            f"{100.0 * smallest / max(self.amplitude_um, 1e-12):.1f} % of 1X"
+            f"after {self.revolutions} revolutions the smallest change that can be seen is "
+            f"{smallest:.2g} um, {100.0 * smallest / max(self.amplitude_um, 1e-12):.1f} % of 1X"
         )
         if self.rotor.natural_frequency_tolerance > 0.05 or self.fit_error is None:
             said.append(
@@ -200,14 +200,14 @@ def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) ->
     _refuse_unsteady(moved, variance, vectors, rate_hz)
     if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
         raise NotCalibratableError(
-            f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of {math.sqrt(noise / 2.0):.3g} um; "
-            "check that the machine turns, the probes' names and their unit"
+            f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of "
+            f"{math.sqrt(noise / 2.0):.3g} um; check that the machine turns, the probes' names and their unit"
         )
     if abs(baseline[2]) > _REVERSED * abs(baseline[1]):
         raise NotCalibratableError(
             f"the orbit turns against the stated rotation (backward 1X {abs(baseline[2]):.3g} um, forward "
-            f"{abs(baseline[1]):.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft turns "
-            "clockwise; swap the probes, or give the speed a minus sign"
+            f"{abs(baseline[1]):.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft "
+            "turns clockwise; swap the probes, or give the speed a minus sign"
         )
     relative = vectors.noise / vectors.noise.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
@@ -265,14 +265,14 @@ def _refuse_unsteady(moved: Complexes, variance: Floats, vectors: SynchronousVec
     if whole > 0.3 and held > 0.3:
         orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
         raise NotCalibratableError(
-            f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a revolution "
-            f"against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} rpm "
-            f"({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
+            f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a "
+            f"revolution against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} "
+            f"rpm ({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
         )
     worst = int(np.argmax(np.abs(second - first) ** 2 / allowed))
     name = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")[worst]
     raise NotCalibratableError(
         f"not steady: {name} moves by {abs(second[worst] - first[worst]):.3g} um from the first half of the "
-        f"{len(moved)} revolutions to the second ({nats:.0f} nats, at most {_STATIONARY_NATS:.0f} are chance); "
-        "calibrate where the machine runs steadily and is healthy"
+        f"{len(moved)} revolutions to the second ({nats:.0f} nats, at most {_STATIONARY_NATS:.0f} are "
+        "chance); calibrate where the machine runs steadily and is healthy"
     )

@@ -16,10 +16,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.transient import Comparison
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
+_GENERIC_RUB_MARGIN_NATS = 12.0
 _RIVALS = frozenset(("rub", "unmodelled"))
 
 
@@ -34,7 +36,7 @@ class NamingRules:
     """
 
     margin_nats: float = 5.0
-    rub_margin_nats: float = 12.0
+    rub_margin_nats: float = 5.0
     least_severity: float = 0.05
 
 
@@ -71,6 +73,7 @@ def identify(
     previous: Identification | None,
     rules: NamingRules,
     may_name: bool = True,
+    comparison: Comparison | None = None,
 ) -> Identification:
     """Weigh the hypotheses.
 
@@ -81,11 +84,16 @@ def identify(
         previous: the look before; a name takes two that agree.
         rules: margins.
         may_name: whether the rotor has settled enough for a name.
+        comparison: what the transient says of unbalance and loss of damping, if it was abrupt.
     """
     scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
+    if comparison is not None and comparison.holds(complex(change[1])):
+        scores["damping_loss"] += min(0.0, comparison.damping_nats)
+        scores["unbalance"] += min(0.0, -comparison.damping_nats)
     amplitude = healthy.healthy.amplitude_um
     size = float(np.sqrt(np.sum(np.abs(change) ** 2)))
-    deviation = math.sqrt(float(variance.max()))
+    # The typical component: that of the mean position may be drift of the probes, or not there at all.
+    deviation = math.sqrt(float(np.median(variance)))
     best = max(scores, key=lambda name: scores[name])
     probabilities = _posterior(scores)
     candidates: tuple[RotorFault, ...]
@@ -117,10 +125,14 @@ def _group(
     scores: Mapping[RotorFault, float], best: RotorFault, healthy: Calibration, rules: NamingRules
 ) -> tuple[RotorFault, ...]:
     """All hypotheses within the margin of the best one, the best first."""
+    # Without a Laval rotor any change of both senses of 1X would be a loss of damping.
+    alone = best == "damping_loss" and scores[best] - scores["unbalance"] > rules.margin_nats
 
     def margin(name: RotorFault) -> float:
+        if name == "unmodelled" and alone and not healthy.laval:
+            return math.inf
         if {name, best} == _RIVALS:
-            return rules.rub_margin_nats if healthy.laval else math.inf
+            return rules.rub_margin_nats if healthy.laval else _GENERIC_RUB_MARGIN_NATS
         return rules.margin_nats
 
     close = [name for name in scores if scores[best] - scores[name] < margin(name)]

@@ -98,7 +98,7 @@ class LavalRotor:
 
     @property
     def box(self) -> tuple[Floats, Floats]:
-        """Frequencies in rad/s and damping ratios that the rotor may have, equally likely, float64 ``[B]``."""
+        """Frequencies in rad/s and damping ratios that may be, equally likely, float64 ``[B]`` each."""
         spread = np.linspace(-1.0, 1.0, _BOX_POINTS)
         frequency = 1.0 + self.natural_frequency_tolerance * spread
         damping = 1.0 + self.damping_tolerance * spread

@@ -12,7 +12,7 @@ non-harmonic energy: noise, and all that does not repeat with the shaft.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -63,8 +63,8 @@ class SynchronousVectors:
         """Bool ``[R]``, revolutions that could be fitted."""
         return np.isfinite(self.noise)
 
-    def __getitem__(self, part: slice | Flags) -> Self:
-        return type(self)(
+    def __getitem__(self, part: slice | Flags) -> SynchronousVectors:
+        return SynchronousVectors(
             self.vectors[part],
             self.noise[part],
             self.samples[part],
@@ -72,16 +72,15 @@ class SynchronousVectors:
             self.end_index[part],
         )
 
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """One after another."""
-        return cls(
-            np.concatenate([part.vectors for part in parts]) if parts else np.empty((0, 5), np.complex128),
-            *(
-                np.concatenate([getattr(part, name) for part in parts]) if parts else np.empty(0)
-                for name in ("noise", "samples", "period_samples")
-            ),
-            np.concatenate([part.end_index for part in parts]) if parts else np.empty(0, np.int64),
+    @staticmethod
+    def joined(parts: Sequence[SynchronousVectors]) -> SynchronousVectors:
+        """One after another; at least one."""
+        return SynchronousVectors(
+            np.concatenate([part.vectors for part in parts]),
+            np.concatenate([part.noise for part in parts]),
+            np.concatenate([part.samples for part in parts]),
+            np.concatenate([part.period_samples for part in parts]),
+            np.concatenate([part.end_index for part in parts]),
         )
 
 
@@ -123,7 +122,7 @@ def synchronous_vectors(revolutions: Revolutions) -> SynchronousVectors:
     usable = revolutions.trusted & (samples >= np.maximum(_LEAST_SHARE * revolutions.period_samples, 8.0))
     usable &= eigenvalues[:, -1] < _WORST_CONDITION * eigenvalues[:, 0]
     normal[~usable] = np.eye(5)
-    vectors = np.linalg.solve(normal, projected[..., np.newaxis])[..., 0]
+    vectors: Complexes = np.linalg.solve(normal, projected[..., np.newaxis])[..., 0].astype(np.complex128)
     residual = total(np.abs(z) ** 2).real - np.einsum("rk,rk->r", projected.conj(), vectors).real
     noise = np.maximum(residual, 0.0) / np.maximum(samples - 5.0, 1.0)
     vectors[~usable] = np.nan

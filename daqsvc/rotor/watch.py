@@ -1,13 +1,14 @@
 """A calibrated rotor under watch: departure at once, identity after settling, the healthy state again.
 
 The machine's life is a chain of segments, each a stretch in which it does not change. A departure test runs
-on the segment; when it says that the machine has changed, a new segment begins at the estimated onset, and the
-segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`): names within the
+on the segment; when it says that the machine has changed, a new segment begins at the estimated onset, and
+the segment's mean is identified against the healthy baseline at growing intervals (`LOOKS`): names within the
 first revolutions are those of the transient.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -23,13 +24,15 @@ from daqsvc.rotor.calibration import (
 )
 from daqsvc.rotor.departure import DepartureTest, Evidence, threshold_for
 from daqsvc.rotor.identify import Identification, NamingRules, identify
-from daqsvc.rotor.synchronous import SynchronousVectors
+from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors
+from daqsvc.rotor.transient import BEFORE, KNOWN_WITHIN, REVOLUTIONS, Comparison, Transient, compare
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from daqsvc.dsp.revolutions import Revolutions
     from daqsvc.rotor.laval import LavalRotor
 
     Complexes = NDArray[np.complex128]
@@ -48,6 +51,9 @@ _SEGMENT_THRESHOLD_NATS = 30.0
 """A changed machine is less steady than a healthy one: only clear further changes begin a new segment."""
 _KEPT = 512
 """Revolutions that identification can reach back."""
+_ABRUPT = 4
+"""Revolutions in the window of a departure up to which its transient is looked at."""
+_ORBITS_KEPT = REVOLUTIONS + BEFORE + _ABRUPT + 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +112,13 @@ class _Row:
     speed: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Orbit:
+    revolution: int
+    turns: NDArray[np.float64]
+    position: Complexes
+
+
 class RotorWatch:
     """Watches one rotor by its synchronous vectors.
 
@@ -138,6 +151,9 @@ class RotorWatch:
         self._onset: int | None = None
         self._look = 0
         self._identification: Identification | None = None
+        self._orbits: deque[_Orbit] = deque(maxlen=_ORBITS_KEPT)
+        self._alarm: tuple[int, int] | None = None
+        self._comparison: Comparison | None = None
         if calibration is not None:
             self._begin(calibration)
 
@@ -148,12 +164,23 @@ class RotorWatch:
             return "calibrating"
         return "watching" if self._onset is None else "departed"
 
-    def take(self, vectors: SynchronousVectors) -> list[WatchReport]:
-        """Take in revolutions, in order; one report for each that could be fitted."""
+    def take(self, vectors: SynchronousVectors, orbits: Revolutions | None = None) -> list[WatchReport]:
+        """Take in revolutions, in order; one report for each that could be fitted.
+
+        Args:
+            vectors: their synchronous vectors in um.
+            orbits: their samples in um; without them the way from one orbit to the next cannot tell
+                unbalance from loss of damping.
+        """
         said = []
+        ends = [] if orbits is None else [*orbits.starts[1:].tolist(), len(orbits.xy)]
         for i in range(len(vectors)):
             one = vectors[i : i + 1]
             self.revolutions += 1
+            if orbits is not None:
+                part = slice(int(orbits.starts[i]), ends[i])
+                z = orbits.xy[part, 0] + 1j * orbits.xy[part, 1]
+                self._orbits.append(_Orbit(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z))
             if one.usable[0]:
                 said.append(self._take(one))
         return said
@@ -174,7 +201,12 @@ class RotorWatch:
         looked = False
         if departed and evidence is not None:
             self._depart(row.revolution - evidence.window + 1, evidence.window)
+            abrupt = self._follows_transients and evidence.window <= _ABRUPT
+            self._alarm = (row.revolution, evidence.window) if abrupt else None
+            self._comparison = None
         elif self._onset is not None:
+            if self._alarm is not None and row.revolution == self._alarm[0] + REVOLUTIONS:
+                self._comparison = self._compare()
             looked = self._maybe_look(row.revolution)
         return self._report(one, evidence, departed=departed, looked=looked)
 
@@ -256,6 +288,27 @@ class RotorWatch:
             self._return_to_health()
         return True
 
+    @property
+    def _follows_transients(self) -> bool:
+        """Whether the rotor is known well enough, and was healthy before."""
+        known = max(self.rotor.natural_frequency_tolerance, self.rotor.damping_tolerance) <= KNOWN_WITHIN
+        assert self.calibration is not None  # noqa: S101
+        return known and self.calibration.laval
+
+    def _compare(self) -> Comparison | None:
+        """The transient of the last departure, unbalance against loss of damping."""
+        assert self._healthy is not None  # noqa: S101
+        assert self._onset is not None  # noqa: S101
+        orbits = [orbit for orbit in self._orbits if orbit.revolution >= self._onset - BEFORE]
+        if len(orbits) < REVOLUTIONS + BEFORE:
+            return None
+        turns = np.concatenate([orbit.turns + (orbit.revolution - self._onset) for orbit in orbits])
+        position = np.concatenate([orbit.position for orbit in orbits])
+        healthy = np.exp(2j * math.pi * np.outer(turns, HARMONICS)) @ self._healthy.baseline
+        there = np.isfinite(position)
+        transient = Transient(turns[there], (position - healthy)[there], self._healthy.noise)
+        return compare(transient, self._healthy.healthy)
+
     def _next_look(self) -> int:
         if self._look < len(LOOKS):
             return LOOKS[self._look]
@@ -290,11 +343,12 @@ class RotorWatch:
             previous=self._identification,
             rules=self.rules.naming,
             may_name=may_name,
+            comparison=self._comparison,
         )
 
     def _return_to_health(self) -> None:
         assert self._healthy is not None  # noqa: S101
-        self._onset, self._identification = None, None
+        self._onset, self._identification, self._alarm, self._comparison = None, None, None, None
         self._begin(self._healthy)
 
     def _floored(self, noise: float) -> float:
@@ -307,7 +361,8 @@ class RotorWatch:
         if len(rows) < 8:
             return np.zeros(5)
         vectors = np.array([row.vector for row in rows])
-        return np.asarray(np.abs(vectors - vectors.mean(axis=0)) ** 2).sum(axis=0) / (len(rows) - 1)
+        squares = np.abs(vectors - vectors.mean(axis=0)) ** 2
+        return np.asarray(squares.sum(axis=0) / (len(rows) - 1))
 
     def _noise_scatter(self) -> float:
         noise = np.array([row.noise for row in self._segment])
