@@ -5,30 +5,24 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe, Verdict
 from daqsvc.diagnosis.probe_quality import RevolutionJudge
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.diagnosis.rotor_statements import DEPARTURE, UNDETERMINED, Standing, Stater
+from daqsvc.diagnosis.rotor_turns import SpeedReference, Turn, Turns
 from daqsvc.diagnosis.vector_checks import VectorChecks, speed_verdict, static_position_missing
-from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
-from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors, synchronous_vectors
 from daqsvc.rotor.watch import RotorWatch, WatchReport, WatchRules
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable, Sequence
 
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.dsp.revolutions import EdgeCounts, RevolutionCutter, Revolutions
+    from daqsvc.dsp.revolutions import EdgeCounts
     from daqsvc.rotor.calibration import Calibration
     from daqsvc.rotor.laval import LavalRotor
-
-    Floats = NDArray[np.float64]
+    from daqsvc.rotor.synchronous import SynchronousVectors
 
 __all__ = [
     "DEPARTURE",
@@ -39,11 +33,8 @@ __all__ = [
     "SpeedReference",
 ]
 
-SpeedReference: TypeAlias = "KeyphasorProbe | Literal['fixed', 'orbit']"
-"""What tells the shaft angle: a keyphasor, the stated speed, or the orbit's own 1X around it."""
-
-_MIN_PROBE_SPREAD = 0.5
-"""Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
+_WINDOW_S = 0.05
+"""A fast shaft is looked at so often, several revolutions at a time; a slow one every revolution."""
 _DEAD = 0.05
 """A probe that moves less than this part of what it did when it was calibrated is dead."""
 _BLIND_REVOLUTIONS = 8.0
@@ -121,62 +112,38 @@ class RotorSynchronousDetector:
         name: str = "rotor-synchronous",
         listener: Callable[[WatchReport, SynchronousVectors], None] | None = None,
     ) -> None:
-        if not (math.isfinite(speed_rpm) and speed_rpm != 0.0 and math.isfinite(rate_hz) and rate_hz > 0.0):
-            raise ValueError(
-                f"rotor of {machine!r}: a speed of {speed_rpm} rpm sampled at {rate_hz} Hz cannot be "
-                "followed; both must be finite, the rate above 0 and the speed not 0"
-            )
-        spread = math.sin(math.radians(probes[1].angle_deg - probes[0].angle_deg))
-        if abs(spread) < _MIN_PROBE_SPREAD:
-            raise ValueError(
-                f"rotor of {machine!r}: {probes[0].name!r} at {probes[0].angle_deg} and "
-                f"{probes[1].name!r} at {probes[1].angle_deg} degrees look in nearly the same direction; "
-                "the orbit needs two probes 30 to 150 degrees apart"
-            )
+        self._turns = Turns(
+            machine=machine, rate_hz=rate_hz, speed_rpm=speed_rpm, probes=probes, reference=reference
+        )
         self.name = name
         self.stream = stream
+        turns = max(1.0, _WINDOW_S * abs(speed_rpm) / 60.0)
+        self.block = max(1, round(self._turns.period * turns))
         self.ac_coupled = ac_coupled
         self._rate_hz = rate_hz
-        self._period = 60.0 * rate_hz / abs(speed_rpm)
-        self.block = max(1, round(self._period))
         self._reference = reference
         self._rules = rules or WatchRules()
         self._listener = listener
-        clockwise = speed_rpm < 0.0
-        axes_deg = [180.0 - probe.angle_deg if clockwise else probe.angle_deg for probe in probes]
-        angles = np.radians(axes_deg)
-        self._to_xy = np.linalg.inv(np.vstack((np.cos(angles), np.sin(angles))))
-        sensors: list[Probe | KeyphasorProbe] = [*probes]
-        if isinstance(reference, KeyphasorProbe):
-            sensors.append(reference)
-        self._columns = [sensor.column for sensor in sensors]
-        self._um_per_unit = np.array([probe.um_per_unit for probe in probes])
-        self._cutter = self._new_cutter()
         self._judge = RevolutionJudge(probes)
-        self._checks = VectorChecks(probes, axes_deg, angle_assumed=reference == "fixed")
+        self._checks = VectorChecks(probes, self._turns.axes_deg, angle_assumed=reference == "fixed")
         self._stater = Stater(
             machine=machine,
             detector=name,
             stream=stream,
-            sensors=tuple(sensor.name for sensor in sensors),
-            clockwise=clockwise,
+            sensors=tuple(sensor.name for sensor in self._turns.sensors),
+            clockwise=self._turns.clockwise,
             rate_hz=rate_hz,
             rules=self._rules,
         )
         self._watch = self._new_watch(rotor, calibration)
         self._report: WatchReport | None = None
         self._refused = ""
-        self._origin: int | None = None
-        self._next_index = 0
-        self._cutter_index = 0
-        self._held = np.empty((0, 2))
-        self._held_index = 0
         self._untrusted = 0
         self._t_end_ns = 0
         self._period_ns = 0.0
         self._verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
         self._ends: deque[int] = deque(maxlen=_REACH)
-        self._speed_rpm = abs(speed_rpm)
+        self._speed_rpm = self._stated_rpm = abs(speed_rpm)
 
     @property
     def watch(self) -> RotorWatch:
@@ -191,34 +158,31 @@ class RotorSynchronousDetector:
     @property
     def edges(self) -> EdgeCounts:
         """What became of the keyphasor's pulses."""
-        return self._cutter.counts
+        return self._turns.edges
 
     def warm(self) -> None:
         """See `Detector.warm`; there is nothing to compile."""
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
-        samples = np.asarray(window.samples, dtype=np.float64)[:, self._columns]
-        if not len(samples):
+        if not len(window.samples):
             return []
-        samples = np.where(np.isfinite(samples), samples, np.nan)
-        first_index = window.first_index
-        if self._origin is None:
-            self._origin = first_index
-            self._begin_cutting(first_index)
-        elif 0 < (gap := first_index - self._next_index) <= self._period:
-            samples = np.concatenate((np.full((gap, samples.shape[1]), np.nan), samples))
-            first_index -= gap
-        elif gap:
-            self._begin_cutting(first_index)
-        self._next_index = first_index + len(samples)
         self._t_end_ns, self._period_ns = window.t_end_ns, window.period_ns
-        return list(self._step(samples))
+        if abs(window.first_index - self._turns.end_index) > self._turns.period:
+            self._judge.reset()
+            self._checks.reset()
+        said = [self._turn(turn) for turn in self._turns.process(window.samples, window.first_index)]
+        if self._untrusted > _RELOCK_REVOLUTIONS * self._turns.period:
+            # Whatever the pulses seem to be locked to is not the shaft.
+            self._turns.restart()
+            self._untrusted = 0
+        said.append(self._blind())
+        return [diagnosis for diagnosis in said if diagnosis is not None]
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
         verdict = Verdict("missing", silence_reason(self.stream, silence_s))
-        return [self._stater.silence(self._standing(), verdict, self._next_index, t_ns)]
+        return [self._stater.silence(self._standing(), verdict, self._turns.end_index, t_ns)]
 
     def finish(self) -> Diagnosis | None:
         """A last look, at the end of a recording; None if there was no revolution to look at."""
@@ -228,18 +192,6 @@ class RotorSynchronousDetector:
         self._report = replace(self._report, identification=found, looked=found is not None)
         return self._stater.state(self._standing(), self._verdict(), *self._end(self._ends[-1]))
 
-    def _new_cutter(self) -> RevolutionCutter:
-        if self._reference == "fixed":
-            return FixedSpeedCutter(self._period)
-        if self._reference == "orbit":
-            return OrbitCutter(self._period)
-        return KeyphasorCutter(
-            threshold=self._reference.threshold_v,
-            hysteresis=self._reference.hysteresis_v,
-            period_samples=self._period,
-            edge=self._reference.edge,
-        )
-
     def _new_watch(self, rotor: LavalRotor, calibration: Calibration | None) -> RotorWatch:
         if calibration is not None and self.ac_coupled:
             baseline = calibration.baseline.copy()
@@ -247,65 +199,18 @@ class RotorSynchronousDetector:
             calibration = replace(calibration, baseline=baseline)
         return RotorWatch(rotor, self._rate_hz, calibration=calibration, rules=self._rules)
 
-    def _begin_cutting(self, first_index: int) -> None:
-        """Start the cutter at a sample, at the start or after a gap."""
-        self._cutter.reset()
-        self._judge.reset()
-        self._checks.reset()
-        self._cutter_index = self._held_index = first_index
-        self._held = np.empty((0, 2))
-        self._untrusted = 0
-
-    def _step(self, samples: Floats) -> Iterator[Diagnosis]:
-        probes = samples[:, :2] * self._um_per_unit
-        marker = samples[:, 2] if isinstance(self._reference, KeyphasorProbe) else None
-        revolutions = self._cutter.process(probes @ self._to_xy, marker)
-        self._held = np.concatenate((self._held, probes))
-        if len(revolutions):
-            begin = self._cutter_index + revolutions.first_index - self._held_index
-            raw, self._held = np.split(self._held, [begin + len(revolutions.xy)])
-            self._held_index += len(raw)
-            turns = np.split(raw[begin:], revolutions.starts[1:])
-            vectors = self._vectors(revolutions)
-            for i, turn in enumerate(turns):
-                said = self._turn(turn, vectors[i : i + 1], trusted=bool(revolutions.trusted[i]))
-                if said is not None:
-                    yield said
-        if self._untrusted > _RELOCK_REVOLUTIONS * self._period:
-            # Whatever the cutter has locked to, it is not the shaft: it must look for the shaft anew.
-            self._begin_cutting(self._next_index)
-        blind = self._blind()
-        if blind.quality != "good":
-            said = self._stater.maybe(self._standing(), blind, *self._end(self._next_index))
-            if said is not None:
-                yield said
-
-    def _vectors(self, revolutions: Revolutions) -> SynchronousVectors:
-        """Synchronous vectors with their place since the first sample, and the angle of a stated speed."""
-        assert self._origin is not None  # noqa: S101 - set with the first sample
-        vectors = synchronous_vectors(revolutions)
-        components = vectors.vectors.copy()
-        since = self._cutter_index - self._origin
-        if self._reference == "fixed":
-            # After a gap the cutter begins at angle zero anew; the shaft does not.
-            angle = math.tau * math.fmod(since / self._period, 1.0)
-            components *= np.exp(-1j * angle * np.array(HARMONICS))
-        if self.ac_coupled:
-            components[vectors.usable, 0] = 0.0
-        return replace(vectors, vectors=components, end_index=vectors.end_index + since)
-
-    def _turn(self, raw: Floats, one: SynchronousVectors, *, trusted: bool) -> Diagnosis | None:
+    def _turn(self, turn: Turn) -> Diagnosis | None:
         """One revolution: what it is worth, what the watch makes of it, and what is worth saying."""
-        assert self._origin is not None  # noqa: S101 - set with the first sample
-        self._speed_rpm = 60.0 * self._rate_hz / float(one.period_samples[0])
-        verdict = self._judge_turn(raw, one, trusted=trusted)
+        if self.ac_coupled:
+            turn = turn.without_mean()
+        self._speed_rpm = 60.0 * self._rate_hz / float(turn.vector.period_samples[0])
+        verdict = self._judge_turn(turn)
         self._verdicts.append(verdict)
         if verdict.quality != "good":
-            nothing = np.full(1, np.nan)
-            one = replace(one, vectors=np.full((1, 5), np.nan, dtype=np.complex128), noise=nothing)
+            turn = turn.unusable()
         calibrating = self._watch.calibration is None
-        reports = self._watch.take(one)
-        self._ends.append(self._origin + int(one.end_index[0]))
+        reports = self._watch.take(turn.vector)
+        self._ends.append(self._turns.origin + int(turn.vector.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)
         rejected = calibrating and self._watch.calibration is None and bool(self._refused)
@@ -314,33 +219,33 @@ class RotorSynchronousDetector:
         for report in [] if rejected else reports:
             self._report = report
             if self._listener is not None:
-                self._listener(report, one)
+                self._listener(report, turn.vector)
         return self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
 
-    def _judge_turn(self, raw: Floats, one: SynchronousVectors, *, trusted: bool) -> Verdict:
+    def _judge_turn(self, turn: Turn) -> Verdict:
         """What a revolution is worth, the cheapest and clearest reason first."""
         calibration = self._watch.calibration
         least_um = 0.0
         if self._refused and not self._rules.retry:
             return Verdict("not_ok", self._refused)
-        self._untrusted = 0 if trusted else self._untrusted + len(raw)
-        if not trusted or self._speed_rpm * self._period > _OVERSPEED * 60.0 * self._rate_hz:
+        self._untrusted = 0 if turn.trusted else self._untrusted + len(turn.raw)
+        if not turn.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
             return Verdict("missing", self._angle_unknown())
         if calibration is not None:
             verdict = speed_verdict(self._speed_rpm, calibration)
             if verdict.quality != "good":
                 return verdict
             least_um = _DEAD * math.hypot(calibration.noise_um, calibration.amplitude_um / math.sqrt(2.0))
-        verdict = self._judge.judge(raw, least_um)
+        verdict = self._judge.judge(turn.raw, least_um)
         if verdict.quality != "good":
             return verdict
-        if not one.usable[0]:
+        if not turn.vector.usable[0]:
             return Verdict(
                 "missing",
-                f"{len(raw)} samples of a revolution, some missing in one piece, cannot tell its harmonics; "
-                "check the bus and the device, or sample faster",
+                f"{len(turn.raw)} samples of a revolution, some missing in one piece, cannot tell its "
+                "harmonics; check the bus and the device, or sample faster",
             )
-        self._checks.add(one.vectors[0])
+        self._checks.add(turn.vector.vectors[0])
         return Verdict() if calibration is None else self._checks.judge(calibration)
 
     def _look_at_baseline(self, calibration: Calibration) -> None:
@@ -357,25 +262,25 @@ class RotorSynchronousDetector:
             self._watch = self._new_watch(calibration.rotor, calibration)
         self._watch.revolutions = revolutions
 
-    def _blind(self) -> Verdict:
-        """Whether no revolution has come out for so long that it must be said."""
-        period = 60.0 * self._rate_hz / self._speed_rpm
+    def _blind(self) -> Diagnosis | None:
+        """What to say when no revolution has come out for too long."""
+        slowest_rpm = min(self._speed_rpm, self._stated_rpm)
         patience = _ORBIT_LOCK_REVOLUTIONS if self._reference == "orbit" else _BLIND_REVOLUTIONS
-        if self._next_index - self._held_index <= patience * max(period, self._period):
-            return Verdict()
-        return Verdict("missing", self._angle_unknown())
+        if self._turns.waiting_samples <= patience * 60.0 * self._rate_hz / slowest_rpm:
+            return None
+        verdict = Verdict("missing", self._angle_unknown())
+        return self._stater.maybe(self._standing(), verdict, *self._end(self._turns.end_index))
 
     def _angle_unknown(self) -> str:
-        expected_rpm = 60.0 * self._rate_hz / self._period
         if isinstance(self._reference, KeyphasorProbe):
             return (
-                f"{self._reference.name}: its pulses do not tell the shaft angle at {expected_rpm:.0f} rpm; "
-                "check that the shaft turns at that speed, and that the pulse crosses "
+                f"{self._reference.name}: its pulses do not tell the shaft angle at {self._stated_rpm:.0f} "
+                "rpm; check that the shaft turns at that speed, and that the pulse crosses "
                 f"{self._reference.threshold_v} V"
             )
         return (
-            f"no 1X is found in the orbit around {expected_rpm:.0f} rpm; check that the shaft turns at that "
-            "speed, or use a keyphasor"
+            f"no 1X is found in the orbit around {self._stated_rpm:.0f} rpm; check that the shaft turns at "
+            "that speed, or use a keyphasor"
         )
 
     def _verdict(self) -> Verdict:
@@ -406,4 +311,4 @@ class RotorSynchronousDetector:
 
     def _end(self, end_index: int) -> tuple[int, int]:
         """An end of evidence with the monotonic time of the last sample before it."""
-        return end_index, self._t_end_ns - round((self._next_index - end_index) * self._period_ns)
+        return end_index, self._t_end_ns - round((self._turns.end_index - end_index) * self._period_ns)

@@ -38,7 +38,7 @@ def test_the_detector_is_what_the_machine_file_says():
             ("false_alarms_per_1000_rev = 0.1", "false_alarms_per_1000_rev = 0.01"),
         )
     )
-    assert (made.name, made.stream, made.block) == ("rotor-synchronous", "shaft", 64)
+    assert (made.name, made.stream, made.block) == ("rotor-synchronous", "shaft", 80)
     assert made.watch.rules.calibrate_revolutions == 77
     assert made.watch.rules.probe_drift_um == 3.0
     assert made.watch.rules.false_alarms_per_1000_rev == 0.01
