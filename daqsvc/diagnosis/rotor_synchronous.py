@@ -209,7 +209,7 @@ class RotorSynchronousDetector:
         if verdict.quality != "good":
             turn = turn.unusable()
         calibrating = self._watch.calibration is None
-        reports = self._watch.take(turn.vector)
+        reports = self._watch.take(turn.vector, turn.orbit)
         self._ends.append(self._turns.origin + int(turn.vector.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)
