@@ -226,6 +226,8 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
             rule=bank.rule,
             threshold_nats=bank.threshold_nats,
             back_threshold_nats=bank.back_threshold_nats,
+            identity_nats=bank.identity_nats,
+            settle_revolutions=bank.settle_revolutions,
             false_alarms_per_1000_rev=bank.false_alarms_per_1000_rev,
             mtbf_hours=bank.mtbf_hours,
             speed_rpm=machine.machine.speed_rpm,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor import kernels
+from daqsvc.rotor.cusum import decide_by_cusum
 from daqsvc.rotor.decision import DecisionRules, Declaration, Departure
 from daqsvc.rotor.discretise import BankMode, at_speed, discretise
 from daqsvc.rotor.likeness import alike
@@ -223,8 +224,9 @@ class ModelBank:
         cusum_verdicts = np.empty(n, dtype=np.int64)
         suspects = np.empty(n, dtype=np.int64)
         ages = np.zeros(n, dtype=np.int64)
-        self._cusum_decision = kernels.decide_by_cusum(
+        self._cusum_decision = decide_by_cusum(
             scores, self._thresholds, self.rules.threshold_nats, self.rules.identity_nats,
+            round(self.rules.settle_revolutions * self._samples_per_rev),
             _LEAD_LIMIT * self.rules.threshold_nats, self._alike, self._cusum_decision,
             self._cusum, self._lead, self._duels, self._ages, cusum_verdicts, suspects, ages,
         )  # fmt: skip

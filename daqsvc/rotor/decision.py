@@ -36,6 +36,9 @@ class DecisionRules:
         threshold_nats: evidence that changes the decision to a worse mode.
         back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
         identity_nats: lead over the other candidates that a change of the decision takes: odds of 20 to 1.
+        settle_revolutions: time since the onset of its evidence that a change of the decision waits for; the
+            departure is told at once. The transient after a severe fault passes by the orbits of milder
+            ones of other kinds, so that a bank of many kinds of faults needs some four revolutions.
         group_nats: lead below which two modes are not told apart: odds of 150 to 1.
         alike_nats_per_rev: steady evidence a revolution, by the models, below which two modes never are.
         probability_threshold: conditional probability that declares under the paper's rule.
@@ -46,8 +49,9 @@ class DecisionRules:
     threshold_nats: float = 16.0
     back_threshold_nats: float = 25.0
     identity_nats: float = 3.0
+    settle_revolutions: float = 0.0
     group_nats: float = 5.0
-    alike_nats_per_rev: float = 0.1
+    alike_nats_per_rev: float = 0.3
     probability_threshold: float = 0.9
     priors: tuple[float, ...] | None = None
 
@@ -60,6 +64,10 @@ class DecisionRules:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"decision rule: {name} is {value}; evidence is a finite number above 0")
+        if not (math.isfinite(self.settle_revolutions) and self.settle_revolutions >= 0.0):
+            raise ValueError(
+                f"decision rule: settle_revolutions is {self.settle_revolutions}; it is a number from 0 up"
+            )
         if not 0.5 <= self.probability_threshold < 1.0:
             raise ValueError(
                 f"decision rule: probability_threshold is {self.probability_threshold}; "

@@ -89,6 +89,12 @@ class RotorBank(Section):
     mtbf_hours: Positive | None = Field(
         default=None, description="mean time between failures, in place of back_threshold_nats"
     )
+    identity_nats: Positive = Field(
+        default=3.0, description="lead over the other candidates that names the fault"
+    )
+    settle_revolutions: Annotated[NotNegative, Field(le=1000)] = Field(
+        default=0.0, description="how long a departure waits for its name; some 4 for many kinds of faults"
+    )
     calibrate_revolutions: Annotated[int, Field(ge=0, le=100_000)] = Field(
         default=0,
         description="healthy revolutions that unbalance and sag are measured over; 0 trusts the file",
