@@ -9,14 +9,18 @@ from typing import TYPE_CHECKING
 
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.rotor.departure import threshold_for
+from daqsvc.rotor.severity import levels
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.probe_checks import Verdict
     from daqsvc.diagnosis.record import DataQuality, Severity
     from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.identify import Identification
     from daqsvc.rotor.watch import WatchReport, WatchRules
 
     Complexes = NDArray[np.complex128]
@@ -44,6 +48,9 @@ _UNITS = {
     "departure": "nat",
     "departure.energy": "nat",
 }
+_SUFFIXES = {"_um": "um", "_deg": "deg"}
+_DIRECTIONS = frozenset(("change_deg", "shift_deg"))
+"""Figures of a level that are directions in the plane of the orbit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +208,7 @@ class Stater:
             probabilities={} if found is None else {str(k): p for k, p in found.probabilities.items()},
             group=self._group,
             statistics=statistics,
-            units={name: unit for name, unit in _UNITS.items() if name in statistics},
+            units=_units(statistics),
             thresholds=self._thresholds,
             evidence={} if found is None else {str(k): nats for k, nats in found.evidence.items()},
             revolutions=float(standing.revolutions),
@@ -230,7 +237,28 @@ class Stater:
             statistics["departure.energy"] = report.evidence.energy_nats
         if report is not None and report.identification is not None:
             statistics["severity"] = report.identification.severity
+            if calibration is not None and report.identification.named:
+                statistics |= self._levels(report.identification, calibration)
         return statistics
+
+    def _levels(self, found: Identification, calibration: Calibration) -> dict[str, float]:
+        """How large the fault is, for every member of the group: `levels`, angles as in `_unmirrored`."""
+        figures = {}
+        for fault, level in levels(found, calibration).items():
+            for name, value in level.items():
+                mirrored = self._clockwise and name in _DIRECTIONS
+                figures[f"{fault}.{name}"] = (180.0 - value) % 360.0 if mirrored else value
+        return figures
 
     def _unmirrored(self, position: complex) -> complex:
         return -position.conjugate() if self._clockwise else position
+
+
+def _units(statistics: Iterable[str]) -> dict[str, str]:
+    """Unit of each statistic that has one: stated, or the end of its name."""
+    units = {name: _UNITS.get(name, "") for name in statistics}
+    for name in statistics:
+        for suffix, unit in _SUFFIXES.items():
+            if name.endswith(suffix):
+                units[name] = unit
+    return {name: unit for name, unit in units.items() if unit}

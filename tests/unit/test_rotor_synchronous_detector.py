@@ -123,6 +123,12 @@ def test_a_change_is_told_at_once_and_named_when_it_has_settled(grown):
     assert last["1x.amplitude"] == pytest.approx(orbit, rel=0.03)
     assert (last["mean.x"], last["mean.y"]) == pytest.approx((0.0, -10.0), abs=0.5)
     assert last["speed"] == pytest.approx(RPM, rel=1e-3)
+    # How large it is, for each member of the group: unbalance times 1.75.
+    assert last["unbalance.ratio"] == pytest.approx(1.75, rel=0.05)
+    assert last["unbalance.eccentricity_change_um"] == pytest.approx(7.5, rel=0.3)
+    assert said[-1].units["unbalance.eccentricity_change_um"] == "um"
+    assert "unbalance.ratio" not in said[-1].units
+    assert last["damping_loss.damping_ratio"] < 0.11
 
 
 def test_at_most_one_statement_a_revolution_and_one_a_second_while_nothing_changes(steady):
@@ -178,6 +184,9 @@ def test_a_clockwise_shaft_still_hangs_down(softer):
     assert here["mean.y"] == pytest.approx(there["mean.y"])
     assert here["mean.x"] == pytest.approx(-there["mean.x"], abs=1e-6)
     assert (here["1x.phase"] + there["1x.phase"]) % 360.0 == pytest.approx(180.0)
+    loss = "stiffness_loss.stiffness"
+    assert here[loss] == pytest.approx(there[loss])
+    assert there[loss] == pytest.approx(0.85, abs=0.06)
 
 
 def test_returns_to_normal():
