@@ -10,6 +10,7 @@ import numpy as np
 
 from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
+from daqsvc.analysis.baseline import load_baseline
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
@@ -49,20 +50,20 @@ class MachineAnalyst:
         channels: which variable of a recording is which sensor or channel.
         rate_hz: sampling rate; None: what the recording says.
         unit: unit of the proximity probes in the recording; None: those of the sensors.
-        calibration: the healthy machine, in place of what the machine file says.
+        calibration: file with the healthy machine, in place of what the machine file names.
     """
 
     machine: str
     channels: Mapping[str, str] = field(default_factory=dict)
     rate_hz: float | None = None
     unit: LengthUnit | None = None
-    calibration: Calibration | None = None
+    calibration: Path | None = None
 
     def check(self) -> None:
         """See whether the map fits the machine.
 
         Raises:
-            ValueError: it names what is no sensor or channel.
+            ValueError: it names what is no sensor or channel, or the calibration cannot be used.
             MachineFileError: the machine file cannot be used.
         """
         machine = load_machine_file(Path(self.machine))
@@ -71,6 +72,12 @@ class MachineAnalyst:
             raise ValueError(
                 f"--map names {unknown[0]!r}, which is no sensor of {self.machine}; there are "
                 f"{', '.join(sensor.name for sensor in machine.sensors)}"
+            )
+        if machine.pipeline.rotor_synchronous is not None:
+            self._rotor(machine, machine.pipeline.rotor_synchronous)
+        elif self.calibration is not None:
+            raise ValueError(
+                f"--calibration: {self.machine} has no [pipeline.rotor_synchronous] that would use it; add it"
             )
 
     def judge(
@@ -132,24 +139,16 @@ class MachineAnalyst:
 
     def _setup(self, machine: MachineFile, given: models.RotorSynchronous) -> RotorSetup:
         """The calibrated rotor of the machine file, as `analyse` wants it."""
-        rotor = machine.machine.rotor
-        assert rotor is not None  # noqa: S101 - the settings check it
         x, y = (cast("models.ProximityProbe", machine.sensor(name)) for name in given.probes)
         keyphasor = None
         if given.reference == "keyphasor" and given.keyphasor is not None:
             sensor = cast("models.Keyphasor", machine.sensor(given.keyphasor))
             keyphasor = Keyphasor(sensor.name, sensor.threshold_v, sensor.edge, sensor.hysteresis_v)
+        rotor, calibration = self._rotor(machine, given)
         return RotorSetup(
             probes=(x.name, y.name),
             probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),
-            rotor=LavalRotor(
-                natural_frequency_hz=rotor.natural_frequency_hz,
-                damping_ratio=rotor.damping_ratio,
-                natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
-                damping_tolerance=given.damping_tolerance_percent / 100.0,
-                clearance_um=rotor.clearance_um,
-                static_sag_um=rotor.static_sag_um,
-            ),
+            rotor=rotor,
             speed_rpm=machine.machine.speed_rpm,
             unit=self.unit or x.unit,
             keyphasor=keyphasor,
@@ -160,8 +159,31 @@ class MachineAnalyst:
                 probe_drift_um=given.probe_drift_um,
                 retry=False,
             ),
-            calibration=self.calibration,
+            calibration=calibration,
             ac_coupled=machine.ac_coupled,
+        )
+
+    def _rotor(
+        self, machine: MachineFile, given: models.RotorSynchronous
+    ) -> tuple[LavalRotor, Calibration | None]:
+        """The rotor by the calibration if there is one, else by the machine file."""
+        rotor = machine.machine.rotor
+        assert rotor is not None  # noqa: S101 - the settings check it
+        path = self.calibration
+        if path is None and given.calibration is not None:
+            path = machine.resolve(given.calibration)
+        if path is not None:
+            return load_baseline(path, machine.machine.speed_rpm, rotor.clearance_um)
+        return (
+            LavalRotor(
+                natural_frequency_hz=rotor.natural_frequency_hz,
+                damping_ratio=rotor.damping_ratio,
+                natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
+                damping_tolerance=given.damping_tolerance_percent / 100.0,
+                clearance_um=rotor.clearance_um,
+                static_sag_um=rotor.static_sag_um,
+            ),
+            None,
         )
 
     def _statements(self, machine: MachineFile, recording: Recording) -> dict[str, Statements]:

@@ -209,23 +209,22 @@ def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
         )
 
 
-def refuse_gaps(unusable: int, revolutions: int, why: str) -> None:
+def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[str]) -> None:
     """Refuse a recording most revolutions of which cannot be judged.
 
     Args:
         unusable: revolutions that cannot.
         revolutions: all of them.
-        why: the last reason.
+        complaints: of the detector.
 
     Raises:
         RefusedError: more than half of them, or there is none at all.
     """
     if not revolutions:
         raise RefusedError("no whole revolution was found; check the speed and the keyphasor")
+    why = complaints[-1] if complaints else "samples are missing"
     if unusable > _MOST_UNUSABLE * revolutions:
-        raise RefusedError(
-            f"{why or 'samples are missing'} ({unusable} of {revolutions} revolutions cannot be judged)"
-        )
+        raise RefusedError(f"{why} ({unusable} of {revolutions} revolutions cannot be judged)")
 
 
 def lacks_mean(samples: Floats) -> bool:

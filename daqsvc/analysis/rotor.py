@@ -59,9 +59,6 @@ class _Watched:
         self.reports.append(report)
         self.vectors.append(vectors)
 
-    def joined(self) -> SynchronousVectors:
-        return SynchronousVectors.joined(self.vectors)
-
 
 def analyse(
     recording: Recording, setup: RotorSetup, progress: Callable[[int, int], None] | None = None
@@ -145,9 +142,10 @@ def _judge(
         listener=watched.take,
     )
     complaints = _feed(detector, samples, recording.rate_hz, period, progress)
-    reading = _Reading(
-        recording, setup, detector, tuple(watched.reports), watched.joined(), tuple(complaints)
-    )
+    revolutions = detector.watch.revolutions
+    checks.refuse_gaps(revolutions - len(watched.reports), revolutions, complaints)
+    vectors = SynchronousVectors.joined(watched.vectors)
+    reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, tuple(complaints))
     return reading.verdict(quality)
 
 
@@ -194,7 +192,6 @@ class _Reading:
             unusable_revolutions=unusable,
             keyphasor=self.detector.edges if self.setup.keyphasor is not None else None,
         )
-        checks.refuse_gaps(unusable, watch.revolutions, self.complaints[-1] if self.complaints else "")
         for complaint in self.complaints:
             quality = quality.with_problem(complaint)
         calibration = watch.calibration

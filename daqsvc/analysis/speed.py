@@ -72,6 +72,11 @@ def speed_of(
         raise RefusedError(too_short(revolutions, needed, setup))
     if setup.follow_orbit:
         return Speed(setup.speed_rpm), quality
+    if setup.calibration is not None:
+        quality = quality.with_problem(
+            "without a keyphasor the phases of the calibration hold only if this recording begins at the "
+            "same shaft angle as the healthy one"
+        )
     return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
 
 

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from daqsvc.analysis.many import Analyst, Outcome
-    from daqsvc.rotor.calibration import Calibration
     from daqsvc.settings import MachineFile
 
     Load: TypeAlias = Callable[[Path], MachineFile | None]
@@ -102,15 +101,18 @@ class AnalyzeCommand:
 
         keyphasor, speed = arguments.keyphasor, arguments.speed_rpm or SpeedOption(None)
         try:
-            calibration = _calibration(arguments.calibration)
             rules = WatchRules(
                 calibrate_revolutions=arguments.calibrate_revs,
                 false_alarms_per_1000_rev=arguments.false_alarms_per_1000_rev,
                 retry=False,
             )
             threshold_for(rules.false_alarms_per_1000_rev)
-            rotor = calibration.rotor if calibration is not None else None
-            if rotor is None or arguments.natural_frequency_hz is not None:
+            calibration = None
+            if arguments.calibration is not None:
+                from daqsvc.analysis.baseline import load_baseline  # noqa: PLC0415
+
+                rotor, calibration = load_baseline(arguments.calibration, speed.rpm, arguments.clearance_um)
+            else:
                 rotor = LavalRotor(
                     natural_frequency_hz=arguments.natural_frequency_hz,
                     damping_ratio=arguments.damping_ratio,
@@ -149,7 +151,7 @@ class AnalyzeCommand:
                 channels=arguments.map,
                 rate_hz=arguments.fs,
                 unit=arguments.unit,
-                calibration=_calibration(arguments.calibration),
+                calibration=arguments.calibration,
             )
             analyst.check()
         except (OSError, ValueError) as error:
@@ -182,14 +184,6 @@ def _tell(outcomes: Iterable[Outcome], *, as_json: bool) -> int:
         if outcome.refused:
             code = EXIT_REFUSED
     return code
-
-
-def _calibration(path: Path | None) -> Calibration | None:
-    if path is None:
-        return None
-    from daqsvc.rotor.calibration_file import load_calibration  # noqa: PLC0415
-
-    return load_calibration(path)
 
 
 def _processes(jobs: int | None, recordings: int) -> int:

@@ -189,14 +189,19 @@ def misuse(arguments: argparse.Namespace, machine: str | None, recordings: Seque
     if machine is not None:
         extra = [name for name, is_there in given.items() if is_there]
         return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
+    known = [
+        name
+        for name in ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um")
+        if given[name] and arguments.calibration is not None
+    ]
+    if known:
+        return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
     return _lacking(arguments, given)
 
 
 def _lacking(arguments: argparse.Namespace, given: dict[str, bool]) -> str:
     needed = ["--probes"]
-    if arguments.calibration is None or any(
-        given[name] for name in ("--natural-frequency-hz", "--damping-ratio")
-    ):
+    if arguments.calibration is None:
         needed += ["--natural-frequency-hz", "--damping-ratio"]
     if arguments.keyphasor is None:
         needed.append("--speed-rpm")

@@ -15,7 +15,12 @@ import numpy as np
 import pytest
 from orbit_files import OPTIONS, RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, Orbit
 
+from daqsvc.analysis.rotor import analyse
+from daqsvc.analysis.setup import Keyphasor, RotorSetup
 from daqsvc.cli import main
+from daqsvc.recording.recording import Recording
+from daqsvc.rotor.calibration_file import save_calibration
+from daqsvc.rotor.laval import LavalRotor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -439,6 +444,58 @@ def test_missing_matplotlib_is_told(
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     assert main(["analyze", "a.npz", *OPTIONS, "--plot", str(tmp_path)]) == 1
     assert "pip install 'daqsvc[plot]'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    """The healthy machine by the first revolutions of a healthy recording, on disk."""
+    orbit = Orbit(seed=9)
+    recording = Recording(
+        ("x", "y", "k"),
+        np.column_stack([orbit.x, orbit.y, orbit.keyphasor]),
+        RATE_HZ,
+        tmp_path / "healthy",
+        0,
+    )
+    rotor = LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1)
+    setup = RotorSetup(probes=("x", "y"), rotor=rotor, speed_rpm=SPEED_RPM, keyphasor=Keyphasor("k"))
+    healthy = analyse(recording, setup).calibration
+    assert healthy is not None
+    save_calibration(healthy, tmp_path / "healthy.toml")
+    return tmp_path / "healthy.toml"
+
+
+def test_a_calibration_stands_in_for_the_first_revolutions(
+    analyze: Callable[..., Any], calibration: Path, tmp_path: Path
+) -> None:
+    options = ["--probes", "x,y", "--keyphasor", "keyphasor", "--calibration", calibration]
+    faulty = Orbit(change=UNBALANCE)
+    for name in ("x", "y", "keyphasor"):
+        setattr(faulty, name, getattr(faulty, name)[85 * 64 :])
+    code, found, err = analyze(
+        Orbit(30).save(tmp_path / "h.npz"), faulty.save(tmp_path / "f.npz"), *options, "--jobs", 2
+    )
+    assert (code, err) == (0, "")
+    assert [one["verdict"] for one in found] == ["normal", "unbalance"]
+    assert found[0]["calibration"] == found[1]["calibration"]
+    assert found[1]["departure"]["revolution"] <= 2
+    code, found, err = analyze(tmp_path / "f.npz", *options, "--damping-ratio", "0.1")
+    assert (code, found) == (2, [])
+    assert "the calibration says this" in err
+    code, found, err = analyze(tmp_path / "f.npz", *options, "--speed-rpm", 1000)
+    assert (code, found) == (2, [])
+    assert "no baseline within 5 % of 1000.0 rpm" in err
+
+
+def test_a_calibration_replaces_that_of_the_machine_file(
+    analyze: Callable[..., Any], calibration: Path, machine: Path, tmp_path: Path
+) -> None:
+    file = Orbit(30).save(tmp_path / "h.npz")
+    code, (found,), _ = analyze(machine, file, "--calibration", calibration)
+    assert (code, found["verdict"]) == (0, "normal")
+    assert found["calibration"]["amplitude_um"] == pytest.approx(40.0, rel=0.01)
+    code, (found,), _ = analyze(machine, file)
+    assert "too short" in found["refused"]
 
 
 @pytest.fixture
