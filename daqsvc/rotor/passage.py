@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_STEP_SPREAD = 0.1
+_STEP_SPREAD = 0.25
 """Samples are taken together until the variance of their evidence is this much, nats squared."""
-_FINEST_CELL = 0.1
+_FINEST_CELL = 0.15
 _MOST_CELLS = 400
 _STEPS_BEFORE = 64
 _MOST_STEPS = 4000
@@ -57,7 +57,8 @@ def delay_samples(before: Axis, after: Axis, w: float, threshold_nats: float, qu
     # The slowest of both modes rules the transient.
     transient = min(_LONGEST_TRANSIENT, math.ceil(_DECAYED / min(before.decay, after.decay)))
     growing = _changing_steps(growth_after(before, after, w, transient))
-    steady = _steps_of(steady_growth(after, after, before, w))
+    lasting = steady_growth(after, after, before, w)
+    steady = _steps_of(lasting) if lasting.drift[0] > 0.0 else ()
     time = passed = 0.0
     for samples, drift, spread in itertools.islice(itertools.chain(growing, steady), _MOST_STEPS):
         before_step, passed = passed, cusum.advance(samples * drift, samples * spread)
@@ -82,6 +83,8 @@ class _Cusum:
         cell = threshold_nats / (count - 0.5)
         self._edges = (np.arange(1 - count, count + 1) - 0.5) * cell
         self._passed = 0.0
+        self._step = (math.nan, math.nan)
+        self._moves = self._exits = self._weight
 
     def forget_alarms(self) -> None:
         """Keep to the runs that have not passed yet."""
@@ -90,10 +93,14 @@ class _Cusum:
 
     def advance(self, drift: float, spread: float) -> float:
         """One step by a normal increment of that mean and variance; the part of all runs that has passed."""
+        if self._step != (drift, spread):
+            self._step = (drift, spread)
+            below = ndtr((self._edges - drift) / math.sqrt(max(spread, 1e-12)))
+            self._moves = below[1:] - below[:-1]
+            self._exits = 1.0 - below[: len(self._weight) - 1 : -1]
         count = len(self._weight)
-        below = ndtr((self._edges - drift) / math.sqrt(max(spread, 1e-12)))
-        moved = np.convolve(self._weight, np.diff(below))[count - 1 : 2 * count - 1]
-        self._passed += float(self._weight @ (1.0 - below[: count - 1 : -1]))
+        moved = np.convolve(self._weight, self._moves)[count - 1 : 2 * count - 1]
+        self._passed += float(self._weight @ self._exits)
         moved[0] = max(0.0, 1.0 - self._passed - float(moved[1:].sum()))
         self._weight = moved
         return self._passed

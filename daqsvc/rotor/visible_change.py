@@ -7,20 +7,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from scipy.optimize import brentq
 
 from daqsvc.rotor.evidence import orbit_noise
 from daqsvc.rotor.passage import delay_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable
 
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.evidence import Axis
     from daqsvc.rotor.model import NormalisedRotor
-
-    Floats = NDArray[np.float64]
 
 Fault = Literal["unbalance", "damping_loss", "stiffness_loss", "static_load"]
 
@@ -28,6 +25,7 @@ VECTOR_THRESHOLD_NATS = 20.0
 """Departure test of the synchronous vector: about one false alarm in 10,000 revolutions."""
 _VECTOR_FLOOR = 0.002
 """Part of |1X| that the synchronous vector's baseline is never believed better than."""
+_LOG_TOLERANCE = 0.005
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,23 +49,25 @@ class SmallestChange:
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """A kind of fault: the rotor at a quantity, the healthy quantity, and the quantities to look at."""
+    """A kind of fault: its quantity and the rotor with it, by severity from 0, and the worst severity."""
 
     fault: Fault
-    healthy: Callable[[NormalisedRotor], float]
+    quantity: Callable[[NormalisedRotor, float], float]
     rotor: Callable[[NormalisedRotor, float], NormalisedRotor]
-    quantities: Callable[[NormalisedRotor], Floats]
+    worst: float
 
 
-_RISE = np.geomspace(1e-4, 30.0, 30)
-_LOSS = np.geomspace(1e-4, 0.98, 30)
+_MILDEST = 1e-4
 _KINDS = (
-    _Kind("unbalance", lambda _: 1.0, lambda r, x: replace(r, e=r.e * x), lambda _: 1.0 + _RISE),
+    _Kind("unbalance", lambda _, x: 1.0 + x, lambda r, x: replace(r, e=r.e * (1.0 + x)), 30.0),
     _Kind(
-        "damping_loss", lambda r: r.zeta, lambda r, x: replace(r, zeta=x), lambda r: r.zeta * (1.0 - _LOSS)
+        "damping_loss",
+        lambda r, x: r.zeta * (1.0 - x),
+        lambda r, x: replace(r, zeta=r.zeta * (1.0 - x)),
+        0.98,
     ),
-    _Kind("stiffness_loss", lambda _: 1.0, lambda r, x: replace(r, k=r.k * x), lambda _: 1.0 - _LOSS),
-    _Kind("static_load", lambda _: 0.0, lambda r, x: replace(r, g=r.g + r.k * x), lambda _: _RISE / 10.0),
+    _Kind("stiffness_loss", lambda _, x: 1.0 - x, lambda r, x: replace(r, k=r.k * (1.0 - x)), 0.98),
+    _Kind("static_load", lambda _, x: x, lambda r, x: replace(r, g=r.g + r.k * x), 3.0),
 )
 
 
@@ -93,30 +93,48 @@ def smallest_changes(
     before = axis(healthy)
     rotor = healthy.rotor
     needed = within_rev * 2.0 * math.pi / abs(rotor.w) / before.duration
-    found = []
-    for kind in _KINDS:
+
+    def haste(changed: NormalisedRotor) -> float:
+        after = axis(replace(healthy, rotor=changed))
+        return needed / max(1.0, delay_samples(before, after, rotor.w, threshold_nats))
+
+    def clarity(changed: NormalisedRotor) -> float:
+        return _vector_evidence(before, changed, calibration_rev) / VECTOR_THRESHOLD_NATS
+
+    def smallest(kind: _Kind, criterion: Callable[[NormalisedRotor], float]) -> float | None:
         if ac_coupled and kind.fault == "static_load":
-            found.append(SmallestChange(fault=kind.fault, healthy=0.0, by_bank=None, by_vector=None))
-            continue
-        quantities, normal = kind.quantities(rotor), kind.healthy(rotor)
-        changed = [kind.rotor(rotor, float(quantity)) for quantity in quantities]
-        afters = [axis(replace(healthy, rotor=candidate)) for candidate in changed]
-        delays = [delay_samples(before, after, rotor.w, threshold_nats) for after in afters]
-        haste = needed / np.maximum(delays, 1.0)
-        evidence = _vector_evidence(before, changed, calibration_rev)
-        found.append(
-            SmallestChange(
-                fault=kind.fault,
-                healthy=normal,
-                by_bank=_first_crossing(quantities, haste, normal),
-                by_vector=_first_crossing(quantities, evidence / VECTOR_THRESHOLD_NATS, normal),
-            )
+            return None
+        severity = _mildest(lambda x: criterion(kind.rotor(rotor, x)), kind.worst)
+        return None if severity is None else kind.quantity(rotor, severity)
+
+    return tuple(
+        SmallestChange(
+            fault=kind.fault,
+            healthy=kind.quantity(rotor, 0.0),
+            by_bank=smallest(kind, haste),
+            by_vector=smallest(kind, clarity),
         )
-    return tuple(found)
+        for kind in _KINDS
+    )
 
 
-def _vector_evidence(before: Axis, changed: Sequence[NormalisedRotor], calibration_rev: float) -> Floats:
-    """Evidence of changes in the synchronous vector after long enough, float64 ``[len(changed)]``, nats.
+def _mildest(criterion: Callable[[float], float], worst: float) -> float | None:
+    """The severity at which a criterion passes 1; None if not even the worst one does."""
+
+    def short_of(log_severity: float) -> float:
+        # Both criteria go with the square of a small severity: a line in logarithms, all but one.
+        return math.log(max(criterion(math.exp(log_severity)), 1e-12))
+
+    mildest, worst = math.log(_MILDEST), math.log(worst)
+    if short_of(worst) < 0.0:
+        return None
+    if short_of(mildest) >= 0.0:
+        return _MILDEST
+    return math.exp(float(brentq(short_of, mildest, worst, xtol=_LOG_TOLERANCE)))
+
+
+def _vector_evidence(before: Axis, changed: NormalisedRotor, calibration_rev: float) -> float:
+    """Evidence of a change in the synchronous vector after long enough, nats.
 
     With sensor noise alone this is ``nc N SNR delta^2``: the baseline's nc revolutions are the limit, not
     patience. The orbit's own noise is not white and adds what it has at rest and at 1X.
@@ -126,18 +144,5 @@ def _vector_evidence(before: Axis, changed: Sequence[NormalisedRotor], calibrati
     white = 2.0 * before.noise**2 * before.duration / revolution
     variance = white + orbit_noise(rotor, before.process_noise, w) / revolution
     variance = variance / calibration_rev + (_VECTOR_FLOOR * abs(rotor.orbit())) ** 2
-    moved = np.array([(r.rest - rotor.rest, r.orbit() - rotor.orbit()) for r in changed])
-    return np.asarray(np.sum(np.abs(moved) ** 2 / variance, axis=1), dtype=np.float64)
-
-
-def _first_crossing(quantities: Floats, ratios: Floats, healthy: float) -> float | None:
-    """The quantity nearest the healthy one where a ratio passes 1, between two of a grid in logarithms."""
-    if not (above := ratios >= 1.0).any():
-        return None
-    first = int(above.argmax())
-    if first == 0 or ratios[first - 1] <= 0.0:
-        return float(quantities[first])
-    distance = np.log(np.abs(quantities[first - 1 : first + 1] - healthy))
-    height = np.log(ratios[first - 1 : first + 1])
-    step = math.exp(float(np.interp(0.0, height, distance)))
-    return healthy + math.copysign(step, float(quantities[first]) - healthy)
+    moved = np.array([changed.rest - rotor.rest, changed.orbit() - rotor.orbit()])
+    return float(np.sum(np.abs(moved) ** 2 / variance))
