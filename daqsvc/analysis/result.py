@@ -97,7 +97,7 @@ class RotorAnalysis:
         probabilities: of every verdict.
         evidence: nats of every hypothesis over "normal".
         severity: modulus of the change over the healthy whirl's amplitude.
-        level: how large the fault is, in its own terms.
+        level: how large each fault of the group would be, in its own terms (`daqsvc.rotor.severity`).
         identification: what the last look saw; None while the machine is healthy.
         onset: estimated begin of the change.
         departure: where the alarm is raised.
@@ -120,7 +120,7 @@ class RotorAnalysis:
     probabilities: Mapping[RotorFault, float] = field(default_factory=dict)
     evidence: Mapping[RotorFault, float] = field(default_factory=dict)
     severity: float | None = None
-    level: Mapping[str, Any] = field(default_factory=dict)
+    level: Mapping[RotorFault, Mapping[str, float]] = field(default_factory=dict)
     identification: Identification | None = None
     onset: Instant | None = None
     departure: Instant | None = None
@@ -152,7 +152,7 @@ class RotorAnalysis:
                 else {},
                 "evidence": dict(self.evidence),
                 "severity": self.severity,
-                "level": dict(self.level),
+                "level": {fault: dict(level) for fault, level in self.level.items()},
                 "change_um": None
                 if change is None
                 else {
@@ -181,6 +181,11 @@ class RotorAnalysis:
             lines.append(f"changed at {_told(self.onset)}; alarm at {_told(self.departure)}" + self._named())
         if self.identification is not None and self.calibration is not None:
             lines.append(self._change())
+            lines += [
+                f"{_words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
+                for fault, level in self.level.items()
+                if level
+            ]
         if self.calibration is not None:
             was = self.calibration
             lines.append(
@@ -228,9 +233,8 @@ class RotorAnalysis:
         assert self.identification is not None  # noqa: S101 - asked before
         assert self.calibration is not None  # noqa: S101 - asked before
         change, now = self.identification.change, self.calibration.baseline + self.identification.change
-        level = "".join(f", {_words(key)} {_figure(value)}" for key, value in self.level.items())
         return (
-            f"severity {self.identification.severity:.3g} of the healthy whirl{level}; 1X is "
+            f"severity {self.identification.severity:.3g} of the healthy whirl; 1X is "
             f"{abs(now[1]):.4g} um at {_degrees(now[1]):.0f} degrees, the mean position moved by "
             f"{abs(change[0]):.3g} um, backward 1X by {abs(change[2]):.3g}, 2X by {abs(change[3]):.3g} um"
         )
@@ -284,5 +288,12 @@ def _percent(probability: float) -> str:
     return "above 99.9 %" if probability > 0.999 else f"{100.0 * probability:.1f} %"
 
 
-def _figure(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+_UNITS = {"_um": " um", "_deg": " degrees", "_percent": " %"}
+
+
+def _figure(key: str, value: float) -> str:
+    """A figure whose name ends in its unit, in words: ``change_um`` 3.0 is ``change 3 um``."""
+    for ending, unit in _UNITS.items():
+        if key.endswith(ending):
+            return f"{_words(key.removesuffix(ending))} {value:.3g}{unit}"
+    return f"{_words(key)} {value:.3g}"

@@ -25,6 +25,7 @@ from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration import Calibration, compensated
 from daqsvc.rotor.departure import threshold_for
+from daqsvc.rotor.severity import levels
 from daqsvc.rotor.signatures import likelihoods
 from daqsvc.rotor.synchronous import SynchronousVectors
 
@@ -236,6 +237,7 @@ class _Reading:
             probabilities=last.probabilities,
             evidence=last.evidence,
             severity=last.severity,
+            level=levels(last, calibration),
             identification=last,
             declaration=self._declared(departed, last),
         )

@@ -77,6 +77,7 @@ def test_a_growing_unbalance_is_found_and_placed(analyze: Callable[..., Any], tm
     assert found["severity"] == pytest.approx(UNBALANCE, rel=0.05)
     real, imaginary = found["change_um"]["1"]
     assert math.hypot(real, imaginary) == pytest.approx(UNBALANCE * 40.0, rel=0.05)
+    assert found["level"]["unbalance"]["ratio"] == pytest.approx(1.0 + UNBALANCE, rel=0.02)
     assert math.degrees(math.atan2(imaginary, real)) == pytest.approx(math.degrees(-0.7), abs=3.0)
     assert found["calibration"]["amplitude_um"] == pytest.approx(40.0, rel=0.01)
     assert found["calibration"]["noise_um"] == pytest.approx(1.0, rel=0.1)
@@ -87,6 +88,14 @@ def test_a_growing_unbalance_is_found_and_placed(analyze: Callable[..., Any], tm
     assert found["history"][-1]["named"] is True
     assert found["refused"] is None
     assert found["data_quality"]["problems"] == []
+
+
+def test_every_key_is_documented(analyze: Callable[..., Any], machine: Path, tmp_path: Path) -> None:
+    told = (CONFIG.parents[1] / "docs" / "analyze.md").read_text()
+    _, (found,), _ = analyze(machine, Orbit(change=UNBALANCE).save(tmp_path / "a.npz"))
+    for keys in (found, found["calibration"], found["data_quality"], found["history"][0], found["onset"]):
+        assert [key for key in keys if f"`{key}`" not in told] == []
+    assert [name for name in VERDICTS if f"`{name}`" not in told] == []
 
 
 def test_a_healthy_machine_is_normal(analyze: Callable[..., Any], tmp_path: Path) -> None:
