@@ -45,6 +45,8 @@ _OVERSPEED = 2.0
 """No machine turns at so many times its stated speed; pulses that say so are noise."""
 _RELOCK_REVOLUTIONS = 16.0
 """After so long without a shaft angle the keyphasor is looked at as if for the first time."""
+_NO_MEAN_UM = 1e6
+"""A drift of the probes beside which no mean position is evidence of anything."""
 _DOUBTED = 2
 """So many of the last few revolutions must be worth nothing before the statement is not good."""
 _REMEMBERED = 4
@@ -73,8 +75,9 @@ class RotorSynchronousDetector:
     A shaft that turns clockwise is looked at from its other end (x mirrored): its whirl is then forward, and
     gravity still points down. Statistics are in the machine's own coordinates.
 
-    With AC-coupled probes the mean position says nothing and is left out: a static load cannot be seen. The
-    same is assumed if the calibrated mean position is zero where the shaft's weight must bend it.
+    With AC-coupled probes the mean position says nothing and is left out: a static load cannot be seen,
+    stiffness loss is hard to tell from unbalance, and rub and an unmodelled change stay one group. The same
+    is assumed if the calibrated mean position is zero where the shaft's weight must bend it.
 
     Args:
         machine: name of the machine.
@@ -197,7 +200,12 @@ class RotorSynchronousDetector:
             baseline = calibration.baseline.copy()
             baseline[0] = 0.0
             calibration = replace(calibration, baseline=baseline)
-        return RotorWatch(rotor, self._rate_hz, calibration=calibration, rules=self._rules)
+        rules = self._rules
+        if self.ac_coupled:
+            # Where the shaft touches is told from where it runs: without that a crack can look like a rub.
+            naming = replace(rules.naming, rub_margin_nats=math.inf)
+            rules = replace(rules, probe_drift_um=_NO_MEAN_UM, naming=naming)
+        return RotorWatch(rotor, self._rate_hz, calibration=calibration, rules=rules)
 
     def _turn(self, turn: Turn) -> Diagnosis | None:
         """One revolution: what it is worth, what the watch makes of it, and what is worth saying."""

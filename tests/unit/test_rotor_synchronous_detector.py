@@ -417,6 +417,13 @@ def test_ac_coupled_probes_see_no_static_load():
     assert run(detector(), channels(revolutions=80.0))[-1].reason == ""
 
 
+def test_without_a_mean_position_stiffness_loss_is_not_told_from_unbalance(softer):
+    with_mean = run(detector(), softer)[-1]
+    assert (with_mean.decision, with_mean.group) == ("stiffness_loss", ())
+    without = run(detector(ac_coupled=True), softer)[-1]
+    assert {"stiffness_loss", "unbalance"} <= set(without.group)
+
+
 def test_the_listener_hears_every_judged_revolution(steady):
     heard = []
     run(detector(listener=lambda report, vectors: heard.append((report, vectors))), steady)
