@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from typing import TYPE_CHECKING
@@ -23,11 +24,13 @@ _CONTACT_FREE = 0.9
 """An orbit that stays within this part of the clearance is not driven backwards by a rub."""
 _BACKWARD = 2.0
 """Backward over forward radius from which the orbit as a whole turns backwards."""
+_DIRECTION_REVOLUTIONS = 4
 _DC_REVOLUTIONS = 4
 _NO_DC = 0.25
 """Part of the expected static position below which the probes show none."""
-_SLIP_REVOLUTIONS = 24
-_SLIP = 0.002
+_SLIP_REVOLUTIONS = 32
+_SLIP_PARTS = 4
+_SLIP = 0.003
 """Relative difference of orbit's and keyphasor's speed that a real machine cannot have."""
 _UNSTEADY = 0.3
 
@@ -54,6 +57,7 @@ class OrbitWatch:
         """Forget the orbit, for instance after a long gap."""
         self._fit = SteadyFit()
         self._covered = 0
+        self._forward = False
         self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
 
     def add(self, xy: Floats, cos: Floats, sin: Floats, revolution: int) -> None:
@@ -73,6 +77,22 @@ class OrbitWatch:
             self._motions.append(self._fit.solve())
         self._fit, self._covered = SteadyFit(), 0
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether the orbit has been seen to turn with the shaft, or to meet the housing, where it need not.
+
+        Until then the models may not be compared: what is strange to all of them favours the one that
+        expects the least.
+        """
+        motions = list(self._motions)
+        if not self._forward and motions:
+            forward = _radius([motion.forward for motion in motions])
+            backward = _radius([motion.backward for motion in motions])
+            rest = _radius([motion.rest for motion in motions])
+            clear = forward > max(backward, _SIGNIFICANT * self._sigma(motions))
+            self._forward = clear or forward + backward + rest > _CONTACT_FREE
+        return self._forward
+
     def doubt(self) -> str:
         """What cannot be true, with the remedy; empty if nothing is wrong."""
         return self._direction() or self._static_position() or self._slip()
@@ -82,7 +102,7 @@ class OrbitWatch:
         return self._noise * math.sqrt(2.0 / sum(motion.samples for motion in motions))
 
     def _direction(self) -> str:
-        motions = list(self._motions)[-2:]
+        motions = list(self._motions)[-_DIRECTION_REVOLUTIONS:]
         if not motions:
             return ""
         forward = _radius([motion.forward for motion in motions])
@@ -124,13 +144,13 @@ class OrbitWatch:
         sigma = self._sigma(motions[:1])
         if np.ptp(radius) > max(_UNSTEADY * radius.mean(), _SIGNIFICANT * sigma):
             return ""
-        first, second, third = np.split(forward, 3)
-        turns = np.angle([np.vdot(first, second), np.vdot(second, third)])
-        revolutions = len(forward) // 3
+        parts = np.split(forward, _SLIP_PARTS)
+        turns = np.angle([np.vdot(before, after) for before, after in itertools.pairwise(parts)])
+        revolutions = len(forward) // _SLIP_PARTS
         sigma_turn = sigma / float(radius.mean()) / math.sqrt(revolutions)
         slip = float(turns.mean()) / revolutions / math.tau
-        # A machine that changes turns its orbit once, between two of the thirds; a slip goes on.
-        lasting = np.ptp(turns) < max(0.5 * abs(turns.mean()), 2.0 * sigma_turn) and turns.prod() > 0.0
+        # A machine that changes turns its orbit once, within two of the parts at most; a slip goes on.
+        lasting = np.abs(turns).min() > 0.4 * np.abs(turns).max() and abs(np.sign(turns).sum()) == len(turns)
         if abs(slip) < _SLIP or not lasting or abs(turns.sum()) < _SIGNIFICANT * sigma_turn:
             return ""
         return (

@@ -281,7 +281,8 @@ class RotorBankDetector:
         self._watch.add(xy, cos, sin, revolution)
         verdict = self._judge()
         self._follow_speed(float(angle[0]))
-        if verdict.quality != "good":
+        unsure = self._bank.decision == UNDETERMINED and not self._watch.confirmed
+        if verdict.quality != "good" or unsure:
             xy[:] = np.nan
 
         before = self._revolutions
