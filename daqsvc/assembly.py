@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
+from functools import partial
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +16,11 @@ from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limit
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.publish.mqtt import MqttSettings
-from daqsvc.rotor.calibration_file import CalibrationFileError, load_calibration
+from daqsvc.rotor.calibration_file import CalibrationFileError, load_calibration, save_calibration
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.watch import WatchRules
 from daqsvc.settings.models import (
+    ROTOR_SYNCHRONOUS,
     Accelerometer,
     CanBus,
     DbcLayout,
@@ -41,6 +45,8 @@ if TYPE_CHECKING:
     from daqsvc.rotor.calibration import Calibration
     from daqsvc.settings.models import MachineFile, RotorBank, RotorSynchronous, Sensor
     from drivers.base import Driver
+
+log = logging.getLogger(__name__)
 
 DRIVERS = "daqsvc.drivers"
 _NS_PER_MS = 1_000_000
@@ -128,8 +134,12 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
     return made
 
 
-def detectors(machine: MachineFile) -> list[Detector]:
+def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]:
     """Every detector that the pipeline section asks for.
+
+    Args:
+        machine: the machine file.
+        store: directory of the state that survives restarts; None to begin without any and leave none.
 
     Raises:
         AssemblyError: a calibration that the machine file names cannot be used.
@@ -156,7 +166,7 @@ def detectors(machine: MachineFile) -> list[Detector]:
     if machine.pipeline.rotor_bank is not None:
         made.append(_rotor_bank(machine, machine.pipeline.rotor_bank))
     if machine.pipeline.rotor_synchronous is not None:
-        made.append(_rotor_synchronous(machine, machine.pipeline.rotor_synchronous))
+        made.append(_rotor_synchronous(machine, machine.pipeline.rotor_synchronous, store))
     return made
 
 
@@ -239,7 +249,7 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
     )
 
 
-def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous) -> Detector:
+def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Path | None) -> Detector:
     rotor = machine.machine.rotor
     assert rotor is not None  # noqa: S101 - settings/rotor_checks.py: it needs [machine.rotor]
     stream = machine.sensor(given.probes[0]).stream
@@ -249,6 +259,20 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous) -> Detecto
         reference = _keyphasor(machine, given.keyphasor)
     else:
         reference = given.reference
+    known = LavalRotor(
+        natural_frequency_hz=rotor.natural_frequency_hz,
+        damping_ratio=rotor.damping_ratio,
+        natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
+        damping_tolerance=given.damping_tolerance_percent / 100.0,
+        clearance_um=rotor.clearance_um,
+        static_sag_um=rotor.static_sag_um,
+    )
+    calibration, kept = None, None
+    if given.calibration is not None:
+        calibration = _calibration(machine, given.calibration)
+    elif store is not None:
+        kept = store / f"{ROTOR_SYNCHRONOUS}.toml"
+        calibration = _kept_calibration(kept, machine.machine.speed_rpm, known)
     return RotorSynchronousDetector(
         machine=machine.machine.name,
         stream=stream,
@@ -256,21 +280,15 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous) -> Detecto
         speed_rpm=machine.machine.speed_rpm,
         probes=_probes(machine, given.probes),
         reference=reference,
-        rotor=LavalRotor(
-            natural_frequency_hz=rotor.natural_frequency_hz,
-            damping_ratio=rotor.damping_ratio,
-            natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
-            damping_tolerance=given.damping_tolerance_percent / 100.0,
-            clearance_um=rotor.clearance_um,
-            static_sag_um=rotor.static_sag_um,
-        ),
+        rotor=known,
         rules=WatchRules(
             calibrate_revolutions=given.calibrate_revolutions,
             false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
             probe_drift_um=given.probe_drift_um,
         ),
-        calibration=None if given.calibration is None else _calibration(machine, given.calibration),
+        calibration=calibration,
         ac_coupled=machine.ac_coupled,
+        keep=None if kept is None else partial(_keep_calibration, kept),
     )
 
 
@@ -281,6 +299,25 @@ def _calibration(machine: MachineFile, path: Path) -> Calibration:
         raise AssemblyError(
             f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(path)!r}: {error}"
         ) from error
+
+
+def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibration | None:
+    """The healthy state that was measured before a restart, with what the file says of the rotor now."""
+    if not path.exists():
+        return None
+    try:
+        return replace(load_calibration(path, speed_rpm), rotor=rotor)
+    except CalibrationFileError as error:
+        log.warning("the healthy state of the rotor is measured anew: %s", error)
+        return None
+
+
+def _keep_calibration(path: Path, calibration: Calibration) -> None:
+    """Keep the healthy state, so that a restart does not take a faulty machine for a healthy one."""
+    try:
+        save_calibration(calibration, path, source="the running service")
+    except CalibrationFileError as error:
+        log.error("the healthy state of the rotor will be lost at the next restart: %s", error)  # noqa: TRY400
 
 
 def _probes(machine: MachineFile, names: tuple[str, str]) -> tuple[Probe, Probe]:

@@ -91,7 +91,7 @@ class Service:
         self.lag = LoopLag()
         self.ready = asyncio.Event()
         self._identity = assembly.identity(machine)
-        detectors = assembly.detectors(machine)
+        detectors = assembly.detectors(machine, store)
         self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
         self.drivers: list[Driver] = assembly.drivers(machine, self.clock, self._deliver)
         self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)

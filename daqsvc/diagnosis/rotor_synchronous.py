@@ -94,6 +94,7 @@ class RotorSynchronousDetector:
         name: name of the detector.
         listener: called with every report of the watch and the revolution that it is about, in the
             coordinates of the watch; for plots.
+        keep: called with the baseline that was made of the first revolutions, on the detector's thread.
 
     Raises:
         ValueError: a figure cannot be, or the probes look in nearly the same direction.
@@ -114,6 +115,7 @@ class RotorSynchronousDetector:
         ac_coupled: bool = False,
         name: str = "rotor-synchronous",
         listener: Callable[[WatchReport, SynchronousVectors], None] | None = None,
+        keep: Callable[[Calibration], None] | None = None,
     ) -> None:
         self._turns = Turns(
             machine=machine, rate_hz=rate_hz, speed_rpm=speed_rpm, probes=probes, reference=reference
@@ -122,11 +124,12 @@ class RotorSynchronousDetector:
         self.stream = stream
         turns = max(1.0, _WINDOW_S * abs(speed_rpm) / 60.0)
         self.block = max(1, round(self._turns.period * turns))
-        self.ac_coupled = ac_coupled
+        self.ac_coupled = ac_coupled or (calibration is not None and static_position_missing(calibration))
         self._rate_hz = rate_hz
         self._reference = reference
         self._rules = rules or WatchRules()
         self._listener = listener
+        self._keep = keep
         self._judge = RevolutionJudge(probes)
         self._checks = VectorChecks(probes, self._turns.axes_deg, angle_assumed=reference == "fixed")
         self._stater = Stater(
@@ -264,6 +267,8 @@ class RotorSynchronousDetector:
             self._watch = self._new_watch(calibration.rotor, None)
         else:
             self._refused = ""
+            if self._keep is not None:
+                self._keep(calibration)
             if self.ac_coupled or not static_position_missing(calibration):
                 return
             self.ac_coupled = True

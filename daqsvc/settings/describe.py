@@ -180,7 +180,7 @@ def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
         "orbit": f"angle from the orbit's 1X around {machine.machine.speed_rpm:g} rpm",
     }
     healthy = (
-        f"the first {synchronous.calibrate_revolutions} revolutions after every start are the healthy state"
+        f"the first {synchronous.calibrate_revolutions} revolutions are the healthy state, kept over restarts"
         if synchronous.calibration is None
         else f"healthy state in {synchronous.calibration}"
     )

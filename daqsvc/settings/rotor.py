@@ -31,7 +31,8 @@ class RotorSynchronous(Section):
         "itself, around machine.speed_rpm. The keyphasor if there is one, else fixed",
     )
     calibrate_revolutions: Annotated[int, Field(ge=20, le=10_000)] = Field(
-        default=50, description="revolutions at the start that are the healthy state, without calibration"
+        default=50,
+        description="first revolutions, which are the healthy state without calibration; kept over restarts",
     )
     calibration: Annotated[Path, Field(strict=False)] | None = Field(
         default=None, description="file with the healthy state, in place of the first revolutions"

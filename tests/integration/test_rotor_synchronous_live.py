@@ -137,3 +137,9 @@ async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
         finally:
             stop.set()
             await task
+        # A restart knows what healthy was: it does not take the faulty machine for it.
+        again = Service(machine_file(broker.url), tmp_path)
+        (detector,) = (d for d in again.pipeline.detectors if d.name == "rotor-synchronous")
+        before = next(d for d in service.pipeline.detectors if d.name == "rotor-synchronous")
+        assert detector.watch.state == "watching"
+        np.testing.assert_array_equal(detector.watch.calibration.baseline, before.watch.calibration.baseline)

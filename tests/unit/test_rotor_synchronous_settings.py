@@ -151,3 +151,30 @@ def test_a_calibration_is_read_beside_the_machine_file(tmp_path):
     (tmp_path / "healthy.toml").unlink()
     with pytest.raises(assembly.AssemblyError, match=r"rotor_synchronous\.calibration = 'healthy\.toml'"):
         assembly.detectors(given)
+
+
+def test_a_kept_healthy_state_is_used_with_what_the_file_says_of_the_rotor_now(tmp_path, caplog):
+    rotor = LavalRotor(natural_frequency_hz=99.0, damping_ratio=0.5)
+    calibration = Calibration(
+        rotor=rotor,
+        speed_rpm=1500.0,
+        revolutions=50,
+        baseline=np.array([-10j, 16.0, 0.1, 0.0, 0.0]),
+        variance=np.full(5, 0.01),
+        noise=0.5,
+        noise_variance=0.02,
+        samples_per_rev=64.0,
+    )
+
+    def kept():
+        made = assembly.detectors(machine(), tmp_path)
+        return next(d for d in made if isinstance(d, RotorSynchronousDetector)).watch
+
+    assert kept().state == "calibrating"
+    path = tmp_path / "rotor-synchronous.toml"
+    save_calibration(calibration, path)
+    assert kept().state == "watching"
+    assert kept().rotor.natural_frequency_hz == 31.0
+    path.write_text("rubbish = 1", encoding="utf-8")
+    assert kept().state == "calibrating"
+    assert "measured anew" in caplog.text
