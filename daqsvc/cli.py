@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
 from daqsvc.commands.analyze import AnalyzeCommand
+from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 
 if TYPE_CHECKING:
@@ -193,6 +194,7 @@ def commands() -> dict[str, Command]:
         "run": RunCommand(),
         "check": CheckCommand(),
         "analyze": AnalyzeCommand(load, prepare_kernel_cache),
+        "calibrate": CalibrateCommand(load, prepare_kernel_cache),
         "detectability": DetectabilityCommand(load, prepare_kernel_cache),
     }
     for point in entry_points(group=COMMANDS):

@@ -43,6 +43,8 @@ _MOST_FREQUENCY_DOUBT = 0.1
 _MOST_DAMPING_DOUBT = 0.5
 _LEAST_NATS = 100.0
 """Energy of the whirl over the noise of a sample below which there is no orbit to speak of."""
+_REVERSED = 2.0
+"""Backward over forward 1X of an orbit that turns the wrong way."""
 _SURE = 2.0
 """Standard deviations that noise may be above its mean in what the model seems to leave unexplained."""
 _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 0.9
@@ -89,6 +91,7 @@ def fit_run_up(xy_um: Floats, angle_rad: Floats, rate_hz: float) -> RunUpFit:
             f"only {np.count_nonzero(vectors.usable)} of {len(cut)} revolutions of the run-up have enough "
             "samples; record it again, with at least 8 samples in the shortest revolution"
         )
+    _refuse_reversed(vectors)
     model = Chirp(z, angle_rad, rate_hz, max(1, int(cut.period_samples.min() / _SAMPLES_PER_REVOLUTION)))
     omega, zeta = _search(model, _starts(vectors, rate_hz))
     return _conclude(model, omega, zeta, angle_rad, (low, high))
@@ -110,6 +113,17 @@ def _revolutions(z: Complexes, angle_rad: Floats) -> Revolutions:
         period_samples=np.diff(edges),
         trusted=np.ones(len(starts[:-1]), dtype=np.bool_),
     )
+
+
+def _refuse_reversed(vectors: SynchronousVectors) -> None:
+    """Refuse an orbit that turns against the shaft."""
+    size = np.sqrt((np.abs(vectors.vectors[vectors.usable]) ** 2).mean(axis=0))
+    if size[_BACKWARD] > _REVERSED * size[_FORWARD]:
+        raise NotCalibratableError(
+            f"the orbit turns against the stated rotation (backward 1X {size[_BACKWARD]:.3g} um rms, forward "
+            f"{size[_FORWARD]:.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft "
+            "turns clockwise; swap the probes, or give the speed a minus sign"
+        )
 
 
 def _starts(vectors: SynchronousVectors, rate_hz: float) -> list[tuple[float, float]]:

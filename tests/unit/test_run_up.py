@@ -3,56 +3,15 @@
 from __future__ import annotations
 
 import math
-from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from run_ups import CENTRE, ECCENTRICITY, RATE_HZ, record
 
 from daqsvc.rotor.calibration import NotCalibratableError
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.run_up import fit_run_up
 from daqsvc.rotor.run_up_fit import NotLavalError
-
-RATE_HZ = 4000.0
-OMEGA = 2.0 * math.pi * 40.0
-ECCENTRICITY = 20.0 * np.exp(0.7j)
-CENTRE = 5.0 - 150.0j
-
-
-@cache
-def clean_record(
-    *,
-    zeta: float = 0.08,
-    speeds_hz: tuple[float, float] = (12.0, 75.0),
-    duration_s: float = 4.0,
-    stiffness_y: float = 1.0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Orbit in um and shaft angle of a rotor whose speed grows evenly, integrated in the time domain."""
-    w0, w1 = (2.0 * math.pi * f for f in speeds_hz)
-    growth = (w1 - w0) / duration_s
-    stiff = np.array([1.0, stiffness_y])
-
-    def motion(t: float, state: np.ndarray) -> np.ndarray:
-        position, velocity = state[:2], state[2:]
-        angle, speed = w0 * t + growth * t * t / 2.0, w0 + growth * t
-        force = ECCENTRICITY * (speed**2 - 1j * growth) * np.exp(1j * angle)
-        pull = OMEGA**2 * stiff * (position - [CENTRE.real, CENTRE.imag])
-        return np.concatenate(
-            (velocity, np.array([force.real, force.imag]) - 2 * zeta * OMEGA * velocity - pull)
-        )
-
-    t = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
-    start = [CENTRE.real, CENTRE.imag, 0.0, 0.0]
-    solved = solve_ivp(motion, (0.0, t[-1]), start, t_eval=t, rtol=1e-8, atol=1e-6, max_step=2e-3)
-    return solved.y[:2].T, w0 * t + growth * t * t / 2.0
-
-
-def record(noise_um: float = 0.0, seed: int = 0, **run_up: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The same with noise on both probes."""
-    xy, angle = clean_record(**run_up)
-    return xy + noise_um * np.random.default_rng(seed).standard_normal(xy.shape), angle
 
 
 def test_finds_every_figure_of_a_clean_run_up() -> None:
@@ -161,6 +120,14 @@ def test_refuses_noise() -> None:
     noise = np.random.default_rng(5).standard_normal((len(angle), 2))
     with pytest.raises(NotCalibratableError, match=r"there is no whirl|does not show"):
         fit_run_up(noise, angle, RATE_HZ)
+
+
+def test_refuses_swapped_probes() -> None:
+    xy, angle = record(noise_um=5.0)
+    with pytest.raises(
+        NotCalibratableError, match=r"turns against the stated rotation .* swap the probes, or"
+    ):
+        fit_run_up(xy[:, ::-1], angle, RATE_HZ)
 
 
 def test_refuses_an_angle_that_does_not_grow() -> None:

@@ -1,0 +1,249 @@
+"""From recordings of a healthy machine to what a calibration file holds of it.
+
+A recording through which the speed goes up or down tells the rotor; one at steady speed tells the baseline at
+that speed, by the detector that watches the machine live (`analyse`), over all of its revolutions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.analysis import quality as checks
+from daqsvc.analysis.rotor import analyse
+from daqsvc.analysis.setup import RefusedError
+from daqsvc.analysis.speed import LEAST_JUDGED, speed_of
+from daqsvc.dsp.revolutions import KeyphasorCutter
+from daqsvc.recording.channels import to_um
+from daqsvc.rotor.calibration import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
+from daqsvc.rotor.calibration_file import CalibrationRecord
+from daqsvc.rotor.run_up import LEAST_SPEED_RATIO, fit_run_up
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.analysis.setup import RotorSetup
+    from daqsvc.recording.recording import Recording
+    from daqsvc.rotor.run_up_fit import RunUpFit
+
+    Floats = NDArray[np.float64]
+
+_ENDS = 0.02
+"""Part of the revolutions at either end of the speeds that does not say whether a recording is a run-up."""
+_SAME_SPEED = 0.01
+"""Baselines at speeds that differ by less than this part are of one speed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationSetup:
+    """What `calibrate_recordings` needs to know.
+
+    Attributes:
+        taken: how the recordings were taken.
+        rotor_given: whether natural frequency and damping in ``taken`` are known; if not, a run-up has to
+            tell them.
+        sweep_rpm: speed at the first and the last sample of the first recording, which is then a run-up
+            without a keyphasor, even in time; positive.
+    """
+
+    taken: RotorSetup
+    rotor_given: bool = True
+    sweep_rpm: tuple[float, float] | None = None
+
+
+class _Sweep(NamedTuple):
+    """A stretch in which the shaft angle is known: orbit in um, rotation from x to y, and unwrapped angle."""
+
+    xy_um: Floats
+    angle_rad: Floats
+
+
+def calibrate_recordings(recordings: Sequence[Recording], setup: CalibrationSetup) -> CalibrationRecord:
+    """Calibrate on recordings of a healthy machine.
+
+    Args:
+        recordings: with the channels of ``setup.taken.columns``, by their names there; at most one run-up.
+        setup: what is known.
+
+    Returns:
+        The record, without a date.
+
+    Raises:
+        RefusedError: a recording that cannot be the healthy machine, by name and with the reason.
+    """
+    run_ups: list[tuple[Recording, RunUpFit]] = []
+    steady: list[Recording] = []
+    for number, recording in enumerate(recordings):
+        sweep_rpm = setup.sweep_rpm if number == 0 else None
+        try:
+            sweep = _sweep(recording, setup.taken, sweep_rpm)
+            if sweep is None:
+                steady.append(recording)
+            else:
+                run_ups.append((recording, fit_run_up(*sweep, recording.rate_hz)))
+        except (RefusedError, NotCalibratableError) as error:
+            raise _about(recording, error) from None
+    if len(run_ups) > 1:
+        raise RefusedError(
+            f"{' and '.join(str(recording.source) for recording, _ in run_ups)} are run-ups; give one of them"
+        )
+    run_up_recording, run_up = run_ups[0] if run_ups else (None, None)
+    taken = setup.taken
+    if run_up is not None and (run_up.laval or not setup.rotor_given):
+        known = taken.rotor
+        rotor = run_up.rotor(clearance_um=known.clearance_um, static_sag_um=known.static_sag_um)
+        taken = replace(taken, rotor=rotor)
+    elif not setup.rotor_given:
+        raise RefusedError(
+            "natural frequency and damping ratio are not known: add a run-up, or give "
+            "--natural-frequency-hz and --damping-ratio"
+        )
+    calibrations: list[Calibration] = []
+    for recording in steady:
+        try:
+            made = replace(
+                _baseline(recording, taken), fit_error=None if run_up is None else run_up.fit_error
+            )
+            _refuse_twice(made, calibrations)
+        except RefusedError as error:
+            raise _about(recording, error) from None
+        calibrations.append(made)
+    return CalibrationRecord(
+        rotor=taken.rotor,
+        steady=tuple(calibrations),
+        steady_sources=tuple(str(recording.source) for recording in steady),
+        run_up=run_up,
+        run_up_source="" if run_up_recording is None else str(run_up_recording.source),
+    )
+
+
+def _about(recording: Recording, error: Exception) -> RefusedError:
+    return RefusedError(f"{recording.source}: {error}")
+
+
+def _refuse_twice(made: Calibration, calibrations: Sequence[Calibration]) -> None:
+    for other in calibrations:
+        if abs(made.speed_rpm / other.speed_rpm - 1.0) < _SAME_SPEED:
+            raise RefusedError(
+                f"there is another recording at {other.speed_rpm:.1f} rpm; give one for each speed"
+            )
+
+
+def _baseline(recording: Recording, taken: RotorSetup) -> Calibration:
+    """The healthy machine at the steady speed of a recording, of all its usable revolutions."""
+    if taken.keyphasor is None:
+        assert taken.speed_rpm is not None  # noqa: S101 - see RotorSetup
+        turns = len(recording.samples) * abs(taken.speed_rpm) / 60.0 / recording.rate_hz
+        _refuse_short(turns)
+    # A short baseline first: it shows how many revolutions can be used.
+    first = analyse(recording, _with_revolutions(taken, LEAST_REVOLUTIONS))
+    if first.refused is not None or first.trace is None:
+        raise RefusedError(first.refused or "no revolution can be used")
+    usable = len(first.trace.vectors) - LEAST_JUDGED
+    if usable <= LEAST_REVOLUTIONS:
+        found = first
+    else:
+        found = analyse(recording, _with_revolutions(taken, usable))
+        if found.refused is not None:
+            raise RefusedError(found.refused)
+    assert found.calibration is not None  # noqa: S101 - not refused
+    return found.calibration
+
+
+def _with_revolutions(taken: RotorSetup, revolutions: int) -> RotorSetup:
+    rules = replace(taken.rules, calibrate_revolutions=revolutions, retry=False)
+    return replace(taken, rules=rules, calibration=None)
+
+
+def _refuse_short(turns: float) -> None:
+    needed = LEAST_REVOLUTIONS + LEAST_JUDGED
+    if turns < needed:
+        raise RefusedError(
+            f"the recording is too short: {turns:.1f} revolutions, a baseline needs {needed}; "
+            "give a longer one"
+        )
+
+
+def _sweep(recording: Recording, taken: RotorSetup, sweep_rpm: tuple[float, float] | None) -> _Sweep | None:
+    """Orbit and angle of a run-up; None if the recording is one at steady speed.
+
+    Raises:
+        RefusedError: the samples cannot be used.
+    """
+    if taken.keyphasor is None and sweep_rpm is None:
+        return None
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    samples = samples[:, [recording.names.index(name) for name in taken.columns]]
+    samples[:, :2] = to_um(samples[:, :2], taken.unit)
+    checks.refuse_unreadable(tuple(taken.columns), samples)
+    if sweep_rpm is not None:
+        sweep = _even_sweep(recording, taken, samples, sweep_rpm)
+        period = 120.0 * recording.rate_hz / sum(sweep_rpm)
+    else:
+        found = _keyphasor_sweep(recording, taken, samples)
+        if found is None:
+            return None
+        sweep, period = found
+    checks.refuse_size(samples[:, :2], taken.rotor.clearance_um, taken.unit)
+    checks.refuse_stuck(checks.count_bad(taken.probes, samples[:, :2]), taken.probes, samples[:, :2], period)
+    return sweep
+
+
+def _even_sweep(
+    recording: Recording, taken: RotorSetup, samples: Floats, sweep_rpm: tuple[float, float]
+) -> _Sweep:
+    """A speed that goes evenly from one value to another, angle zero at the first sample."""
+    begin, end = (rpm * math.pi / 30.0 / recording.rate_hz for rpm in sweep_rpm)
+    place = np.arange(len(samples), dtype=np.float64)
+    angle = begin * place + (end - begin) / (2.0 * len(samples)) * place**2
+    return _Sweep(_shaft_axes(taken, samples[:, :2]), angle)
+
+
+def _keyphasor_sweep(recording: Recording, taken: RotorSetup, samples: Floats) -> tuple[_Sweep, float] | None:
+    """The longest stretch with a known angle, and samples in its median revolution; None if it is steady."""
+    short = _with_revolutions(taken, 0)
+    speed, _ = speed_of(recording, short, samples, checks.count_bad(tuple(taken.columns), samples))
+    marks = speed.keyphasor
+    assert marks is not None  # noqa: S101 - taken.keyphasor
+    cutter = KeyphasorCutter(
+        threshold=marks.threshold_v,
+        hysteresis=marks.hysteresis_v,
+        period_samples=60.0 * recording.rate_hz / abs(speed.rpm),
+        edge=marks.edge,
+    )
+    cut = cutter.process(_shaft_axes(taken, samples[:, :2]), samples[:, 2])
+    first, last = _longest(cut.trusted)
+    periods = cut.period_samples[first:last]
+    if len(periods) < LEAST_REVOLUTIONS:
+        _refuse_short(len(periods))
+    fast, slow = np.quantile(periods, [_ENDS, 1.0 - _ENDS])
+    if slow < LEAST_SPEED_RATIO * fast:
+        return None
+    ends = np.append(cut.starts, len(cut.xy))
+    part = slice(int(ends[first]), int(ends[last]))
+    turn = np.repeat(np.arange(last - first), np.diff(ends[first : last + 1]))
+    return _Sweep(cut.xy[part], cut.angle_rad[part] + math.tau * turn), float(np.median(periods))
+
+
+def _longest(trusted: NDArray[np.bool_]) -> tuple[int, int]:
+    """The longest run of True, as a half-open interval."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], trusted, [False])).astype(np.int8)))
+    begins, ends = edges[::2], edges[1::2]
+    if not len(begins):
+        return 0, 0
+    best = int(np.argmax(ends - begins))
+    return int(begins[best]), int(ends[best])
+
+
+def _shaft_axes(taken: RotorSetup, probes_um: Floats) -> Floats:
+    """Positions along two probes as x and y; a shaft that turns clockwise is looked at from its other end."""
+    axes = np.radians(taken.probe_angles_deg)
+    xy = probes_um @ np.linalg.inv(np.vstack((np.cos(axes), np.sin(axes))))
+    if (taken.speed_rpm or 1.0) < 0.0:
+        xy[:, 0] = -xy[:, 0]
+    return xy

@@ -1,0 +1,199 @@
+"""What ``daqsvc calibrate`` says of what it found."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.analysis.result import calibration_json, finite
+from daqsvc.rotor.synchronous import HARMONICS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.calibration_file import CalibrationRecord
+    from daqsvc.rotor.run_up_fit import RunUpFit
+
+_OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)
+
+
+def speeds_to_predict(fit: RunUpFit, asked: Sequence[float] | None) -> tuple[float, ...]:
+    """Speeds in rpm at which the run-up says something; those asked for, or parts of the critical one."""
+    if not fit.laval:
+        return ()
+    if asked is not None:
+        return tuple(asked)
+    low, high = fit.speed_range_rpm
+    parts = (60.0 * fit.natural_frequency_hz * part for part in _OF_CRITICAL)
+    return tuple(speed for speed in parts if low <= speed <= high)
+
+
+def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path | None) -> dict[str, Any]:
+    """One JSON object: lengths in um, uncertainties are standard deviations."""
+    rotor = record.rotor
+    found: dict[str, Any] = finite(
+        {
+            "refused": None,
+            "out": None if out is None else str(out),
+            "written": record.written,
+            "rotor": {
+                "natural_frequency_hz": rotor.natural_frequency_hz,
+                "natural_frequency_tolerance": rotor.natural_frequency_tolerance,
+                "damping_ratio": rotor.damping_ratio,
+                "damping_tolerance": rotor.damping_tolerance,
+                "clearance_um": rotor.clearance_um,
+                "static_sag_um": rotor.sag_um,
+            },
+            "run_up": None
+            if record.run_up is None
+            else {"source": record.run_up_source, **_run_up_json(record.run_up, asked)},
+            "steady": [
+                {"source": source, **_steady_json(record, calibration)}
+                for calibration, source in zip(record.steady, record.steady_sources, strict=True)
+            ],
+        }
+    )
+    return found
+
+
+def _run_up_json(fit: RunUpFit, asked: Sequence[float] | None) -> dict[str, Any]:
+    return {
+        "revolutions": fit.revolutions,
+        "speed_range_rpm": list(fit.speed_range_rpm),
+        "natural_frequency_hz": fit.natural_frequency_hz,
+        "natural_frequency_uncertainty_hz": fit.natural_frequency_uncertainty_hz,
+        "critical_speed_rpm": 60.0 * fit.natural_frequency_hz,
+        "damping_ratio": fit.damping_ratio,
+        "damping_uncertainty": fit.damping_uncertainty,
+        "eccentricity_um": abs(fit.eccentricity_um),
+        "eccentricity_uncertainty_um": fit.eccentricity_uncertainty_um,
+        "heavy_spot_deg": _degrees(fit.eccentricity_um),
+        "heavy_spot_uncertainty_deg": fit.heavy_spot_uncertainty_deg,
+        "centre_um": [fit.centre_um.real, fit.centre_um.imag],
+        "centre_uncertainty_um": fit.centre_uncertainty_um,
+        "ellipticity": fit.ellipticity,
+        "noise_um": fit.noise_um,
+        "fit_error": fit.fit_error,
+        "laval": fit.laval,
+        "verdict": fit.describe(),
+        "predicted_1x": [
+            {
+                "speed_rpm": speed,
+                "amplitude_um": abs(vector),
+                "phase_deg": _degrees(vector),
+                "uncertainty_um": sd,
+            }
+            for speed in speeds_to_predict(fit, asked)
+            for vector, sd in [fit.predict(speed)]
+        ]
+        if fit.laval
+        else None,
+    }
+
+
+def _steady_json(record: CalibrationRecord, calibration: Calibration) -> dict[str, Any]:
+    deviations = _deviations(calibration)
+    return {
+        **calibration_json(calibration),
+        "vector_um": {
+            str(order): [value.real, value.imag]
+            for order, value in zip(HARMONICS, calibration.baseline.tolist(), strict=True)
+        },
+        "vector_uncertainty_um": {
+            str(order): deviation for order, deviation in zip(HARMONICS, deviations, strict=True)
+        },
+        "eccentricity_um": abs(calibration.eccentricity_um) if calibration.laval else None,
+        "heavy_spot_deg": _degrees(calibration.eccentricity_um) if calibration.laval else None,
+        "fit_error": calibration.fit_error,
+        "off_prediction": _off_prediction(record.run_up, calibration),
+    }
+
+
+def as_text(record: CalibrationRecord, asked: Sequence[float] | None) -> str:
+    """The same in lines for a person."""
+    lines: list[str] = []
+    if record.run_up is not None:
+        lines += _run_up_lines(record.run_up, record.run_up_source, asked)
+    else:
+        rotor = record.rotor
+        lines.append(
+            f"rotor as given: natural frequency {rotor.natural_frequency_hz:.4g} Hz +- "
+            f"{100.0 * rotor.natural_frequency_tolerance:g} %, damping ratio {rotor.damping_ratio:.3g} +- "
+            f"{100.0 * rotor.damping_tolerance:g} %"
+        )
+    for calibration, source in zip(record.steady, record.steady_sources, strict=True):
+        lines += _steady_lines(record, calibration, source)
+    return "\n".join(lines)
+
+
+def _run_up_lines(fit: RunUpFit, source: str, asked: Sequence[float] | None) -> list[str]:
+    low, high = fit.speed_range_rpm
+    kind = "" if fit.laval else "nearest Laval rotor: "
+    frequency = (
+        f"{kind}natural frequency {fit.natural_frequency_hz:.3f} +- "
+        f"{fit.natural_frequency_uncertainty_hz:.2g} Hz (critical speed "
+        f"{60.0 * fit.natural_frequency_hz:.1f} rpm), damping ratio {fit.damping_ratio:.4f} +- "
+        f"{fit.damping_uncertainty:.2g}"
+    )
+    unbalance = (
+        f"eccentricity {abs(fit.eccentricity_um):.4g} +- {fit.eccentricity_uncertainty_um:.2g} um at "
+        f"{_degrees(fit.eccentricity_um):.1f} +- {fit.heavy_spot_uncertainty_deg:.2g} degrees, centre "
+        f"({fit.centre_um.real:.4g}, {fit.centre_um.imag:.4g}) +- {fit.centre_uncertainty_um:.2g} um"
+    )
+    errors = (
+        f"noise {fit.noise_um:.3g} um a sample, fit error {100.0 * fit.fit_error:.2g} %, backward over "
+        f"forward whirl {100.0 * fit.ellipticity:.2g} %"
+    )
+    said = [frequency, unbalance, errors, fit.describe()]
+    for speed in speeds_to_predict(fit, asked):
+        vector, deviation = fit.predict(speed)
+        said.append(
+            f"predicted 1X at {speed:.0f} rpm: {abs(vector):.4g} +- {deviation:.2g} um at "
+            f"{_degrees(vector):.1f} degrees"
+        )
+    return [f"{source}: {fit.revolutions} revolutions from {low:.0f} to {high:.0f} rpm", *_indented(said)]
+
+
+def _steady_lines(record: CalibrationRecord, calibration: Calibration, source: str) -> list[str]:
+    deviations = _deviations(calibration)
+    mean, forward = calibration.baseline[0], calibration.baseline[1]
+    whirl = (
+        f"1X {abs(forward):.4g} +- {deviations[1]:.2g} um at {_degrees(forward):.1f} degrees, backward over "
+        f"forward 1X {100.0 * calibration.ellipticity:.2g} %"
+    )
+    said = [whirl]
+    if (off := _off_prediction(record.run_up, calibration)) is not None:
+        said.append(f"1X is {100.0 * off:.2g} % off what the run-up predicts")
+    said += [
+        f"mean position ({mean.real:.4g}, {mean.imag:.4g}) +- {deviations[0]:.2g} um",
+        f"noise {calibration.noise_um:.3g} um a sample, SNR {calibration.snr_db:.1f} dB",
+        f"the machine {calibration.describe()}",
+    ]
+    head = f"{source}: {calibration.revolutions} revolutions at {calibration.speed_rpm:.2f} rpm"
+    return [head, *_indented(said)]
+
+
+def _indented(said: Sequence[str]) -> list[str]:
+    return [f"  {line}" for line in said]
+
+
+def _off_prediction(fit: RunUpFit | None, calibration: Calibration) -> float | None:
+    """How far 1X is from what the run-up predicts, relative; None if nothing is predicted there."""
+    if fit is None or not fit.laval:
+        return None
+    low, high = fit.speed_range_rpm
+    if not low <= calibration.speed_rpm <= high:
+        return None
+    predicted, _ = fit.predict(calibration.speed_rpm)
+    return abs(complex(calibration.baseline[1]) - predicted) / abs(predicted)
+
+
+def _deviations(calibration: Calibration) -> list[float]:
+    """Standard deviation of each coordinate of the components of the baseline, um."""
+    return [math.sqrt(v / calibration.revolutions / 2.0) for v in calibration.variance.tolist()]
+
+
+def _degrees(vector: complex) -> float:
+    return math.degrees(math.atan2(vector.imag, vector.real))
