@@ -47,7 +47,7 @@ _VELOCITY = 1.0 / np.array(ORDERS, dtype=np.float64)[:, np.newaxis]
 """Acceleration to velocity, in units of the shaft speed."""
 _SCALES = 2.0 ** np.arange(-3, 7)
 """How large a change may be, as multiples of the healthy level: integrated over."""
-_HARMONIC_SHARES = (0.05, 0.2, 0.6)
+_HARMONIC_SHARES = (0.0, 0.02, 0.1, 0.3, 0.6)
 """2X and 3X that unbalance brings along, over its 1X, as velocity: integrated over."""
 _OPEN_NATS = -6.0
 """An unmodelled change explains everything; it must explain it better by so much."""
@@ -202,7 +202,8 @@ def _check_alike(baseline: OrderVectors, present: OrderVectors, rules: OrderRule
             "compare the same channels"
         )
     difference = present.speed_rpm / baseline.speed_rpm - 1.0
-    if abs(difference) > rules.most_speed_difference:
+    unknown = math.hypot(present.speed_uncertainty_rpm, baseline.speed_uncertainty_rpm) / baseline.speed_rpm
+    if abs(difference) > rules.most_speed_difference + 3.0 * unknown:
         raise ValueError(
             f"the shaft turns at {present.speed_rpm:.0f} rpm, {difference:+.1%} from the healthy run's "
             f"{baseline.speed_rpm:.0f} rpm; 1X changes with speed by itself: give a healthy run within "
