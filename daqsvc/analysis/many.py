@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -71,7 +72,9 @@ def judge_all(
     # One process a core: threads of the linear algebra inside each would only get in each other's way.
     for name in _BLAS_THREADS:
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(
+        processes, multiprocessing.get_context("spawn"), initializer=_leave_interrupts_to_the_parent
+    )
     try:
         jobs = [pool.submit(analyst.judge, *job) for job in zip(recordings, figures, strict=True)]
         for recording, job in zip(recordings, jobs, strict=True):
@@ -84,3 +87,8 @@ def judge_all(
                 ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    """Ctrl-C goes to the whole group; only who waits for the others should say so."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

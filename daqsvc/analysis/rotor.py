@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 
 _WINDOW_REVOLUTIONS = 256
 """Revolutions handed to the detector at a time: often enough to see it get on."""
+_NO_MEAN = (
+    "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss cannot be "
+    "seen"
+)
 _SEEN = 128
 """Revolutions that say what a healthy machine looks like at the end."""
 
@@ -120,12 +124,6 @@ def _judge(
     speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
     quality = checks.refuse_stuck(quality, setup.probes, samples[:, :2], period)
-    ac_coupled = setup.ac_coupled or checks.lacks_mean(samples[:, :2])
-    if ac_coupled and not setup.ac_coupled:
-        quality = quality.with_problem(
-            "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss "
-            "cannot be seen"
-        )
     detector = RotorSynchronousDetector(
         machine="recording",
         stream=str(recording.source),
@@ -139,12 +137,14 @@ def _judge(
         rotor=setup.rotor,
         rules=setup.rules,
         calibration=setup.calibration,
-        ac_coupled=ac_coupled,
+        ac_coupled=setup.ac_coupled or checks.lacks_mean(samples[:, :2]),
         listener=watched.take,
     )
     complaints = _feed(detector, samples, recording.rate_hz, period, progress)
     revolutions = detector.watch.revolutions
     checks.refuse_gaps(revolutions - len(watched.reports), revolutions, complaints)
+    if detector.ac_coupled and not setup.ac_coupled:
+        quality = quality.with_problem(_NO_MEAN)
     vectors = SynchronousVectors.joined(watched.vectors)
     reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, tuple(complaints))
     return reading.verdict(quality)

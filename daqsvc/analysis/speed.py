@@ -108,7 +108,8 @@ def _fixed_speed(
     if significant and abs(off) * calibrating > _FIXED_SPEED_TURN:
         raise RefusedError(
             f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
-            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, or use a keyphasor"
+            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, use a "
+            "keyphasor, or --follow-orbit"
         )
     revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
     if significant and abs(off) * revolutions > _RELEVANT_TURN:

@@ -170,8 +170,12 @@ def _outcomes(
             outcome = analyst.judge(recordings[0], figures[0], bar.update)
         yield outcome
         return
+    found = judge_all(analyst, recordings, figures, processes)
+    if sys.stdout.isatty():
+        yield from found  # each line tells how far it is
+        return
     with progress_bar(f"{len(recordings)} recordings") as bar:
-        for done, outcome in enumerate(judge_all(analyst, recordings, figures, processes), 1):
+        for done, outcome in enumerate(found, 1):
             yield outcome
             bar.update(done, len(recordings))
 

@@ -418,7 +418,8 @@ def test_a_person_reads_what_and_since_when(tmp_path: Path, capsys: pytest.Captu
     lines = out.splitlines()
     assert lines[0].startswith(f"{file}: unbalance")
     assert "changed at revolution 80 (sample 5120, 1.600 s); alarm at revolution 81" in lines[1]
-    assert len(lines) <= 6
+    assert any(line.startswith("  unbalance: ratio 1.8, change 32 um") for line in lines)
+    assert len(lines) <= 8
 
 
 def test_figures_are_drawn_for_each_recording(analyze: Callable[..., Any], tmp_path: Path) -> None:
