@@ -130,7 +130,7 @@ class _Line:
 
 def _orbit(xy: Floats) -> tuple[Complexes, NDArray[np.bool_]]:
     """The orbit as x + i y, zero where it is missing, and where it is not."""
-    valid: NDArray[np.bool_] = np.isfinite(xy).all(axis=1)
+    valid = np.isfinite(xy[:, 0]) & np.isfinite(xy[:, 1])
     z: Complexes = np.where(valid, xy[:, 0], 0.0) + 1j * np.where(valid, xy[:, 1], 0.0)
     return z, valid
 

@@ -267,6 +267,21 @@ def test_two_misplaced_edges_bend_nothing(period, early, at):
     assert np.abs(error[known]).max() < 0.03
 
 
+def test_acceleration_is_not_carried_on_for_ever():
+    # The speed falls by 4 % a revolution until the pulses stop, and stays there.
+    period = 64.0 * np.minimum(1.04 ** np.arange(40), 1.04**12)
+    edges = 20.0 + np.concatenate(([0.0], np.cumsum(period)))
+    turns = np.interp(np.arange(edges[-1]), edges, np.arange(len(edges)))
+    signal = pulses(turns)
+    signal[turns > 12.7] = -1.0
+    track = tracker(64.0, threshold=0.0, hysteresis=0.2).process(signal)
+    unwrapped = np.unwrap(track.angle_rad[turns > 3]) / (2 * math.pi)
+    assert (np.diff(unwrapped) > 0.0).all()
+    # Carried on, it would have come to rest in ten revolutions and turned back.
+    speed = np.diff(unwrapped)[-1] * period[-1]
+    assert 0.5 <= speed < 1.0
+
+
 def test_lock_at_a_part_of_the_speed_is_found_out():
     # Every other pulse missing at first, then all are there.
     signal = ramps(64.0, 0.5, 40, skip={1, 3, 5, 7, 9})

@@ -125,9 +125,11 @@ def test_fixed_speed_in_any_blocks(period, cuts):
     lost=st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(1, 60)), max_size=3),
     skip=st.sets(st.integers(1, 50), max_size=20),
     extra=st.lists(st.floats(1.0, 38.0), max_size=6),
+    silent=st.tuples(st.integers(4, 30), st.integers(0, 12)),
 )
-def test_keyphasor_in_any_blocks(period, ratio, cuts, lost, skip, extra):
+def test_keyphasor_in_any_blocks(period, ratio, cuts, lost, skip, extra, silent):
     turns = constant_acceleration(period, ratio * period, 40)
+    skip |= set(range(silent[0], sum(silent)))
     marker, xy = pulses(turns, skip=skip, extra=extra), orbit(turns)
     for where, count in lost:
         begin = int(where * len(marker))
@@ -293,7 +295,8 @@ def test_orbit_at_0_db_follows_drift(seed, law, backward):
     assert len(got) >= turns[-1] - turns[0] - 7
     error, _ = errors(got, turns)
     error = np.degrees(np.angle(np.exp(1j * error) / np.mean(np.exp(1j * error))))
-    assert error.std() < 3.0
+    # 1.6 in the mean of many runs; read at the end of the parabola it would be 2.5.
+    assert error.std() < 2.3
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.7])

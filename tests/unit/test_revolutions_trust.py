@@ -148,6 +148,29 @@ def test_an_orbit_lost_for_long_is_searched_anew():
     assert subject.counts.missing > 15
 
 
+def test_an_orbit_that_loses_its_1x_is_not_trusted():
+    turns, xy = steady(200)
+    rng = np.random.default_rng(4)
+    xy[turns > 80] = 0.0
+    xy += 0.3 * rng.standard_normal(xy.shape)
+    got = OrbitCutter(64.0).process(xy)
+    begins = turns[got.first_index + got.starts]
+    assert got.trusted[begins < 76].all()
+    # What is left of the good phases in the window carries the angle for a while.
+    assert not got.trusted[(begins > 90) & (begins < 180)].any()
+
+
+def test_no_late_crossing_changes_what_was_overdue():
+    # Eight revolutions without a pulse, settled sample by sample or by the edge that ends them.
+    turns, xy = steady(60)
+    marker = keyphasor_voltage(turns)
+    marker[20 * 64 + 16 : 28 * 64 + 16] = -10.0
+    whole, one = cutter().process(xy, marker), cutter()
+    pieces = [one.process(xy[a : a + 1], marker[a : a + 1]) for a in range(len(xy))]
+    np.testing.assert_array_equal(np.concatenate([p.angle_rad for p in pieces]), whole.angle_rad)
+    np.testing.assert_array_equal(np.concatenate([p.trusted for p in pieces]), whole.trusted)
+
+
 def test_an_orbit_without_1x_is_never_trusted():
     rng = np.random.default_rng(3)
     got = OrbitCutter(64.0).process(rng.standard_normal((64 * 100, 2)))
