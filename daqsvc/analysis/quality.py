@@ -26,6 +26,8 @@ _MOST_CLEARANCES = 20.0
 _CLIPPED = 1 / 16
 """Part of a revolution at an extreme value from which on a probe may be clipped."""
 _LEAST_CLIPPED_REVOLUTIONS = 3
+_LEAST_CUT_OFF = 8
+"""So often a recording must end at its extreme value, and four times as often as at any other."""
 _NO_MEAN = 1e-3
 """A mean position within this part of the 1X amplitude is none."""
 _MOST_UNUSABLE = 0.5
@@ -130,7 +132,7 @@ def refuse_stuck(
         period_samples: samples per revolution.
 
     Returns:
-        The quality with the clipped samples counted.
+        The quality with the clipped samples counted, and told if they are few.
 
     Raises:
         RefusedError: a probe repeats one value through whole revolutions, or is clipped in some.
@@ -164,7 +166,23 @@ def refuse_stuck(
                 f"revolution {first + 1}; check the gap and the range of the converter",
                 replace(quality, clipped={**quality.clipped, name: samples_at}),
             )
+        quality = _peaks_cut_off(quality, name, samples[:, column])
     return quality
+
+
+def _peaks_cut_off(quality: DataQuality, name: str, signal: Floats) -> DataQuality:
+    """Tell of a probe whose highest or lowest peaks all end at one value, now and then."""
+    values, counts = np.unique(signal[np.isfinite(signal)], return_counts=True)
+    least = max(_LEAST_CUT_OFF, 4 * int(counts[1:-1].max(initial=0)))
+    ends = {float(values[end]): int(counts[end]) for end in (0, -1) if counts[end] >= least}
+    if not ends:
+        return quality
+    clipped = {**quality.clipped, name: sum(ends.values())}
+    at = " and ".join(f"{value:.6g} um" for value in ends)
+    return replace(quality, clipped=clipped).with_problem(
+        f"{name} is clipped now and then: {sum(ends.values())} samples are at {at}; check the gap and the "
+        "range of the converter"
+    )
 
 
 class ClippedError(RefusedError):

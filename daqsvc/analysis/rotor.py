@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -48,6 +49,7 @@ _NO_MEAN = (
     "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss cannot be "
     "seen"
 )
+_FIGURES = re.compile(r"[\d.]+")
 _SEEN = 128
 """Revolutions that say what a healthy machine looks like at the end."""
 
@@ -157,8 +159,8 @@ def _feed(
     period_samples: float,
     progress: Callable[[int, int], None] | None,
 ) -> list[str]:
-    """Hand the recording to the detector in windows; what it complains of, each once."""
-    complaints: dict[str, None] = {}
+    """Hand the recording to the detector in windows; what it complains of, each kind once."""
+    complaints: dict[str, list[str]] = {}
     length = max(1, round(_WINDOW_REVOLUTIONS * period_samples / detector.block)) * detector.block
     period_ns = NS_PER_S / rate_hz
     for begin in range(0, len(samples), length):
@@ -166,12 +168,16 @@ def _feed(
         end = begin + len(part)
         for said in detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns)):
             if said.quality != "good":
-                complaints.setdefault(said.reason)
+                # Complaints that differ in figures only are of one kind.
+                complaints.setdefault(_FIGURES.sub("", said.reason), []).append(said.reason)
         if progress is not None:
             progress(end, len(samples))
         if detector.refused:
             raise RefusedError(detector.refused)
-    return list(complaints)
+    return [
+        reasons[0] if len(reasons) == 1 else f"{reasons[0]} (and {len(reasons) - 1} times more)"
+        for reasons in complaints.values()
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,6 +96,25 @@ def test_a_coarse_converter_is_not_a_clipped_probe() -> None:
     assert refused.value.quality.clipped["x"] > 1000
 
 
+def test_peaks_that_are_cut_off_now_and_then_are_told() -> None:
+    orbit = Orbit()
+    samples = np.column_stack([orbit.x, np.minimum(orbit.y, np.sort(orbit.y)[-40])])
+    known = quality.refuse_stuck(quality.count_bad(("x", "y"), samples), ("x", "y"), samples, 64.0)
+    assert known.clipped == {"x": 0, "y": 40}
+    assert known.problems[0].startswith("y is clipped now and then: 40 samples are at 2")
+
+
+def test_complaints_of_one_kind_are_told_once() -> None:
+    orbit = Orbit()
+    for revolution in range(55, 100, 5):
+        orbit.x[revolution * 64 : revolution * 64 + 40] = np.nan
+        orbit.x[revolution * 64 + 64 : revolution * 64 + 64 + min(60, revolution - 20)] = np.nan
+    told = analyse(recorded(orbit), SETUP)
+    assert told.refused is None
+    assert len(told.quality.problems) == 1
+    assert re.search(r"^x: \d+ of 64 samples.*times more\)$", told.quality.problems[0])
+
+
 def test_a_mean_within_the_noise_is_no_mean() -> None:
     orbit = Orbit()
     samples = np.column_stack([orbit.x, orbit.y])
