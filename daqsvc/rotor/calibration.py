@@ -28,6 +28,10 @@ _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
 _STATIONARY_NATS = 25.0
 """Half against half: Gamma(5, 1) passes this once in 5 million calibrations."""
+_TURNING_NATS = 100.0
+_LEAST_TURN_RAD = 0.6
+"""1X may turn by so much over the whole calibration: drift of the speed does it, too."""
+_TURN_PADDING = 16
 _LAVAL_ELLIPTICITY = 0.05
 _REVERSED = 2.0
 _LEAST_WHIRL = 4.0
@@ -190,14 +194,18 @@ def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) ->
             f"only {count} usable revolutions; a baseline needs {LEAST_REVOLUTIONS}: give a longer recording"
         )
     speed_rad_s = float(2.0 * math.pi * rate_hz / vectors.period_samples.mean())
-    moved, _ = compensated(vectors, rotor, speed_rad_s, rate_hz)
+    moved, deviation = compensated(vectors, rotor, speed_rad_s, rate_hz)
     baseline = moved.mean(axis=0)
     samples = float(vectors.samples.mean())
     amplitude = float(np.sqrt(np.sum(np.abs(baseline[1:]) ** 2)))
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
-    _refuse_unsteady(moved, variance, vectors, rate_hz)
+    _, slope = rotor.speed_slope(speed_rad_s)
+    half = count // 2
+    guard = slope * float(deviation[half:].mean() - deviation[:half].mean())
+    _refuse_turning(vectors.vectors[:, 1], white, speed_rad_s * 30.0 / math.pi)
+    _refuse_unsteady(moved, variance, guard)
     if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
         raise NotCalibratableError(
             f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of "
@@ -248,27 +256,39 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
     return np.asarray(white + stirred * (1.0 + memory) / (1.0 - memory))
 
 
-def _refuse_unsteady(moved: Complexes, variance: Floats, vectors: SynchronousVectors, rate_hz: float) -> None:
-    """Half against half; if they differ, say why."""
+def _refuse_turning(forward: Complexes, white: float, speed_rpm: float) -> None:
+    """Whether 1X turns against the angle: then the angle is not the shaft's."""
+    count = len(forward)
+    size = _TURN_PADDING * 2 ** math.ceil(math.log2(count))
+    power = np.abs(np.fft.fft(forward, size)) ** 2 / (count * max(white, 1e-300))
+    strongest = int(power.argmax())
+    turn = 2.0 * math.pi * ((strongest + size // 2) % size - size // 2) / size
+    if abs(turn) * count < _LEAST_TURN_RAD or power[strongest] - power[0] < _TURNING_NATS:
+        return
+    orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
+    raise NotCalibratableError(
+        f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a revolution "
+        f"against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} rpm "
+        f"({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
+    )
+
+
+def _refuse_unsteady(moved: Complexes, variance: Floats, guard: float) -> None:
+    """Half against half.
+
+    Args:
+        moved: complex128 ``[R, 5]``, vectors brought to one speed.
+        variance: float64 ``[5]``, of one of them.
+        guard: relative uncertainty of 1X that the difference of the halves' speeds leaves.
+    """
     half = len(moved) // 2
     first, second = moved[:half].mean(axis=0), moved[half:].mean(axis=0)
     amplitude = float(np.abs(moved[:, 1]).mean())
     allowed = variance * (1.0 / half + 1.0 / (len(moved) - half)) + (_FLOOR * amplitude) ** 2
+    allowed[1:3] += (amplitude * guard) ** 2
     nats = float((np.abs(second - first) ** 2 / allowed).sum())
     if nats <= _STATIONARY_NATS:
         return
-    turn = np.angle(np.sum(moved[1:, 1] * moved[:-1, 1].conj()))
-    held = float(np.abs(np.sum(moved[1:, 1] * moved[:-1, 1].conj())) / np.sum(np.abs(moved[1:, 1]) ** 2))
-    whole = abs(turn) * len(moved)
-    period = float(vectors.period_samples.mean())
-    speed_rpm = 60.0 * rate_hz / period
-    if whole > 0.3 and held > 0.3:
-        orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
-        raise NotCalibratableError(
-            f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a "
-            f"revolution against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} "
-            f"rpm ({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
-        )
     worst = int(np.argmax(np.abs(second - first) ** 2 / allowed))
     name = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")[worst]
     raise NotCalibratableError(

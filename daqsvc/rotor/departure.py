@@ -32,7 +32,7 @@ _MOST_REFERENCE = 2000
 """The reference stops to grow here: beyond, a machine that drifts would take its own drift for healthy."""
 
 # Measured over healthy revolutions with a growing baseline (test_rotor_departure.py): 1.6, 0.42, 0.09
-# and 0.02 departures per 1000 revolutions at 16, 18, 20 and 22 nats; the line through them is on the safe side.
+# and 0.02 departures per 1000 revolutions at 16, 18, 20 and 22 nats; the line is on the safe side of them.
 _RATE_AT_16 = 1.9
 _RATE_PER_NAT = math.log(1.9 / 0.03) / 6.0
 

@@ -52,8 +52,9 @@ _STIFFNESS_LOSSES = np.geomspace(0.02, 1.2, 24)
 _STIFFNESS_TOLERANCE = 0.3
 _GENERIC_STIFFNESS_NATS = 2.0
 """What stiffness loss pays where no model ties mean position and 1X together."""
-_STIFFNESS_DAMPING = np.array([1.0, 1.6])
-"""A softer shaft or support is also damped otherwise."""
+_STIFFNESS_DAMPING = np.array([0.0, 1.8])
+"""A softer support also damps more: relative increase per 1 / k - 1, up to `_MOST_DAMPING`."""
+_MOST_DAMPING = 1.6
 
 _RUB_FULL_CLEARANCE = 0.9
 
@@ -171,12 +172,13 @@ def _stiffness_loss(change: Complexes, variance: Floats, healthy: Healthy) -> fl
         both = [_free(change[k], variance[k], healthy.amplitude_um) for k in (DC, FORWARD)]
         return rest - float(score[BACKWARD]) + float(backward) + sum(both) - _GENERIC_STIFFNESS_NATS
     omega, zeta = healthy.rotor.box
-    loss, point, factor = (
+    loss, point, more = (
         axis.ravel()
         for axis in np.meshgrid(_STIFFNESS_LOSSES, np.arange(len(omega)), _STIFFNESS_DAMPING, indexing="ij")
     )
     point = point.astype(np.int64)
     stiffness = 1.0 / (1.0 + loss)
+    factor = np.minimum(1.0 + more * loss, _MOST_DAMPING)
     speed = healthy.speed_rad_s / omega[point]
     before = 1.0 / (1.0 - speed**2 + 2j * zeta[point] * speed)
     after = 1.0 / (stiffness - speed**2 + 2j * zeta[point] * factor * speed)
