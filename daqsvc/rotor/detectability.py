@@ -17,7 +17,7 @@ import numpy as np
 from daqsvc.rotor.evidence import Axis, Observation
 from daqsvc.rotor.passage import delay_samples
 from daqsvc.rotor.rub_evidence import simulate_rubs
-from daqsvc.rotor.visible_change import smallest_changes
+from daqsvc.rotor.visible_change import FAULTS, smallest_changes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.rub_evidence import RubPair
-    from daqsvc.rotor.visible_change import SmallestChange
+    from daqsvc.rotor.visible_change import Fault, SmallestChange
 
     Floats = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ class Detectability:
         process_noise: power spectral density q that the machine is taken to shake with, normalised.
         pairs: every ordered pair of modes.
         ambiguities: pairs that look the same at this speed.
-        smallest: the smallest visible change of each kind of fault, from the healthy mode.
+        smallest: the smallest visible change of each kind of fault asked for, from the healthy mode.
         within_rev: the delay that `SmallestChange.by_bank` is for, revolutions.
         calibration_rev: revolutions that the synchronous vector's baseline is taken from.
         false_alarms_per_1000_rev: bound on the false alarms of the healthy mode: a CUSUM of log-likelihood
@@ -135,6 +135,7 @@ def detectability(
     ac_coupled: bool = False,
     within_rev: float = 100.0,
     calibration_rev: float = 50.0,
+    faults: Sequence[Fault] = FAULTS,
     seed: int = 0,
 ) -> Detectability:
     """What a bank can tell apart, and how soon.
@@ -155,6 +156,7 @@ def detectability(
         ac_coupled: whether the probes show no static position, so that a static load cannot be seen.
         within_rev: delay for which the smallest visible change is computed, revolutions.
         calibration_rev: revolutions of the synchronous vector's baseline.
+        faults: kinds of fault to look for the smallest visible change of.
         seed: seed of the simulated runs of modes that rub.
 
     Raises:
@@ -214,6 +216,7 @@ def detectability(
             within_rev=within_rev,
             calibration_rev=calibration_rev,
             ac_coupled=ac_coupled,
+            faults=faults,
         ),
         within_rev=within_rev,
         calibration_rev=calibration_rev,

@@ -13,7 +13,7 @@ from daqsvc.rotor.evidence import orbit_noise
 from daqsvc.rotor.passage import delay_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.evidence import Axis
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Fault = Literal["unbalance", "damping_loss", "stiffness_loss", "static_load"]
 
+FAULTS: tuple[Fault, ...] = ("unbalance", "damping_loss", "stiffness_loss", "static_load")
 VECTOR_THRESHOLD_NATS = 20.0
 """Departure test of the synchronous vector: about one false alarm in 10,000 revolutions."""
 _VECTOR_FLOOR = 0.002
@@ -79,6 +80,7 @@ def smallest_changes(
     within_rev: float,
     calibration_rev: float,
     ac_coupled: bool = False,
+    faults: Sequence[Fault] = FAULTS,
 ) -> tuple[SmallestChange, ...]:
     """The smallest visible change of every kind, at the healthy mode's speed.
 
@@ -89,6 +91,7 @@ def smallest_changes(
         within_rev: revolutions in which half of all changes are to be declared by a matching mode.
         calibration_rev: revolutions of the synchronous vector's baseline.
         ac_coupled: whether the probes show no static position.
+        faults: the kinds to look for.
     """
     before = axis(healthy)
     rotor = healthy.rotor
@@ -115,6 +118,7 @@ def smallest_changes(
             by_vector=smallest(kind, clarity),
         )
         for kind in _KINDS
+        if kind.fault in faults
     )
 
 

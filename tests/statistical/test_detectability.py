@@ -113,7 +113,12 @@ def observed(before, after, noise, *, settled_rev, seeds):
 def foreseen(before, after, noise, **options):
     names = ["N", *(name for name in (before, after) if name != "N")]
     found = detectability(
-        [MODES[name] for name in names], noise=noise, duration=DURATION, threshold_nats=THRESHOLD, **options
+        [MODES[name] for name in names],
+        noise=noise,
+        duration=DURATION,
+        threshold_nats=THRESHOLD,
+        faults=(),
+        **options,
     )
     forward, back = found.pair(after, before), found.pair(before, after)
     return back.nats_per_rev, forward.nats_per_rev, forward.delay_rev
