@@ -223,8 +223,8 @@ class OrbitPhase:
     The first 16 revolutions give frequency and sense (`estimate_speed`'s line fit). From then on each
     revolution gives one phase, by least squares together with DC and the opposite 1X, and a parabola through
     the last 30 phases gives the angle. It is read 3.4 revolutions before its end: there it has no lag even
-    when the acceleration changes, and a sixth of the variance at its end. A single revolution of 64 samples
-    at 0 dB has 5 degrees of noise, the parabola 1.8.
+    when the acceleration changes, and less than half of the variance that it has at its end. A single
+    revolution of 64 samples at 0 dB has 5 degrees of noise, the parabola 1.7.
 
     Phases that make no sense for 16 revolutions start the search anew; until then, and while searching,
     the speed is guessed and nothing is trusted.
