@@ -16,6 +16,7 @@ from daqsvc.commands.analyze_arguments import (
     add_rotor_arguments,
     misuse,
 )
+from daqsvc.commands.analyze_orders import add_order_arguments, by_orders, order_analyst, order_misuse
 
 if TYPE_CHECKING:
     import argparse
@@ -48,9 +49,10 @@ class AnalyzeCommand:
         "Run the detectors of the service over recordings (.npz, .mat, .csv[.gz], .wav, .parquet), faster "
         "than real time, and say which fault the rotor has, what else it might be, since when, and how large "
         "it is. Either the first file is a machine file (.toml), or options name probes, speed and rotor; "
-        "the first revolutions of a recording are then the healthy machine. Verdicts: normal, unbalance, "
-        "damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none of these), "
-        "small_change (too small for a name)."
+        "the first revolutions of a recording are then the healthy machine. Accelerometers without a "
+        "keyphasor are compared with a recording of the healthy machine (--channels, --baseline). Verdicts: "
+        "normal, unbalance, damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none "
+        "of these), small_change (too small for a name)."
     )
 
     def __init__(self, load: Load, prepare_kernel_cache: Callable[[], None]) -> None:
@@ -68,6 +70,7 @@ class AnalyzeCommand:
             "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
         )
         add_rotor_arguments(parser)
+        add_order_arguments(parser)
         add_machine_arguments(parser)
         add_output_arguments(parser)
 
@@ -75,11 +78,15 @@ class AnalyzeCommand:
         """See `Command.run`."""
         machine = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
         recordings = arguments.files[1:] if machine is not None else arguments.files
-        if wrong := misuse(arguments, machine, recordings):
+        orders = by_orders(arguments)
+        if wrong := order_misuse(arguments, machine) if orders else misuse(arguments, machine, recordings):
             self._parser.error(wrong)
         if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
             return _fail(wrong, EXIT_FAILED)
-        analyst = self._rotor(arguments) if machine is None else self._machine(machine, arguments)
+        if orders:
+            analyst = self._orders(arguments)
+        else:
+            analyst = self._rotor(arguments) if machine is None else self._machine(machine, arguments)
         if analyst is None:
             return EXIT_USAGE
         from daqsvc.analysis.many import WorkerLostError  # noqa: PLC0415 - each verb imports what it needs
@@ -137,6 +144,13 @@ class AnalyzeCommand:
         except (OSError, ValueError) as error:
             self._parser.error(str(error))
         return RotorAnalyst(setup)
+
+    def _orders(self, arguments: argparse.Namespace) -> Analyst | None:
+        """An analyst of accelerometers; None after its error has been printed."""
+        try:
+            return order_analyst(arguments)
+        except ValueError as error:
+            self._parser.error(str(error))
 
     def _machine(self, machine: str, arguments: argparse.Namespace) -> Analyst | None:
         """An analyst by a machine file; None after its errors have been printed."""

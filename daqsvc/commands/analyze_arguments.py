@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.analysis.acceleration import ACCELERATION_UNITS
 from daqsvc.recording.channels import LENGTH_UNITS, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
@@ -130,8 +131,8 @@ def add_machine_arguments(parser: argparse.ArgumentParser) -> None:
     )
     both.add_argument(
         "--unit",
-        choices=LENGTH_UNITS,
-        help="unit of the probes' samples (default: um, or the machine file's)",
+        choices=(*LENGTH_UNITS, *ACCELERATION_UNITS),
+        help="unit of the samples (default: um, or the machine file's; of accelerometers: g)",
     )
     both.add_argument(
         "--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it"
@@ -170,7 +171,25 @@ def misuse(arguments: argparse.Namespace, machine: str | None, recordings: Seque
         return f"{machine} is a machine file, and there is no recording after it; name at least one"
     if machines := [name for name in recordings if name.lower().endswith(".toml")]:
         return f"{machines[0]} is not a recording; a machine file comes first, and there is only one"
-    given = {
+    if arguments.unit in ACCELERATION_UNITS:
+        return f"--unit {arguments.unit}: proximity probes measure in {', '.join(LENGTH_UNITS)}"
+    given = rotor_options(arguments)
+    if machine is not None:
+        extra = [name for name, is_there in given.items() if is_there]
+        return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
+    known = [
+        name
+        for name in ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um")
+        if given[name] and arguments.calibration is not None
+    ]
+    if known:
+        return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
+    return _lacking(arguments, given)
+
+
+def rotor_options(arguments: argparse.Namespace) -> dict[str, bool]:
+    """Which of the options of `add_rotor_arguments` are given."""
+    return {
         "--probes": arguments.probes is not None,
         "--speed-rpm": arguments.speed_rpm is not None,
         "--follow-orbit": arguments.follow_orbit,
@@ -186,17 +205,6 @@ def misuse(arguments: argparse.Namespace, machine: str | None, recordings: Seque
         "--natural-frequency-tolerance": arguments.natural_frequency_tolerance != TOLERANCE_PERCENT,
         "--damping-tolerance": arguments.damping_tolerance != TOLERANCE_PERCENT,
     }
-    if machine is not None:
-        extra = [name for name, is_there in given.items() if is_there]
-        return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
-    known = [
-        name
-        for name in ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um")
-        if given[name] and arguments.calibration is not None
-    ]
-    if known:
-        return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
-    return _lacking(arguments, given)
 
 
 def _lacking(arguments: argparse.Namespace, given: dict[str, bool]) -> str:

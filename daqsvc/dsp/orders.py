@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.dsp.order_speed import ORDERS, find_speed
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -22,15 +24,8 @@ if TYPE_CHECKING:
     Flags: TypeAlias = NDArray[np.bool_]
     Complexes: TypeAlias = NDArray[np.complex128]
 
-ORDERS = (1, 2, 3)
-"""Orders measured, along the second axis of `OrderVectors.amplitudes`."""
-
 LEAST_REVOLUTIONS = 8
-SPEED_SEARCH = 0.03
-"""The speed is searched within this part of the nominal one."""
 
-_WIDE_SEARCH = 0.1
-"""So far a wrong nominal speed is noticed."""
 _BLOCKS = 12
 _LEAST_BLOCKS = 6
 _LEAST_SAMPLES_PER_REVOLUTION = 10.0
@@ -38,9 +33,6 @@ _LEAST_PRESENT = 0.75
 _CLIPPED_SHARE = 1.0 / 64.0
 _DEAD = 1e-9
 """Deviation of a channel, as a part of its largest value, below which nothing moves."""
-_LINE_NATS = 12.0
-"""Evidence per channel of one order that is no chance: e^-12 at each of some hundred places."""
-_POINTS_PER_LINE = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +40,7 @@ class OrderVectors:
     """Orders 1X to 3X of a recording at constant speed.
 
     Attributes:
-        amplitudes: complex128 ``[blocks, 3, channels]``, peak amplitude of each order in the unit of the
+        amplitudes: complex128 ``[blocks, 3, channels]``, peak amplitudes of `ORDERS` in the unit of the
             samples, about a zero of the shaft's angle that all blocks of the recording have in common.
         residual_rms: float64 ``[blocks, channels]``, root mean square of what is left beside the mean and the
             orders.
@@ -113,7 +105,7 @@ def order_vectors(
         _check_channel(values[there[:, channel], channel], len(values), name)
     present: Flags = np.asarray(there.all(axis=1))
     centred = np.where(present[:, np.newaxis], values - np.nanmean(values, axis=0), 0.0)
-    speed = _find_speed(centred, rate_hz, nominal_hz)
+    speed = find_speed(centred, rate_hz, nominal_hz)
     amplitudes, residual, revolutions = _blocks(centred, present, rate_hz, speed.hz)
     if len(amplitudes) < _LEAST_BLOCKS:
         raise ValueError(
@@ -160,118 +152,6 @@ def _check_channel(values: Floats, count: int, name: str) -> None:
             raise ValueError(
                 f"channel {name} is clipped: {share:.1%} of its samples are {extreme:g}; widen the range"
             )
-
-
-@dataclass(frozen=True, slots=True)
-class _Speed:
-    hz: float
-    deviation_hz: float
-    seen: bool
-
-
-def _find_speed(centred: Floats, rate_hz: float, nominal_hz: float) -> _Speed:
-    """The speed by the lines of 1X, 2X and 3X.
-
-    The periodogram at h f over the noise density beside it, summed over the channels, is the log likelihood
-    of a line there. The strongest line near the nominal 1X is taken first; 2X and 3X refine it where they
-    stand out within one resolution of its multiples. Farther off they are lines of something else (belt,
-    mains, gears), however strong. Without a line of 1X, the strongest sum of all orders decides.
-    """
-    resolution = rate_hz / len(centred)
-    lines = _line_evidence(centred, rate_hz, nominal_hz)
-    threshold = _LINE_NATS + 2.0 * centred.shape[1]
-    near = lines.within(nominal_hz, SPEED_SEARCH * nominal_hz)
-    first = near[np.argmax(lines.nats[0, near])]
-    if lines.nats[0, first] < threshold:
-        first = near[np.argmax(lines.nats[:, near].sum(axis=0))]
-    estimates: list[tuple[float, float]] = []
-    for row, order in enumerate(ORDERS):
-        around, deviation = _mean_of(estimates) if estimates else (float(lines.hz[first]), 0.0)
-        reach = max(0.5 * resolution / order, 3.0 * deviation)
-        part = lines.within(around, reach)
-        best = int(part[np.argmax(lines.nats[row, part])])
-        inside = part[0] < best < part[-1] and near[0] < best < near[-1]
-        if inside and lines.nats[row, best] > threshold:
-            estimates.append(_vertex(lines.hz, lines.nats[row], best, 0.2 * resolution / order))
-    if not estimates:
-        # Either nothing stands out, or what does is the skirt of a line outside.
-        _refuse_elsewhere(lines, threshold, nominal_hz)
-        return _Speed(float(lines.hz[first]), SPEED_SEARCH * nominal_hz / np.sqrt(3.0), seen=False)
-    return _Speed(*_mean_of(estimates), seen=True)
-
-
-@dataclass(frozen=True, slots=True)
-class _Lines:
-    """Evidence for a line at each order of a speed, summed over the channels.
-
-    Attributes:
-        hz: float64 ``[n]``, speeds.
-        nats: float64 ``[orders, n]``.
-    """
-
-    hz: Floats
-    nats: Floats
-
-    def within(self, hz: float, reach_hz: float) -> NDArray[np.int64]:
-        """Indices of the speeds about one, at least three of them."""
-        reach = max(int(reach_hz / (self.hz[1] - self.hz[0])), 1)
-        middle = int(np.clip(np.searchsorted(self.hz, hz), 1, len(self.hz) - 2))
-        return np.arange(max(middle - reach, 0), min(middle + reach + 1, len(self.hz)))
-
-
-def _line_evidence(centred: Floats, rate_hz: float, nominal_hz: float) -> _Lines:
-    resolution = rate_hz / len(centred)
-    # Only the lowest lines matter: as a slower series they are found in a hundredth of the time.
-    highest = int(ORDERS[-1] * 1.5 * nominal_hz / resolution) + 16
-    spectrum = np.fft.rfft(centred, axis=0)[:highest]
-    slow = np.fft.irfft(spectrum, 2 * highest, axis=0)
-    # A Hann window keeps strong lines elsewhere out; it widens a line by half.
-    window = np.hanning(len(slow))[:, np.newaxis]
-    power = np.abs(np.fft.rfft(slow * window, len(slow) * _POINTS_PER_LINE, axis=0)) ** 2
-    step = resolution / _POINTS_PER_LINE
-    frequency = np.arange(len(power)) * step
-    hz = np.arange((1.0 - _WIDE_SEARCH) * nominal_hz, (1.0 + _WIDE_SEARCH) * nominal_hz, step / 3.0)
-    nats = np.zeros((len(ORDERS), len(hz)))
-    for row, order in enumerate(ORDERS):
-        reach = max(0.25 * nominal_hz, 12.0 * resolution, order * _WIDE_SEARCH * nominal_hz)
-        # Exponential variables: their median is ln 2 of their mean, and lines do not touch it.
-        noise = np.median(power[np.abs(frequency - order * nominal_hz) < reach], axis=0) / np.log(2.0)
-        noise = np.maximum(noise, 1e-12 * power.max(axis=0) + np.finfo(np.float64).tiny)
-        for channel in range(power.shape[1]):
-            nats[row] += np.interp(order * hz, frequency, power[:, channel]) / noise[channel]
-    return _Lines(hz, nats)
-
-
-def _vertex(grid: Floats, nats: Floats, best: int, reach_hz: float) -> tuple[float, float]:
-    """Vertex of a parabola through a peak of the log likelihood, and the deviation by its curvature."""
-    reach = max(1, int(reach_hz / (grid[1] - grid[0])))
-    part = slice(max(best - reach, 0), best + reach + 1)
-    bend, slope, _ = np.polyfit(grid[part] - grid[best], nats[part], 2)
-    if bend >= 0.0:
-        return float(grid[best]), reach_hz
-    shift = float(np.clip(-slope / (2.0 * bend), -reach_hz, reach_hz))
-    return float(grid[best]) + shift, float(1.0 / np.sqrt(-2.0 * bend))
-
-
-def _mean_of(estimates: list[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean and its deviation, which grows (Birge) where the estimates contradict each other."""
-    values, deviations = np.array(estimates).T
-    weights = deviations**-2.0
-    mean = float((weights * values).sum() / weights.sum())
-    excess = float((weights * (values - mean) ** 2).sum() / max(len(values) - 1, 1))
-    return mean, float(np.sqrt(max(excess, 1.0) / weights.sum()))
-
-
-def _refuse_elsewhere(lines: _Lines, threshold: float, nominal_hz: float) -> None:
-    """Refuse a nominal speed beside which 1X and another order stand elsewhere together."""
-    stands = lines.nats > threshold
-    together = stands[0] & (stands[1] | stands[2])
-    if together.any():
-        found = 60.0 * float(lines.hz[np.argmax(np.where(together, lines.nats.sum(axis=0), 0.0))])
-        raise ValueError(
-            f"the shaft turns at {found:.0f} rpm by its harmonics, not at {60.0 * nominal_hz:g} rpm "
-            f"(+-{SPEED_SEARCH:.0%}): correct the speed"
-        )
 
 
 def _blocks(

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.dsp.orders import ORDERS
+from daqsvc.dsp.order_speed import ORDERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

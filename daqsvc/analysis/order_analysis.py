@@ -1,0 +1,260 @@
+"""From recordings of accelerometers without a keyphasor to a verdict: is 1X still that of the healthy run?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from daqsvc.analysis.acceleration import M_S2_PER_UNIT
+from daqsvc.analysis.many import Outcome
+from daqsvc.analysis.quality import DataQuality, count_bad
+from daqsvc.analysis.result import VERDICTS, finite
+from daqsvc.dsp.order_speed import ORDERS
+from daqsvc.dsp.orders import OrderVectors, order_vectors
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import load_recording
+from daqsvc.rotor.order_change import OrderChange, OrderRules, compare_orders
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from daqsvc.analysis.acceleration import AccelerationUnit
+    from daqsvc.recording.recording import Recording
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderSetup:
+    """What `analyse_orders` needs to know.
+
+    Attributes:
+        channels: names of the channels, of one unit.
+        speed_rpm: nominal shaft speed.
+        unit: of the samples; ``"V"`` if the sensors' sensitivity is not known.
+        map: what a channel is called in the file, where that is not its name here.
+        rate_hz: samples per second; None: what the file says.
+        rules: what counts as a change.
+    """
+
+    channels: tuple[str, ...]
+    speed_rpm: float
+    unit: AccelerationUnit = "g"
+    map: Mapping[str, str] = field(default_factory=dict)
+    rate_hz: float | None = None
+    rules: OrderRules = field(default_factory=OrderRules)
+
+    def load(self, path: str) -> Recording:
+        """Read the channels of a recording.
+
+        Raises:
+            RecordingError: it cannot be read.
+        """
+        return load_recording(path, {name: self.map.get(name, name) for name in self.channels}, self.rate_hz)
+
+    def orders_of(self, recording: Recording) -> OrderVectors:
+        """Measure a recording.
+
+        Raises:
+            ValueError: it cannot be measured.
+        """
+        return order_vectors(recording.samples, recording.rate_hz, self.speed_rpm, recording.names)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderAnalysis:
+    """What a recording says about a machine whose healthy run is known.
+
+    Attributes:
+        recording: name of the recording.
+        baseline: name of the healthy one.
+        setup: what it was judged by.
+        quality: what is known against its samples.
+        refused: why it cannot be judged; None if it can.
+        orders: what was measured; None if refused before.
+        change: the verdict and what it was made of; None if refused.
+    """
+
+    recording: str
+    baseline: str
+    setup: OrderSetup
+    quality: DataQuality
+    refused: str | None = None
+    orders: OrderVectors | None = None
+    change: OrderChange | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """A JSON object: all figures finite, amplitudes in the unit of the samples."""
+        orders, change = self.orders, self.change
+        shares = {} if change is None else {str(name): p for name, p in change.probabilities.items()}
+        found: dict[str, Any] = finite(
+            {
+                "recording": self.recording,
+                "baseline": self.baseline,
+                "verdict": None if change is None else change.verdict,
+                "group": [] if change is None else list(change.group),
+                "probabilities": {} if change is None else {name: shares.get(name, 0.0) for name in VERDICTS},
+                "evidence": {} if change is None else dict(change.evidence),
+                "severity": None if change is None else change.severity,
+                "growth_1x": None
+                if change is None
+                else {
+                    "ratio": change.growth,
+                    "uncertainty": change.growth_uncertainty,
+                    "significant": change.growth_significant,
+                },
+                "departure_nats": None if change is None else change.departure,
+                "threshold_nats": None if change is None else change.departure_threshold,
+                "false_alarm_probability": self.setup.rules.false_alarm_probability,
+                "unit": self.setup.unit,
+                "channels": {} if change is None else self._channels(change),
+                "speed_rpm": None if orders is None else orders.speed_rpm,
+                "speed_uncertainty_rpm": None if orders is None else orders.speed_uncertainty_rpm,
+                "speed_seen": None if orders is None else orders.speed_seen,
+                "revolutions": 0 if orders is None else orders.revolutions,
+                "data_quality": self.quality.as_json(),
+                "refused": self.refused,
+            }
+        )
+        return found
+
+    def _channels(self, change: OrderChange) -> dict[str, Any]:
+        velocity = self._velocity_mm_s(change)
+        return {
+            name: {
+                "orders": {
+                    f"{order}X": {
+                        "healthy": change.healthy[row, column],
+                        "present": change.present[row, column],
+                        "ratio": change.ratio[row, column],
+                        "uncertainty": change.present_uncertainty[row, column],
+                    }
+                    for row, order in enumerate(ORDERS)
+                },
+                "residual_ratio": change.residual_ratio[column],
+                "velocity_1x_mm_s_rms": None if velocity is None else velocity[column],
+            }
+            for column, name in enumerate(self.setup.channels)
+        }
+
+    def _velocity_mm_s(self, change: OrderChange) -> Floats | None:
+        """Velocity of 1X in mm/s r.m.s., as ISO 20816 states it; None if the unit is not an acceleration."""
+        if self.orders is None or self.setup.unit not in M_S2_PER_UNIT:
+            return None
+        rad_s = 2.0 * math.pi * self.orders.speed_rpm / 60.0
+        scale = 1e3 * M_S2_PER_UNIT[self.setup.unit] / rad_s / math.sqrt(2.0)
+        return np.asarray(scale * change.present[0])
+
+    def describe(self) -> str:
+        """A few lines for a person."""
+        if self.change is None or self.orders is None:
+            return f"{self.recording}: not judged: {self.refused}"
+        change, orders = self.change, self.orders
+        said = " or ".join(name.replace("_", " ") for name in change.group)
+        seen = "" if orders.speed_seen else ", guessed: no order stands out of the noise"
+        lines = [f"{self.recording}: {said}" + (" (cannot be told apart)" if len(change.group) > 1 else "")]
+        lines.append(
+            f"1X is {change.growth:.3g} (+-{change.growth_uncertainty:.2g}) times that of {self.baseline}; "
+            f"departure {change.departure:.1f} nats, threshold {change.departure_threshold:.1f} "
+            f"(false alarms: {self.setup.rules.false_alarm_probability:g} a recording)"
+        )
+        by_channel = zip(self.setup.channels, change.healthy[0], change.present[0], strict=True)
+        lines.append(
+            "1X by channel: "
+            + ", ".join(
+                f"{name} {before:.3g} to {after:.3g} {self.setup.unit}" for name, before, after in by_channel
+            )
+        )
+        lines.append(
+            f"{orders.speed_rpm:.1f} +-{orders.speed_uncertainty_rpm:.1f} rpm by the harmonics{seen}, "
+            f"{orders.revolutions} revolutions"
+        )
+        if change.residual_changed:
+            most = int(np.argmax(change.residual_ratio))
+            lines.append(
+                f"beside the orders {self.setup.channels[most]} vibrates "
+                f"{change.residual_ratio[most]:.2g} times as much as in the healthy run"
+            )
+        return "\n  ".join([*lines, *self.quality.problems])
+
+
+def analyse_orders(
+    recording: Recording, setup: OrderSetup, baseline: OrderVectors, baseline_name: str
+) -> OrderAnalysis:
+    """Compare a recording with the orders of a healthy run.
+
+    Args:
+        recording: to be judged.
+        setup: what is known.
+        baseline: of the healthy run, measured by the same setup.
+        baseline_name: what the healthy run is called.
+    """
+    name = str(recording.source)
+    quality = count_bad(recording.names, recording.samples)
+    orders: OrderVectors | None = None
+    try:
+        orders = setup.orders_of(recording)
+        change = compare_orders(baseline, orders, setup.rules)
+    except ValueError as error:
+        return OrderAnalysis(
+            recording=name,
+            baseline=baseline_name,
+            setup=setup,
+            quality=quality,
+            refused=str(error),
+            orders=orders,
+        )
+    return OrderAnalysis(
+        recording=name, baseline=baseline_name, setup=setup, quality=quality, orders=orders, change=change
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OrderAnalyst:
+    """Judges recordings of one machine against its healthy run.
+
+    Attributes:
+        setup: what is known.
+        baseline: orders of the healthy run.
+        baseline_name: its file.
+    """
+
+    setup: OrderSetup
+    baseline: OrderVectors
+    baseline_name: str
+
+    @classmethod
+    def of(cls, setup: OrderSetup, baseline: str) -> OrderAnalyst:
+        """With the healthy run at a path.
+
+        Raises:
+            ValueError: it cannot be read or measured.
+        """
+        try:
+            return cls(setup, setup.orders_of(setup.load(baseline)), baseline)
+        except (RecordingError, ValueError) as error:
+            raise ValueError(f"healthy run {baseline}: {error}") from error
+
+    def judge(
+        self, recording: str, figures: str | None, progress: Callable[[int, int], None] | None = None
+    ) -> Outcome:
+        """See `daqsvc.analysis.many.Analyst.judge`."""
+        del figures, progress  # none are drawn; a recording takes a tenth of a second
+        try:
+            loaded = self.setup.load(recording)
+        except RecordingError as error:
+            analysis = OrderAnalysis(
+                recording=recording,
+                baseline=self.baseline_name,
+                setup=self.setup,
+                quality=DataQuality(0),
+                refused=str(error),
+            )
+        else:
+            analysis = analyse_orders(loaded, self.setup, self.baseline, self.baseline_name)
+        return Outcome(analysis.as_json(), analysis.describe(), analysis.refused is not None)
