@@ -2,7 +2,7 @@
 
 Twelve recordings of two rotors (ROSS, an independent finite-element code), 64 samples a revolution, white
 noise at 20, 10 and 0 dB, 20 seeds each; the first 50 revolutions calibrate; natural frequency and damping are
-off by up to 20 % at random. Seeds are fixed: 720 runs, the same every time.
+off by up to 20 % at random. Seeds are fixed: 720 runs, the same every time; 120 more of a rotor known to 2 %.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ SEEDS = 20
 SNRS_DB = (20, 10, 0)
 CALIBRATE = 50
 TOLERANCE = 0.2
+KNOWN = 0.02
+"""Tolerance of a rotor that a run-up was fitted to."""
 UNBALANCE_OR_DAMPING = {"unbalance", "damping_loss"}
 TRUTHS = {
     "A07_healthy_G2p5": "normal",
@@ -73,7 +75,9 @@ def judged(truth: str, group: tuple[str, ...], *, named: bool) -> str:
     return "group" if truth in group else "wrong"
 
 
-def noisy(path: Path, snr_db: int, seed: int) -> tuple[Recording, RotorSetup, int]:
+def noisy(
+    path: Path, snr_db: int, seed: int, tolerance: float = TOLERANCE
+) -> tuple[Recording, RotorSetup, int]:
     """A recording at 64 samples a revolution with noise, what its user knows, the onset in revolutions."""
     with np.load(path) as file:
         clean = 1e6 * np.column_stack([file["x_disc"], file["y_disc"]]).astype(np.float64)[::2]
@@ -83,11 +87,13 @@ def noisy(path: Path, snr_db: int, seed: int) -> tuple[Recording, RotorSetup, in
     rng = np.random.default_rng([seed, snr_db, *path.stem.encode()])
     deviation = np.sqrt(clean[:onset].var(axis=0) / 10 ** (snr_db / 10))
     samples = clean + deviation * rng.standard_normal(clean.shape)
-    off = 1.0 + TOLERANCE * rng.uniform(-1.0, 1.0, 2)
+    off = 1.0 + tolerance * rng.uniform(-1.0, 1.0, 2)
     # Rotor B is no Laval rotor: its users have these figures from its makers.
     rotor = LavalRotor(
         natural_frequency_hz=off[0] * meta.get("omega_s", 485.0) / (2.0 * math.pi),
         damping_ratio=off[1] * meta.get("zeta", 0.064),
+        natural_frequency_tolerance=tolerance,
+        damping_tolerance=tolerance,
         clearance_um=meta.get("clearance", 0.01) * 1e6,
     )
     recording = Recording(("x", "y"), samples, rate_hz, path, nan_count=0)
@@ -124,6 +130,15 @@ def run(job: tuple[str, int, int]) -> Run:
     )
 
 
+def resolved(job: tuple[str, int, int]) -> bool:
+    """Whether 20 revolutions after the onset unbalance and loss of damping are told apart, and rightly."""
+    path, snr_db, seed = job
+    recording, setup, onset = noisy(Path(path), snr_db, seed, KNOWN)
+    analysis = analyse(recording, setup)
+    looks = [step for step in analysis.history if onset < step.revolution <= onset + 20]
+    return looks[-1].named and looks[-1].group == (TRUTHS[Path(path).stem],)
+
+
 @cache
 def table(directory: Path) -> tuple[Run, ...]:
     jobs = [
@@ -132,8 +147,12 @@ def table(directory: Path) -> tuple[Run, ...]:
         for snr_db in SNRS_DB
         for seed in range(SEEDS)
     ]
-    with ProcessPoolExecutor(min(2, os.cpu_count() or 1), multiprocessing.get_context("spawn")) as pool:
+    with processes() as pool:
         return tuple(pool.map(run, jobs, chunksize=20))
+
+
+def processes() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(min(2, os.cpu_count() or 1), multiprocessing.get_context("spawn"))
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +164,9 @@ def of(runs: tuple[Run, ...], snr_db: int, name: str) -> list[Run]:
     return [run for run in runs if run.snr_db == snr_db and run.file == name]
 
 
-def p95(delays: list[float]) -> float:
-    return float(np.quantile(delays, 0.95, method="higher"))
+def within(these: list[Run], revolutions: float) -> bool:
+    """Whether 95 % of the alarms come within so many revolutions."""
+    return sum(run.delay <= revolutions for run in these) >= 0.95 * len(these)
 
 
 @pytest.mark.parametrize("snr_db", SNRS_DB)
@@ -164,7 +184,7 @@ def test_false_alarms_are_as_rare_as_promised(runs: tuple[Run, ...], snr_db: int
 @pytest.mark.parametrize("name", FAULTS)
 def test_at_20_db(runs: tuple[Run, ...], name: str) -> None:
     these = of(runs, 20, name)
-    assert p95([run.delay for run in these]) <= 2
+    assert within(these, 2)
     told = Counter(run.said[20] for run in these)
     assert told["ok"] >= 0.95 * SEEDS
     assert told["wrong"] == 0
@@ -174,7 +194,7 @@ def test_at_20_db(runs: tuple[Run, ...], name: str) -> None:
 def test_at_10_db(runs: tuple[Run, ...], name: str) -> None:
     these = of(runs, 10, name)
     misaligned = name == "A1_misalign"
-    assert p95([run.delay for run in these]) <= (20 if misaligned else 3)
+    assert within(these, 20 if misaligned else 3)
     told = Counter(run.said[120 if misaligned else 50] for run in these)
     assert told["ok"] >= (0.90 if misaligned else 0.95) * SEEDS
     assert told["wrong"] <= 0.01 * SEEDS
@@ -184,7 +204,16 @@ def test_at_10_db(runs: tuple[Run, ...], name: str) -> None:
 def test_at_0_db(runs: tuple[Run, ...], name: str) -> None:
     these = of(runs, 0, name)
     limit = {"stiffness_loss": 10, "rub": 40}.get(FAULTS[name], 5)
-    assert p95([run.delay for run in these]) <= limit
+    assert within(these, limit)
     told = Counter(run.said[220] for run in these)
     assert told["ok"] >= 0.85 * SEEDS
     assert told["wrong"] <= 0.02 * SEEDS
+
+
+@pytest.mark.parametrize("snr_db", [20, 10])
+def test_a_rotor_that_is_known_from_a_run_up_tells_unbalance_from_damping(data: Path, snr_db: int) -> None:
+    names = ("A1_damp_L2", "A1_unb_x2_G2p5", "A07_unb_x2_G2p5")
+    jobs = [(str(data / "ross" / f"{name}.npz"), snr_db, seed) for name in names for seed in range(SEEDS)]
+    with processes() as pool:
+        right = list(pool.map(resolved, jobs, chunksize=10))
+    assert sum(right) >= 0.95 * len(right)
