@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 _GENERIC_RUB_MARGIN_NATS = 12.0
+_ENERGY_NATS = 12.0
+_MOST_ENERGY_NATS = 100.0
 _RIVALS = frozenset(("rub", "unmodelled"))
 
 
@@ -38,6 +40,19 @@ class NamingRules:
     margin_nats: float = 5.0
     rub_margin_nats: float = 5.0
     least_severity: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Energy:
+    """What the non-harmonic energy says of a segment.
+
+    Attributes:
+        excess: variance of the complex residual of a sample above the healthy one, um^2.
+        nats: evidence that it is more than chance.
+    """
+
+    excess: float = 0.0
+    nats: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +89,7 @@ def identify(
     rules: NamingRules,
     may_name: bool = True,
     comparison: Comparison | None = None,
+    energy: Energy | None = None,
 ) -> Identification:
     """Weigh the hypotheses.
 
@@ -85,13 +101,25 @@ def identify(
         rules: margins.
         may_name: whether the rotor has settled enough for a name.
         comparison: what the transient says of unbalance and loss of damping, if it was abrupt.
+        energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
+            impacts) is what no linear fault makes.
     """
     scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
     if comparison is not None and comparison.holds(complex(change[1])):
         scores["damping_loss"] += min(0.0, comparison.damping_nats)
         scores["unbalance"] += min(0.0, -comparison.damping_nats)
     amplitude = healthy.healthy.amplitude_um
-    size = float(np.sqrt(np.sum(np.abs(change) ** 2)))
+    square = float(np.sum(np.abs(change) ** 2))
+    if (
+        energy is not None
+        and energy.nats > _ENERGY_NATS
+        and energy.excess > (rules.least_severity * amplitude) ** 2
+    ):
+        square += energy.excess
+        for name in scores:
+            if name not in _RIVALS:
+                scores[name] -= min(energy.nats, _MOST_ENERGY_NATS)
+    size = math.sqrt(square)
     # The typical component: that of the mean position may be drift of the probes, or not there at all.
     deviation = math.sqrt(float(np.median(variance)))
     best = max(scores, key=lambda name: scores[name])

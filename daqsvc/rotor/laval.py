@@ -6,6 +6,7 @@ predicted from them is averaged over that box (`LavalRotor.box`).
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -113,10 +114,16 @@ class LavalRotor:
         Returns:
             d ln H / d ln Omega averaged over the box, and the standard deviation of it there.
         """
-        omega, zeta = self.box
-        step = 1e-4
-        here = unbalance_response(speed_rad_s / omega, zeta)
-        there = unbalance_response(speed_rad_s * (1.0 + step) / omega, zeta)
-        slope = (there / here - 1.0) / step
-        mean = complex(slope.mean())
-        return mean, float(np.sqrt(np.mean(np.abs(slope - mean) ** 2)))
+        return _speed_slope(self, speed_rad_s)
+
+
+@functools.lru_cache(maxsize=256)
+def _speed_slope(rotor: LavalRotor, speed_rad_s: float) -> tuple[complex, float]:
+    # Asked for every revolution with the same speed of calibration.
+    omega, zeta = rotor.box
+    step = 1e-4
+    here = unbalance_response(speed_rad_s / omega, zeta)
+    there = unbalance_response(speed_rad_s * (1.0 + step) / omega, zeta)
+    slope = (there / here - 1.0) / step
+    mean = complex(slope.mean())
+    return mean, float(np.sqrt(np.mean(np.abs(slope - mean) ** 2)))

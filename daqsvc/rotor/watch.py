@@ -23,7 +23,7 @@ from daqsvc.rotor.calibration import (
     with_more,
 )
 from daqsvc.rotor.departure import DepartureTest, Evidence, threshold_for
-from daqsvc.rotor.identify import Identification, NamingRules, identify
+from daqsvc.rotor.identify import Energy, Identification, NamingRules, identify
 from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors
 from daqsvc.rotor.transient import BEFORE, KNOWN_WITHIN, REVOLUTIONS, Comparison, Transient, compare
 
@@ -344,7 +344,17 @@ class RotorWatch:
             rules=self.rules.naming,
             may_name=may_name,
             comparison=self._comparison,
+            energy=self._energy(rows[len(rows) // 2 :]),
         )
+
+    def _energy(self, rows: Sequence[_Row]) -> Energy:
+        """The non-harmonic energy of some revolutions against the healthy one."""
+        assert self._healthy is not None  # noqa: S101
+        noise = float(np.mean([row.noise for row in rows]))
+        excess = max(0.0, noise - self._healthy.noise)
+        share = 1.0 / len(rows) + 1.0 / self._healthy.revolutions
+        scale = 2.0 * self._healthy.noise_variance * share * self._healthy.noise**2
+        return Energy(excess, excess**2 / scale)
 
     def _return_to_health(self) -> None:
         assert self._healthy is not None  # noqa: S101

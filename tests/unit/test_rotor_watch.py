@@ -160,6 +160,22 @@ def test_noise_alone_that_gets_louder_is_a_change():
     assert [report.revolution for report in reports if report.departed][:1] == [101]
 
 
+def test_a_whirl_that_does_not_keep_step_with_the_shaft_is_no_unbalance():
+    """Oil whirl at 0.45 of the speed: 1X may move with it, but no unbalance makes the rest."""
+    healthy, after = (
+        orbits(np.tile(HEALTHY, (100, 1)), NOISE_UM, 1),
+        orbits(np.tile(UNBALANCE, (80, 1)), NOISE_UM, 2),
+    )
+    turns = np.arange(80 * PER_REV) / PER_REV
+    whirl = 12.0 * np.exp(2j * math.pi * 0.45 * turns)
+    after.xy[:, 0] += whirl.real
+    after.xy[:, 1] += whirl.imag
+    watch = RotorWatch(ROTOR, RATE_HZ)
+    for part in (healthy, after):
+        watch.take(synchronous_vectors(part))
+    assert set(watch.finish().group) <= {"unmodelled", "rub"}
+
+
 # What cannot be a baseline
 
 
