@@ -59,9 +59,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as cache:
         first_result_s(cache)
         wall_s, cpu_s = first_result_s(cache)
-        print(
-            f"first result  {wall_s:6.2f} s after the start of a process ({cpu_s:.2f} s CPU), warm kernel cache"
-        )
+        print(f"first result  {wall_s:6.2f} s after a process starts ({cpu_s:.2f} s CPU), warm kernel cache")
 
 
 if __name__ == "__main__":
