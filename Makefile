@@ -2,6 +2,7 @@
 # make test   the tests
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
+# make bench-data  the tables of the documentation, anew from the measured recordings
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
@@ -12,7 +13,7 @@ READY  := $(VENV)/.ready
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench lock clean
+.PHONY: help demo test check bench bench-data lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -40,6 +41,9 @@ check: $(READY)
 
 bench: $(READY)
 	@for bench in tests/bench/bench_*.py; do $(BIN)/python $$bench || exit 1; done
+
+bench-data: $(READY)
+	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
 
 # Pin again what pyproject.toml asks for. Needs uv (pip install uv).
 lock:

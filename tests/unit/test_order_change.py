@@ -1,0 +1,267 @@
+"""Orders without a keyphasor, and what two recordings say about a change of 1X."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daqsvc.cli import main
+from daqsvc.dsp.orders import order_vectors
+from daqsvc.rotor.order_change import OrderRules, compare_orders
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.dsp.orders import OrderVectors
+    from daqsvc.rotor.order_change import OrderChange
+
+RATE_HZ = 2000.0
+RPM = 1500.0
+AXES = np.array([1.0, 0.7j, 0.2])
+HARMONICS = (1.0, 0.4, 0.2)
+
+
+def record(
+    seed: int,
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0),
+    *,
+    rpm: float = RPM,
+    noise: float = 0.3,
+    n: int = 4000,
+) -> np.ndarray:
+    """Orders 1 to 3 of three axes from an arbitrary shaft angle, and noise."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * rpm / 60.0 / RATE_HZ * np.arange(n)
+    found = 0.9 + noise * rng.standard_normal((n, 3))
+    for order, (amplitude, factor) in enumerate(zip(HARMONICS, scale, strict=True), 1):
+        found += amplitude * factor * np.real(np.outer(np.exp(1j * order * angle), AXES))
+    return found
+
+
+def orders(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), **more: float) -> OrderVectors:
+    return order_vectors(record(seed, scale, **more), RATE_HZ, RPM)
+
+
+def compared(scale: tuple[float, ...], seed: int = 10, **more: float) -> OrderChange:
+    return compare_orders(orders(seed, **more), orders(seed + 1, scale, **more))
+
+
+def test_measures_amplitudes_and_phases_between_channels() -> None:
+    found = orders(1, noise=0.0)
+    mean = found.amplitudes.mean(axis=0)
+    np.testing.assert_allclose(np.abs(mean), np.outer(HARMONICS, np.abs(AXES)), rtol=2e-3)
+    np.testing.assert_allclose(mean[:, 1] / mean[:, 0], 0.7j, rtol=2e-3)
+    assert found.revolutions == 48
+    assert found.residual_rms.max() < 1e-2
+
+
+@pytest.mark.parametrize("rpm", [1460.0, 1499.3, 1500.0, 1531.7])
+def test_finds_the_speed_with_an_honest_uncertainty(rpm: float) -> None:
+    errors = []
+    for seed in range(12):
+        found = orders(seed, rpm=rpm)
+        assert found.speed_seen
+        errors.append((found.speed_rpm - rpm) / found.speed_uncertainty_rpm)
+        assert found.speed_uncertainty_rpm < 0.5
+    assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_says_when_no_order_stands_out() -> None:
+    rng = np.random.default_rng(5)
+    found = order_vectors(rng.standard_normal((4000, 2)), RATE_HZ, RPM)
+    assert not found.speed_seen
+    assert found.speed_uncertainty_rpm > 10.0
+
+
+def test_takes_no_line_between_the_harmonics_for_the_shaft() -> None:
+    samples = record(3)
+    belt = 3.0 * np.cos(2.0 * np.pi * 1.013 * 2.0 * RPM / 60.0 / RATE_HZ * np.arange(len(samples)))
+    found = order_vectors(samples + belt[:, np.newaxis], RATE_HZ, RPM)
+    assert found.speed_rpm == pytest.approx(RPM, abs=1.5)
+
+
+def test_missing_samples_cost_little() -> None:
+    samples = record(4, noise=0.05)
+    holes = samples.copy()
+    holes[np.random.default_rng(0).random(len(holes)) < 0.1] = np.nan
+    holes[100] = np.inf
+    whole = order_vectors(samples, RATE_HZ, RPM)
+    part = order_vectors(holes, RATE_HZ, RPM)
+    assert compare_orders(whole, part).verdict == "normal"
+    np.testing.assert_allclose(
+        np.abs(part.amplitudes.mean(axis=0)), np.abs(whole.amplitudes.mean(axis=0)), atol=0.02
+    )
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.3, 1.0])
+def test_an_unchanged_machine_is_normal_whatever_its_phase(noise: float) -> None:
+    for seed in range(20):
+        change = compared((1.0, 1.0, 1.0), 100 + 2 * seed, noise=noise)
+        assert (change.verdict, change.group) == ("normal", ("normal",))
+        assert change.probabilities["normal"] > 0.5
+
+
+@pytest.mark.parametrize("growth", [1.6, 2.0, 5.0])
+def test_a_grown_1x_is_unbalance_or_less_damping(growth: float) -> None:
+    change = compared((growth, 1.0, 1.0))
+    assert change.verdict == "unbalance"
+    assert change.group == ("unbalance", "damping_loss")
+    assert change.growth == pytest.approx(growth, rel=0.1)
+    assert change.growth_significant
+    np.testing.assert_allclose(change.ratio[0, :2], growth, rtol=0.15)
+    assert change.probabilities["unbalance"] == change.probabilities["damping_loss"] > 0.45
+
+
+def test_harmonics_that_come_with_unbalance_do_not_hide_it() -> None:
+    assert compared((6.0, 5.0, 6.0)).verdict == "unbalance"
+
+
+def test_harmonics_that_grow_without_1x_are_no_unbalance() -> None:
+    for scale in ((1.0, 6.0, 1.0), (1.0, 1.0, 15.0), (1.0, 6.0, 12.0)):
+        assert compared(scale).group == ("unmodelled",), scale
+
+
+def test_2x_that_grows_far_more_than_1x_is_no_sure_unbalance() -> None:
+    assert "unmodelled" in compared((1.6, 12.0, 1.0)).group
+
+
+def test_1x_that_falls_is_a_change_but_no_unbalance() -> None:
+    change = compared((0.4, 1.0, 1.0), noise=0.05)
+    assert change.group == ("unmodelled",)
+    assert not change.growth_significant
+
+
+def test_a_change_too_small_for_a_name() -> None:
+    assert compared((1.15, 1.0, 1.0), noise=0.01).group == ("small_change",)
+    assert compared((1.02, 1.0, 1.0), noise=0.001).group == ("normal",)
+
+
+def test_vibration_beside_the_orders_is_a_change_of_unknown_cause() -> None:
+    healthy = record(8)
+    rough = record(9)
+    rough += np.random.default_rng(1).standard_normal(rough.shape)
+    change = compare_orders(order_vectors(healthy, RATE_HZ, RPM), order_vectors(rough, RATE_HZ, RPM))
+    assert change.group == ("unmodelled",)
+    assert change.residual_changed
+    assert change.residual_ratio.min() > 2.0
+
+
+def test_1x_that_wanders_by_itself_is_no_change() -> None:
+    # A line 0.2 Hz beside 1X: halves of one recording differ by half of 1X and more.
+    samples = record(2, n=8000, noise=0.02)
+    beat = 0.5 * np.cos(2.0 * np.pi * (RPM / 60.0 + 0.12) / RATE_HZ * np.arange(8000))
+    samples += beat[:, np.newaxis]
+    first, second = (order_vectors(part, RATE_HZ, RPM) for part in (samples[:4000], samples[4000:]))
+    change = compare_orders(first, second)
+    assert change.growth > 1.15 or change.growth < 0.87
+    assert change.verdict == "normal"
+
+
+def test_probabilities_sum_to_one() -> None:
+    for scale in ((1.0, 1.0, 1.0), (1.3, 1.0, 1.0), (3.0, 2.0, 1.0), (1.0, 5.0, 1.0)):
+        change = compared(scale)
+        assert sum(change.probabilities.values()) == pytest.approx(1.0)
+        assert change.verdict in change.group
+
+
+def test_refuses_another_speed() -> None:
+    with pytest.raises(ValueError, match=r"turns at 1620 rpm, \+8\.0% from the healthy run's 1500 rpm"):
+        compare_orders(orders(1), order_vectors(record(2, rpm=1620.0), RATE_HZ, 1620.0))
+    with pytest.raises(ValueError, match=r"turns at about (249|250)\d rpm by its harmonics, not at 1500 rpm"):
+        order_vectors(record(2, rpm=2500.0), RATE_HZ, RPM)
+    with pytest.raises(ValueError, match=r"turns at about 157\d rpm by its harmonics, not at 1500 rpm"):
+        order_vectors(record(2, rpm=1575.0), RATE_HZ, RPM)
+
+
+def test_refuses_other_channels() -> None:
+    with pytest.raises(ValueError, match="3 channels and this one 1"):
+        compare_orders(orders(1), order_vectors(record(2)[:, 0], RATE_HZ, RPM))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda s: s[:300], r"has 3\.8 revolutions at 1500 rpm; at least 8"),
+        (lambda s: np.where(np.arange(3) == 1, 0.9, s), r"channel 'Y' is dead: every sample is 0\.9"),
+        (lambda s: np.minimum(s, 1.9), r"channel 'X' is clipped: .* of its samples are 1\.9"),
+        (lambda s: np.full_like(s, np.nan), r"channel 'X': 4000 of 4000 samples are missing"),
+    ],
+)
+def test_refuses_bad_samples(damage: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        order_vectors(damage(record(1)), RATE_HZ, RPM, ("X", "Y", "Z"))  # type: ignore[operator]
+
+
+def test_refuses_a_rate_too_low() -> None:
+    with pytest.raises(ValueError, match=r"200 Hz are 8\.0 samples per revolution"):
+        order_vectors(record(1), 200.0, RPM)
+
+
+def test_refuses_rules_that_cannot_be() -> None:
+    with pytest.raises(ValueError, match="false-alarm probability of 0 "):
+        OrderRules(false_alarm_probability=0.0)
+    with pytest.raises(ValueError, match=r"least change of 0\.01"):
+        OrderRules(least_change=0.01)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    for name, samples in (
+        ("healthy", record(20)),
+        ("again", record(21)),
+        ("heavy", record(22, (3.0, 1.0, 1.0))),
+        ("short", record(23)[:200]),
+    ):
+        np.savetxt(tmp_path / f"{name}.csv", samples, delimiter=",", header="X,Y,Z", comments="")
+    return tmp_path
+
+
+def command(files: Path, *recordings: str) -> list[str]:
+    paths = [str(files / f"{name}.csv") for name in recordings]
+    return ["analyze", *paths, "--channels", "X,Y,Z", "--fs", "2000", "--speed-rpm", "1500"]
+
+
+def test_the_command_judges_each_recording(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    baseline = ["--baseline", str(files / "healthy.csv"), "--json"]
+    assert main([*command(files, "again", "heavy", "short"), *baseline]) == 3
+    again, heavy, short = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert (again["verdict"], again["group"]) == ("normal", ["normal"])
+    assert (heavy["verdict"], heavy["group"]) == ("unbalance", ["unbalance", "damping_loss"])
+    assert heavy["growth_1x"]["ratio"] == pytest.approx(3.0, rel=0.1)
+    assert heavy["channels"]["X"]["orders"]["1X"]["ratio"] == pytest.approx(3.0, rel=0.1)
+    # 3 g at 157 rad/s
+    assert heavy["channels"]["X"]["velocity_1x_mm_s_rms"] == pytest.approx(132.0, rel=0.05)
+    assert short["verdict"] is None
+    assert "revolutions" in short["refused"]
+    assert main([*command(files, "heavy"), *baseline[:2], "--unit", "V"]) == 0
+    assert "unbalance or damping loss (cannot be told apart)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "--baseline must be given too"),
+        (["--baseline", "nowhere.csv"], "healthy run nowhere.csv: "),
+        (["--baseline", "{healthy}", "--unit", "um"], "--unit um: accelerometers measure in g, m/s2, V"),
+        (["--baseline", "{healthy}", "--probes", "X,Y"], "--probes: not with --channels"),
+        (["--baseline", "{short}"], "has 2.5 revolutions"),
+        (["--baseline", "{healthy}", "--false-alarm-probability", "2"], "not a probability"),
+    ],
+)
+def test_the_command_refuses_misuse(
+    files: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    named = [o.format(healthy=files / "healthy.csv", short=files / "short.csv") for o in options]
+    with pytest.raises(SystemExit) as stop:
+        main([*command(files, "again"), *named])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_probes_measure_no_acceleration(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["analyze", str(files / "again.csv"), "--probes", "X,Y", "--speed-rpm", "1500", "--unit", "g"])
+    assert "proximity probes measure in m, mm, um, mil" in capsys.readouterr().err
