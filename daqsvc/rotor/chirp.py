@@ -23,6 +23,37 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 
+def forcing_of(angle_rad: Floats) -> Complexes:
+    """What drives a rotor sampled at this angle, complex128 ``[n]``, so that ramps between samples are exact.
+
+    Ramps between the samples of a turning vector pass sinc^2 of its turns in a step; the rest are images at
+    the sampling rate, which a rotor does not follow.
+
+    Args:
+        angle_rad: float64 ``[n]``, unwrapped.
+    """
+    return np.asarray(np.exp(1j * angle_rad) / np.sinc(np.gradient(angle_rad) / math.tau) ** 2)
+
+
+def whirl_by_unbalance(
+    forcing: Complexes, angle_rad: Floats, step_s: float, omega: float, zeta: float
+) -> Complexes:
+    """Motion of a rotor at rest to unit eccentricity that turns with the angle, complex128 ``[n]``.
+
+    Args:
+        forcing: `forcing_of` the angle.
+        angle_rad: float64 ``[n]``, unwrapped.
+        step_s: time between samples.
+        omega: natural frequency in rad/s.
+        zeta: damping ratio.
+    """
+    damping = 2.0 * zeta * omega
+    numerator, denominator, _ = cont2discrete(
+        (np.array([damping, omega**2]), np.array([1.0, damping, omega**2])), step_s, method="foh"
+    )
+    return np.asarray(lfilter(numerator.ravel(), denominator, forcing) - np.exp(1j * angle_rad))
+
+
 class Chirp:
     """The record, and a Laval rotor's response to its shaft angle.
 
@@ -38,10 +69,8 @@ class Chirp:
         self._averaged = averaged
         self._length = len(z) // averaged * averaged
         self._time_s = np.arange(len(z)) * self._step_s
-        self._turn = np.exp(1j * angle_rad)
-        # Ramps between the samples of a turning vector pass sinc^2 of its turns in a step; the rest are
-        # images at the sampling rate, which a rotor does not follow.
-        self._forcing = self._turn / np.sinc(np.gradient(angle_rad) / math.tau) ** 2
+        self._angle_rad = angle_rad
+        self._forcing = forcing_of(angle_rad)
         self._recorded = z
         seen = self._mean(z)
         self._there = np.isfinite(seen)
@@ -57,11 +86,7 @@ class Chirp:
 
     def _motions(self, omega: float, zeta: float) -> Iterator[Complexes]:
         """Response to unit eccentricity and the two free motions, complex128 ``[n]`` each."""
-        damping = 2.0 * zeta * omega
-        numerator, denominator, _ = cont2discrete(
-            (np.array([damping, omega**2]), np.array([1.0, damping, omega**2])), self._step_s, method="foh"
-        )
-        yield np.asarray(lfilter(numerator.ravel(), denominator, self._forcing) - self._turn)
+        yield whirl_by_unbalance(self._forcing, self._angle_rad, self._step_s, omega, zeta)
         pole = omega * complex(-zeta, math.sqrt(1.0 - zeta**2))
         yield np.exp(pole * self._time_s)
         yield np.exp(pole.conjugate() * self._time_s)
