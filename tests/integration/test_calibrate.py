@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
+import signal
+import threading
 import tomllib
 from functools import cache
 from typing import TYPE_CHECKING
@@ -330,3 +333,17 @@ async def test_listening_can_be_interrupted_and_leaves_nothing_behind() -> None:
     with pytest.raises(asyncio.CancelledError):
         await listening
     assert [task.get_name() for task in asyncio.all_tasks() if task is not asyncio.current_task()] == []
+
+
+def test_ctrl_c_ends_listening_and_writes_nothing(tmp_path: Path, capsys) -> None:
+    path, out = tmp_path / "machine.toml", tmp_path / "rotor.toml"
+    text = MACHINE.read_text(encoding="utf-8").replace('"socketcan"', '"virtual"')
+    path.write_text(text[: text.index("[mqtt]")], encoding="utf-8")
+    ctrl_c = threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT))
+    ctrl_c.start()
+    code, said, error = calibrate(capsys, path, "--live", "--out", out)
+    ctrl_c.join()
+    assert code == 1
+    assert not said
+    assert "interrupted" in error
+    assert not out.exists()
