@@ -19,14 +19,14 @@ model nothing tells the two apart: they are always named together.
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
 from daqsvc.dsp.order_speed import ORDERS
+from daqsvc.rotor.order_causes import cause_evidence, surprise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.orders import OrderVectors
+    from daqsvc.rotor.order_causes import Cause
 
     Floats: TypeAlias = NDArray[np.float64]
     Complexes: TypeAlias = NDArray[np.complex128]
@@ -45,12 +46,6 @@ _NOISE_LINES = 3
 """Lines on either side of an order, one over the recording's length apart, that tell its noise."""
 _VELOCITY = 1.0 / np.array(ORDERS, dtype=np.float64)[:, np.newaxis]
 """Acceleration to velocity, in units of the shaft speed."""
-_SCALES = 2.0 ** np.arange(-3, 7)
-"""How large a change may be, as multiples of the healthy level: integrated over."""
-_HARMONIC_SHARES = (0.0, 0.02, 0.1, 0.3, 0.6)
-"""2X and 3X that unbalance brings along, over its 1X, as velocity: integrated over."""
-_OPEN_NATS = -6.0
-"""An unmodelled change explains everything; it must explain it better by so much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +118,7 @@ class OrderChange:
     verdict: OrderVerdict
     group: tuple[OrderVerdict, ...]
     probabilities: Mapping[OrderVerdict, float]
-    evidence: Mapping[OrderVerdict, float] = field(default_factory=dict)
+    evidence: Mapping[Cause, float]
     departure: float
     departure_threshold: float
     severity: float
@@ -162,19 +157,28 @@ def compare_orders(
     was, now = _Mean.of(baseline), _Mean.of(present)
     variance, freedom = was.variance + now.variance, _freedom(was, now)
     change = _change(was.mean, now.mean, variance, freedom)
-    departure = float(_surprise(change, variance, freedom).sum())
+    departure = float(surprise(change, variance, freedom).sum())
     threshold = _departure_threshold(change.size, rules.test_probability)
 
     level = _length(was.mean * _VELOCITY, was.variance * _VELOCITY**2)
     severity = _excess(change * _VELOCITY, variance * _VELOCITY**2) / level
     growth, growth_uncertainty, grown = _growth(was, now, rules)
     residual = _Residual.of(baseline, present, rules)
-    evidence = _evidence(change * _VELOCITY, variance * _VELOCITY**2, freedom, level, growing=growth > 1.0)
+    evidence = cause_evidence(
+        change * _VELOCITY, variance * _VELOCITY**2, freedom, level, growing=growth > 1.0
+    )
     # What repeats no better than so is no change, however sure.
-    excess = max(departure - threshold if severity > rules.repeatability else -np.inf, residual.excess)
-    excess = max(excess, 0.0) if grown else excess
+    beyond = departure - threshold
+    departed = beyond > 0.0 and severity > rules.repeatability
+    excess = max(beyond if departed or beyond <= 0.0 else -np.inf, residual.excess, 0.0 if grown else -np.inf)
     large = grown or residual.changed or severity >= rules.least_change
-    group = _group(evidence, rules, changed=grown or excess > 0.0, large=large, grown=grown)
+    if not (grown or departed or residual.changed):
+        group: tuple[OrderVerdict, ...] = ("normal",)
+    elif not large:
+        group = ("small_change",)
+    else:
+        # Vibration beside the orders says nothing of 1X.
+        group = _causes(evidence, rules, growth=growth if departed or grown else 1.0, grown=grown)
     return OrderChange(
         verdict=group[0],
         group=group,
@@ -254,15 +258,7 @@ def _change(was: Complexes, now: Complexes, variance: Floats, freedom: Floats) -
     """The present vectors less the healthy ones, these turned to where they surprise least."""
     turns = np.exp(1j * np.outer(_ANGLES, ORDERS))[:, :, np.newaxis]
     changes = now - turns * was
-    return np.asarray(changes[np.argmin(_surprise(changes, variance, freedom).sum(axis=(1, 2)))])
-
-
-def _surprise(change: Complexes, variance: Floats, freedom: Floats) -> Floats:
-    """-ln of the probability of a larger change by chance: Exp(1) of an unchanged component.
-
-    |change|^2 / variance is F with 2 and 2 nu degrees of freedom, and its survival a power.
-    """
-    return np.asarray(freedom * np.log1p(np.abs(change) ** 2 / (freedom * variance)))
+    return np.asarray(changes[np.argmin(surprise(changes, variance, freedom).sum(axis=(1, 2)))])
 
 
 def _departure_threshold(components: int, probability: float) -> float:
@@ -334,71 +330,14 @@ class _Residual:
         return cls(np.exp(rise), bool((large & (score > needed)).any()), float(nats.max()))
 
 
-def _evidence(
-    change: Complexes, variance: Floats, freedom: Floats, level: float, *, growing: bool
-) -> dict[OrderVerdict, float]:
-    """Log marginal likelihood of the causes over "normal", amplitudes integrated over.
-
-    Args:
-        change: complex128 ``[3, channels]``, as velocity.
-        variance: of it.
-        freedom: complex degrees of freedom of the variance.
-        level: length of the healthy vector, as velocity.
-        growing: whether 1X is longer now.
-    """
-
-    def gain(order: int, sizes: Floats) -> Floats:
-        """Nats of a change of this order that is CN(0, size^2), for each size."""
-        power, noise = np.abs(change[order]) ** 2, variance[order]
-        total = noise + sizes[:, np.newaxis] ** 2
-        normal = (1.0 + 1.0 / freedom[order]) * _surprise(change[order], noise, freedom[order])
-        return np.asarray((normal - power / total - np.log(total / noise)).sum(axis=1))
-
-    sizes: Floats = np.asarray(_SCALES * level, dtype=np.float64)
-    unbalance = 0.0
-    if growing:
-        terms = [
-            gain(0, sizes) + sum((gain(order, share * sizes) for order in (1, 2)), np.zeros(len(sizes)))
-            for share in _HARMONIC_SHARES
-        ]
-        unbalance = _log_mean(np.concatenate(terms))
-    alone = [_log_mean(gain(order, sizes)) for order in range(len(ORDERS))]
-    # 1X that grows alone is what unbalance does: no need of an unknown cause.
-    subsets = [
-        sum(alone[row] for row in rows)
-        for count in range(1, len(ORDERS) + 1)
-        for rows in itertools.combinations(range(len(ORDERS)), count)
-        if not (growing and rows == (0,))
-    ]
-    return {
-        "unbalance": unbalance,
-        "damping_loss": unbalance,
-        "unmodelled": _log_mean(np.array(subsets)) + _OPEN_NATS,
-    }
-
-
-def _log_mean(nats: Floats) -> float:
-    """Logarithm of the mean of exponentials."""
-    most = float(nats.max())
-    return most + math.log(float(np.exp(nats - most).mean()))
-
-
-def _group(
-    evidence: Mapping[OrderVerdict, float],
-    rules: OrderRules,
-    *,
-    changed: bool,
-    large: bool,
-    grown: bool,
-) -> tuple[OrderVerdict, ...]:
-    if not changed:
-        return ("normal",)
-    if not large:
-        return ("small_change",)
+def _causes(
+    evidence: Mapping[Cause, float], rules: OrderRules, *, growth: float, grown: bool
+) -> tuple[Cause, ...]:
+    """What a change comes of, the most likely first."""
     lead = evidence["unbalance"] - evidence["unmodelled"]
-    if not grown or lead < -rules.margin_nats:
+    if growth < 1.0 + rules.least_change or lead < -rules.margin_nats:
         return ("unmodelled",)
-    if lead > rules.margin_nats:
+    if grown and lead > rules.margin_nats:
         return ("unbalance", "damping_loss")
     if lead > 0.0:
         return ("unbalance", "damping_loss", "unmodelled")
@@ -406,7 +345,7 @@ def _group(
 
 
 def _probabilities(
-    group: tuple[OrderVerdict, ...], evidence: Mapping[OrderVerdict, float], excess: float
+    group: tuple[OrderVerdict, ...], evidence: Mapping[Cause, float], excess: float
 ) -> dict[OrderVerdict, float]:
     """At the threshold, changed and unchanged are even; a change is shared out by the causes' evidence."""
     changed = 1.0 / (1.0 + math.exp(-min(max(excess, -500.0), 500.0)))
@@ -417,9 +356,9 @@ def _probabilities(
     if group in {("normal",), ("small_change",)}:
         found["small_change"] = changed
         return found
-    causes: tuple[OrderVerdict, ...] = ("unbalance", "damping_loss", "unmodelled")
+    causes: tuple[Cause, ...] = ("unbalance", "damping_loss", "unmodelled")
     if group == ("unmodelled",):
-        causes = group
+        causes = ("unmodelled",)
     most = max(evidence[cause] for cause in causes)
     weights = {cause: math.exp(max(evidence[cause] - most, -700.0)) for cause in causes}
     for cause in causes:
