@@ -137,7 +137,7 @@ def _judge(
         ),
         reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
         rotor=setup.rotor,
-        rules=setup.rules,
+        rules=replace(setup.rules, speed_uncertainty=speed.uncertainty),
         calibration=setup.calibration,
         ac_coupled=setup.ac_coupled or checks.lacks_mean(samples[:, :2]),
         listener=watched.take,

@@ -50,6 +50,7 @@ class RotorSetup:
         rotor: what is known about the rotor.
         probe_angles_deg: where they point, from +x against the clock.
         speed_rpm: shaft speed, negative if the shaft turns clockwise; may be None with a keyphasor.
+        speed_step_rpm: step of the stated speed's last digit, which it is rounded to; 0: it is exact.
         unit: unit of the probes' samples.
         keyphasor: the keyphasor, if there is one.
         follow_orbit: take speed and angle from the orbit's own 1X, about ``speed_rpm``.
@@ -67,6 +68,7 @@ class RotorSetup:
     rotor: LavalRotor
     speed_rpm: float | None
     probe_angles_deg: tuple[float, float] = (0.0, 90.0)
+    speed_step_rpm: float = 0.0
     unit: LengthUnit = "um"
     keyphasor: Keyphasor | None = None
     follow_orbit: bool = False

@@ -39,10 +39,17 @@ _OFF_NOMINAL = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """Speed that the detector starts from, and the keyphasor's threshold and hysteresis if there is one."""
+    """Speed that the detector starts from.
+
+    Attributes:
+        rpm: the speed.
+        keyphasor: the keyphasor's threshold and hysteresis, if there is one.
+        uncertainty: relative standard deviation of the speed, where the angle rests on it.
+    """
 
     rpm: float
     keyphasor: KeyphasorProbe | None = None
+    uncertainty: float = 0.0
 
 
 def speed_of(
@@ -117,8 +124,12 @@ def _fixed_speed(
             f"the speed is {abs(found.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
             "the former is used"
         )
-        return Speed(found.speed_rpm), quality
-    return Speed(stated_rpm), quality
+        return Speed(found.speed_rpm, uncertainty=found.uncertainty_rpm / abs(found.speed_rpm)), quality
+    # A rounded figure and an estimate with its own uncertainty, weighed.
+    stated = (setup.speed_step_rpm / math.sqrt(12.0)) ** 2
+    weight = stated / (stated + found.uncertainty_rpm**2) if stated > 0.0 else 0.0
+    rpm = stated_rpm + weight * (found.speed_rpm - stated_rpm)
+    return Speed(rpm, uncertainty=math.sqrt((1.0 - weight) * stated) / abs(rpm)), quality
 
 
 def _keyphasor_speed(

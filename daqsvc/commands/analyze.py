@@ -132,6 +132,7 @@ class AnalyzeCommand:
                 probes=arguments.probes,
                 rotor=rotor,
                 speed_rpm=speed.rpm,
+                speed_step_rpm=speed.step_rpm,
                 unit=arguments.unit or "um",
                 keyphasor=None if keyphasor is None else Keyphasor(keyphasor, arguments.keyphasor_threshold),
                 follow_orbit=speed.orbit or arguments.follow_orbit,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,10 +29,12 @@ class SpeedOption:
     Attributes:
         rpm: the speed, negative if clockwise.
         orbit: whether the orbit's own 1X is followed about it.
+        step_rpm: the step of its last digit: 5111 is not 5111.000.
     """
 
     rpm: float | None
     orbit: bool = False
+    step_rpm: float = 0.0
 
 
 class _MergedMap(argparse.Action):
@@ -63,8 +66,8 @@ def add_rotor_arguments(parser: argparse.ArgumentParser) -> None:
         "--speed-rpm",
         type=speed,
         metavar="N",
-        help="shaft speed, negative if clockwise: exact if there is no keyphasor, nominal if there is one; "
-        "orbit:N follows the orbit's own 1X about N",
+        help="shaft speed, negative if clockwise: nominal with a keyphasor, else exact to half of its last "
+        "digit; orbit:N follows the orbit's own 1X about N",
     )
     rotor.add_argument("--follow-orbit", action="store_true", help="the same as --speed-rpm orbit:N")
     rotor.add_argument("--keyphasor", metavar="CH", help="channel of the keyphasor, one pulse a revolution")
@@ -238,7 +241,8 @@ def speed(text: str) -> SpeedOption:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a speed; write revolutions per minute, negative if clockwise, or orbit:N"
         )
-    return SpeedOption(value, orbit)
+    exponent = Decimal(text.removeprefix(_ORBIT)).as_tuple().exponent
+    return SpeedOption(value, orbit, step_rpm=10.0**exponent if isinstance(exponent, int) else 0.0)
 
 
 def number(text: str) -> float:

@@ -64,6 +64,8 @@ class Spread:
         speed_slope: standard deviation of d ln Z_1 / d ln Omega after compensation.
         amplitude_um: modulus of Z_1 that the slope belongs to.
         drift: um^2, variance of the mean position that is the probes', not the shaft's.
+        turn_rad: standard deviation of what the angle turns against the shaft in a revolution, where a
+            stated speed stands in for a keyphasor.
     """
 
     variance: Floats
@@ -73,9 +75,14 @@ class Spread:
     speed_slope: float = 0.0
     amplitude_um: float = 0.0
     drift: float = 0.0
+    turn_rad: float = 0.0
 
     def of_means(
-        self, revolutions: Floats | float, reference: Floats | float, speed: Floats | float
+        self,
+        revolutions: Floats | float,
+        reference: Floats | float,
+        speed: Floats | float,
+        apart: Floats | float = 0.0,
     ) -> Floats:
         """Variance of the difference of two mean vectors, float64 ``[..., 5]``.
 
@@ -83,10 +90,12 @@ class Spread:
             revolutions: in the one mean.
             reference: in the other.
             speed: relative difference of their speeds.
+            apart: revolutions from the middle of the one to that of the other.
         """
         share = np.asarray(1.0 / np.asarray(revolutions) + 1.0 / np.asarray(reference))[..., np.newaxis]
         variance = self.variance * share + self.floor
         guard = (self.amplitude_um * self.speed_slope * np.asarray(speed)) ** 2
+        guard = guard + (self.amplitude_um * self.turn_rad * np.asarray(apart)) ** 2
         variance[..., 1] += guard
         variance[..., 2] += guard
         variance[..., 0] += self.drift
@@ -164,7 +173,8 @@ class DepartureTest:
     ) -> Evidence:
         change = recent[:, :5] - reference[:, :5]
         speed = (recent[:, 6] - reference[:, 6]).real
-        variance = self.spread.of_means(windows.astype(np.float64), length, speed)
+        apart = self.count - (windows + length) / 2.0
+        variance = self.spread.of_means(windows.astype(np.float64), length, speed, apart)
         nats = (np.abs(change) ** 2 / variance).sum(axis=1)
         noise = np.maximum(reference[:, 5].real, 1e-300)
         louder = np.maximum(recent[:, 5].real / noise - 1.0, 0.0)

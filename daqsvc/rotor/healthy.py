@@ -47,6 +47,11 @@ class Healthy:
         return float(np.sqrt(np.sum(np.abs(self.baseline[1:]) ** 2)))
 
     @property
+    def whirl_um(self) -> float:
+        """The part of it that unbalance makes: 1X in both senses."""
+        return float(np.hypot(abs(self.baseline[FORWARD]), abs(self.baseline[BACKWARD])))
+
+    @property
     def ellipticity(self) -> float:
         """Backward over forward 1X."""
         return float(abs(self.baseline[BACKWARD]) / max(abs(self.baseline[FORWARD]), 1e-12))

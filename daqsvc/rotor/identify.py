@@ -105,7 +105,8 @@ def identify(
             impacts) is what no linear fault makes.
     """
     scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
-    if comparison is not None and comparison.holds(complex(change[1])):
+    told = comparison is not None and comparison.holds(complex(change[1]))
+    if comparison is not None and told:
         scores["damping_loss"] += min(0.0, comparison.damping_nats)
         scores["unbalance"] += min(0.0, -comparison.damping_nats)
     amplitude = healthy.healthy.amplitude_um
@@ -130,7 +131,9 @@ def identify(
         probabilities = {"normal": probabilities["normal"], "small_change": 1.0 - probabilities["normal"]}
     else:
         candidates = _group(scores, best, healthy, rules)
-    agreed = previous is not None and set(previous.candidates) == set(candidates)
+    agreed = previous is not None and (
+        set(previous.candidates) == set(candidates) or (told and set(candidates) < set(previous.candidates))
+    )
     named = may_name and agreed
     group = candidates
     if previous is not None and previous.named and not named:

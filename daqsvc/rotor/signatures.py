@@ -97,14 +97,7 @@ def damping_misfit(change: Complexes, variance: Floats, healthy: Healthy) -> flo
 
     The nearest point decides, not the average: what cannot be told apart must stay in the group.
     """
-    omega, zeta = healthy.rotor.box
-    speed = healthy.speed_rad_s
-    grid = np.meshgrid(np.arange(len(omega)), _DAMPING_LEFT, _DAMPING_FREQUENCY, _DAMPING_MASS, indexing="ij")
-    point, left, frequency, mass = (axis.ravel() for axis in grid)
-    point = point.astype(np.int64)
-    before = unbalance_response(speed / omega[point], zeta[point])
-    after = mass * unbalance_response(speed / (omega[point] * frequency), zeta[point] * left)
-    # Towards no change of damping there is no change of frequency and mass either.
+    before, after = _damped(healthy)
     forward = healthy.baseline[FORWARD]
     moved = forward * (after / before - 1.0)
     tolerance = _DAMPING_TOLERANCE * abs(forward + change[FORWARD])
@@ -151,7 +144,31 @@ def _damping_loss(change: Complexes, variance: Floats, healthy: Healthy) -> floa
     score = _still(change, variance, float(np.abs(change[both]).max()))
     for k in both:
         score[k] = _free(change[k], variance[k], healthy.amplitude_um)
-    return float(score.sum())
+    return float(score.sum()) - _beyond_reach(change, variance, healthy)
+
+
+def _beyond_reach(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """How much further 1X moves than a loss of damping can move it, in nats, whatever the rotor's shape.
+
+    The direction of the change is that of a Laval rotor only; its size is no larger for any mode that has
+    the stated frequency and damping.
+    """
+    before, after = _damped(healthy)
+    reach = float(np.abs(after / before - 1.0).max()) * healthy.whirl_um
+    moved = float(np.hypot(abs(change[FORWARD]), abs(change[BACKWARD])))
+    tolerance = (_DAMPING_TOLERANCE * moved) ** 2 + float(variance[FORWARD] + variance[BACKWARD])
+    return max(0.0, max(0.0, moved - reach) ** 2 / tolerance - 1.0)
+
+
+def _damped(healthy: Healthy) -> tuple[Complexes, Complexes]:
+    """1X response before and after every loss of damping, complex128 ``[n]`` each."""
+    omega, zeta = healthy.rotor.box
+    speed = healthy.speed_rad_s
+    grid = np.meshgrid(np.arange(len(omega)), _DAMPING_LEFT, _DAMPING_FREQUENCY, _DAMPING_MASS, indexing="ij")
+    point, left, frequency, mass = (axis.ravel() for axis in grid)
+    point = point.astype(np.int64)
+    before = unbalance_response(speed / omega[point], zeta[point])
+    return before, mass * unbalance_response(speed / (omega[point] * frequency), zeta[point] * left)
 
 
 def _static_load(change: Complexes, variance: Floats, healthy: Healthy) -> float:

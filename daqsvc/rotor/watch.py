@@ -22,7 +22,7 @@ from daqsvc.rotor.calibration import (
     compensated,
     with_more,
 )
-from daqsvc.rotor.departure import DepartureTest, Evidence, threshold_for
+from daqsvc.rotor.departure import DepartureTest, Evidence, Spread, threshold_for
 from daqsvc.rotor.identify import Energy, Identification, NamingRules, identify
 from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors
 from daqsvc.rotor.transient import BEFORE, KNOWN_WITHIN, REVOLUTIONS, Comparison, Transient, compare
@@ -66,6 +66,7 @@ class WatchRules:
         energy_threshold_nats: threshold of the non-harmonic energy.
         naming: how a change gets its name.
         probe_drift_um: standard deviation of the mean position that is drift of the probes.
+        speed_uncertainty: relative standard deviation of a stated speed that stands in for a keyphasor.
         retry: whether to try again after data that cannot be the baseline.
     """
 
@@ -74,6 +75,7 @@ class WatchRules:
     energy_threshold_nats: float = 12.0
     naming: NamingRules = field(default_factory=NamingRules)
     probe_drift_um: float = 0.0
+    speed_uncertainty: float = 0.0
     retry: bool = True
 
 
@@ -148,6 +150,7 @@ class RotorWatch:
         self._segment: list[_Row] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
+        self._begun, self._middle = 0, 0.0
         self._onset: int | None = None
         self._look = 0
         self._identification: Identification | None = None
@@ -207,7 +210,10 @@ class RotorWatch:
         elif self._onset is not None:
             if self._alarm is not None and row.revolution == self._alarm[0] + REVOLUTIONS:
                 self._comparison = self._compare()
-            looked = self._maybe_look(row.revolution)
+                if self._comparison is not None:
+                    self._identify(row.revolution, may_name=True)
+                    looked = True
+            looked = self._maybe_look(row.revolution) or looked
         return self._report(one, evidence, departed=departed, looked=looked)
 
     def _calibrate(self, one: SynchronousVectors) -> WatchReport:
@@ -229,6 +235,7 @@ class RotorWatch:
         self._test = self._new_test(
             threshold_for(self.rules.false_alarms_per_1000_rev), least=calibration.revolutions
         )
+        self._begun = self.revolutions - calibration.revolutions
         # The baseline counts as revolutions seen; they are zero in the test's coordinates.
         for _ in range(calibration.revolutions):
             self._test.add(np.zeros(5, dtype=np.complex128), calibration.noise, 0.0)
@@ -236,7 +243,7 @@ class RotorWatch:
 
     def _new_test(self, threshold_nats: float, *, least: int) -> DepartureTest:
         assert self.calibration is not None  # noqa: S101 - only called after it was made
-        spread = replace(self.calibration.spread, drift=self.rules.probe_drift_um**2)
+        spread = self._spread(self.calibration)
         if self._onset is not None:
             spread = replace(
                 spread,
@@ -249,6 +256,11 @@ class RotorWatch:
             energy_threshold_nats=self.rules.energy_threshold_nats * threshold_nats / 20.0,
             least_reference=least,
         )
+
+    def _spread(self, healthy: Calibration) -> Spread:
+        """The scatter of a baseline's vectors, with what the rules add to it."""
+        turn_rad = 2.0 * math.pi * self.rules.speed_uncertainty
+        return replace(healthy.spread, drift=self.rules.probe_drift_um**2, turn_rad=turn_rad)
 
     def _tests(self, row: _Row) -> bool:
         """Whether a revolution goes into a departure test: not while a new segment settles."""
@@ -272,6 +284,7 @@ class RotorWatch:
         if self._onset is None:
             mean, count = self._test.reference_before(window)
             self._healthy = with_more(self.calibration, self.calibration.baseline + mean, count)
+            self._middle = self._begun + count / 2.0
         self._onset = onset
         self._look = 0
         self._segment.clear()
@@ -333,9 +346,10 @@ class RotorWatch:
         speed = float(np.mean([row.speed for row in rows]))
         shift = self._healthy.baseline - self.calibration.baseline
         change = vectors.mean(axis=0) - shift
-        spread = replace(self._healthy.spread, drift=self.rules.probe_drift_um**2)
+        spread = self._spread(self._healthy)
         spread = replace(spread, variance=np.maximum(spread.variance, self._scatter(rows)))
-        variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed)
+        apart = float(np.mean([row.revolution for row in rows])) - self._middle
+        variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
         self._identification = identify(
             change,
             variance,

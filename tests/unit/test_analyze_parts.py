@@ -125,9 +125,10 @@ def test_a_mean_within_the_noise_is_no_mean() -> None:
 @pytest.mark.parametrize(
     ("text", "option"),
     [
-        ("5000", SpeedOption(5000.0)),
-        ("-12.5", SpeedOption(-12.5)),
-        ("orbit:60", SpeedOption(60.0, orbit=True)),
+        ("5000", SpeedOption(5000.0, step_rpm=1.0)),
+        ("-12.50", SpeedOption(-12.5, step_rpm=0.01)),
+        ("6e3", SpeedOption(6000.0, step_rpm=1000.0)),
+        ("orbit:60", SpeedOption(60.0, orbit=True, step_rpm=1.0)),
     ],
 )
 def test_speeds_are_read(text: str, option: SpeedOption) -> None:
