@@ -16,9 +16,9 @@ from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limit
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.publish.mqtt import MqttSettings
-from daqsvc.rotor.calibration_file import CalibrationFileError, load_calibration, save_calibration
+from daqsvc.rotor.calibration.file import CalibrationFileError, load_calibration, save_calibration
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.watch import WatchRules
+from daqsvc.rotor.synchronous.watch import WatchRules
 from daqsvc.settings.models import (
     ROTOR_SYNCHRONOUS,
     Accelerometer,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.rotor_synchronous import SpeedReference
-    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings.models import MachineFile, RotorBank, RotorSynchronous, Sensor
     from drivers.base import Driver
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from daqsvc.dsp.shaft import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 RATE_HZ = 640.0
 PER_REV = 64

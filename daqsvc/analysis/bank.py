@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daqsvc.analysis.statements import Statements
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.signatures import RotorFault
+    from daqsvc.rotor.synchronous.signatures import RotorFault
 
 
 _CLOSED_LIST = (

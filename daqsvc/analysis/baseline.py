@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from daqsvc.rotor.calibration_file import CalibrationFileError, load_record
+from daqsvc.rotor.calibration.file import CalibrationFileError, load_record
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.rotor.calibration import Calibration
     from daqsvc.rotor.laval import LavalRotor
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
 
 def load_baseline(

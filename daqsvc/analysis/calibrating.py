@@ -18,9 +18,9 @@ from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed import LEAST_JUDGED, speed_of
 from daqsvc.dsp.revolutions import KeyphasorCutter
 from daqsvc.recording.channels import to_um
-from daqsvc.rotor.calibration import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
-from daqsvc.rotor.calibration_file import CalibrationRecord
-from daqsvc.rotor.run_up import LEAST_SPEED_RATIO, fit_run_up
+from daqsvc.rotor.calibration.file import CalibrationRecord
+from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up
+from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from daqsvc.analysis.setup import RotorSetup
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 
     Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from daqsvc.recording.channels import UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.watch import WatchRules
+from daqsvc.rotor.synchronous.watch import WatchRules
 from daqsvc.settings import load_machine_file, models
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
 
     Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ from daqsvc.dsp.order_speed import ORDERS
 from daqsvc.dsp.orders import OrderVectors, order_vectors
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
-from daqsvc.rotor.order_change import OrderChange, OrderRules, compare_orders
+from daqsvc.rotor.orders.change import OrderChange, OrderRules, compare_orders
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -16,7 +16,7 @@ from matplotlib.projections.polar import PolarAxes
 
 from daqsvc.analysis.result import VERDICTS
 from daqsvc.recording.channels import to_um
-from daqsvc.rotor.calibration import compensated
+from daqsvc.rotor.synchronous.baseline import compensated
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from daqsvc.analysis.result import RotorAnalysis, Trace
     from daqsvc.analysis.setup import RotorSetup
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from daqsvc.analysis.quality import DataQuality
-from daqsvc.rotor.signatures import RotorFault
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.signatures import RotorFault
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.identify import Identification
-    from daqsvc.rotor.synchronous import SynchronousVectors
-    from daqsvc.rotor.watch import WatchReport
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.vectors import SynchronousVectors
+    from daqsvc.rotor.synchronous.watch import WatchReport
 
 VERDICTS: tuple[RotorFault, ...] = get_args(RotorFault)
 
@@ -97,7 +97,8 @@ class RotorAnalysis:
         probabilities: of every verdict.
         evidence: nats of every hypothesis over "normal".
         severity: modulus of the change over the healthy whirl's amplitude.
-        level: how large each fault of the group would be, in its own terms (`daqsvc.rotor.severity`).
+        level: how large each fault of the group would be, in its own terms
+            (`daqsvc.rotor.synchronous.severity`).
         identification: what the last look saw; None while the machine is healthy.
         onset: estimated begin of the change.
         departure: where the alarm is raised.

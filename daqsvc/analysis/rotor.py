@@ -24,11 +24,11 @@ from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.probe_checks import Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.recording.channels import to_um
-from daqsvc.rotor.calibration import Calibration, compensated
-from daqsvc.rotor.departure import threshold_for
-from daqsvc.rotor.severity import levels
-from daqsvc.rotor.signatures import likelihoods
-from daqsvc.rotor.synchronous import SynchronousVectors
+from daqsvc.rotor.synchronous.baseline import Calibration, compensated
+from daqsvc.rotor.synchronous.departure import threshold_for
+from daqsvc.rotor.synchronous.severity import levels
+from daqsvc.rotor.synchronous.signatures import likelihoods
+from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
     from daqsvc.analysis.setup import RotorSetup
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.identify import Identification
-    from daqsvc.rotor.signatures import RotorFault
-    from daqsvc.rotor.watch import WatchReport
+    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.signatures import RotorFault
+    from daqsvc.rotor.synchronous.watch import WatchReport
 
     Floats = NDArray[np.float64]
 

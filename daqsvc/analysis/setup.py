@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from daqsvc.rotor.watch import WatchRules
+from daqsvc.rotor.synchronous.watch import WatchRules
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.dsp.marks import Edge
     from daqsvc.recording.channels import LengthUnit
-    from daqsvc.rotor.calibration import Calibration
     from daqsvc.rotor.laval import LavalRotor
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
 SpeedSource = Literal["fixed", "orbit", "keyphasor"]
 

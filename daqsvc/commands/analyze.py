@@ -102,9 +102,9 @@ class AnalyzeCommand:
         """An analyst by the options; None after their error has been printed."""
         from daqsvc.analysis.analyst import RotorAnalyst  # noqa: PLC0415
         from daqsvc.analysis.setup import Keyphasor, RotorSetup  # noqa: PLC0415
-        from daqsvc.rotor.departure import threshold_for  # noqa: PLC0415
         from daqsvc.rotor.laval import LavalRotor  # noqa: PLC0415
-        from daqsvc.rotor.watch import WatchRules  # noqa: PLC0415
+        from daqsvc.rotor.synchronous.departure import threshold_for  # noqa: PLC0415
+        from daqsvc.rotor.synchronous.watch import WatchRules  # noqa: PLC0415
 
         keyphasor, speed = arguments.keyphasor, arguments.speed_rpm or SpeedOption(None)
         try:

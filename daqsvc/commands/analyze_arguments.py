@@ -287,7 +287,7 @@ def count(text: str) -> int:
 
 def calibration_length(text: str) -> int:
     """Revolutions that make a baseline."""
-    from daqsvc.rotor.calibration import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy
+    from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy
 
     value = _whole(text)
     if not LEAST_REVOLUTIONS <= value <= 100_000:

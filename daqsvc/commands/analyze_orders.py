@@ -76,7 +76,7 @@ def order_analyst(arguments: argparse.Namespace) -> Analyst:
         ValueError: the healthy run cannot be used.
     """
     from daqsvc.analysis.order_analysis import OrderAnalyst, OrderSetup  # noqa: PLC0415 - brings numpy
-    from daqsvc.rotor.order_change import OrderRules  # noqa: PLC0415
+    from daqsvc.rotor.orders.change import OrderRules  # noqa: PLC0415
 
     setup = OrderSetup(
         channels=arguments.channels,

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.analysis.calibrating import CalibrationSetup
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.calibration_file import CalibrationRecord
+    from daqsvc.rotor.calibration.file import CalibrationRecord
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
 
 EXIT_OK = 0
@@ -79,7 +79,7 @@ class CalibrateCommand:
             self._prepare_kernel_cache()
         from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
-        from daqsvc.rotor.calibration import NotCalibratableError  # noqa: PLC0415
+        from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415
 
         try:
             if machine is None:
@@ -162,7 +162,7 @@ def _live(machine: MachineFile, arguments: argparse.Namespace) -> CalibrationRec
     from daqsvc.analysis.progress import progress_bar  # noqa: PLC0415
     from daqsvc.assembly import AssemblyError  # noqa: PLC0415
     from daqsvc.commands.calibrate_live import calibrate_live, default_timeout_s  # noqa: PLC0415
-    from daqsvc.rotor.calibration_file import CalibrationRecord  # noqa: PLC0415
+    from daqsvc.rotor.calibration.file import CalibrationRecord  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
     from drivers.frames import LayoutError  # noqa: PLC0415
 
@@ -200,7 +200,7 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
     """Write the file first, then say what was found."""
     from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
     from daqsvc.commands.calibrate_report import as_json, as_text  # noqa: PLC0415
-    from daqsvc.rotor.calibration_file import CalibrationFileError, save_record  # noqa: PLC0415
+    from daqsvc.rotor.calibration.file import CalibrationFileError, save_record  # noqa: PLC0415
 
     record = replace(record, written=iso_utc(SystemClock().wall_ns()))
     try:

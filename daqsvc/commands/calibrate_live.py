@@ -10,7 +10,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
-from daqsvc.rotor.calibration import NotCalibratableError
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.rotor.calibration import Calibration
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
 
 _LOOK_NS = NS_PER_S // 10

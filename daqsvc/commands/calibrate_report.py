@@ -6,15 +6,15 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.analysis.result import calibration_json, finite
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.calibration_file import CalibrationRecord
-    from daqsvc.rotor.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.file import CalibrationRecord
+    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
 _OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)
 

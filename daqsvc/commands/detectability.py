@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daqsvc.rotor.detectability import Detectability
+    from daqsvc.rotor.detectability.foretell import Detectability
     from daqsvc.settings import MachineFile
 
 _FAILED = 1
@@ -91,7 +91,7 @@ def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability
     from daqsvc.assembly import detectors  # noqa: PLC0415
     from daqsvc.diagnosis.rotor_bank import RotorBankDetector  # noqa: PLC0415
     from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
-    from daqsvc.rotor.detectability import detectability  # noqa: PLC0415
+    from daqsvc.rotor.detectability.foretell import detectability  # noqa: PLC0415
 
     (detector,) = (made for made in detectors(machine) if isinstance(made, RotorBankDetector))
     bank = machine.pipeline.rotor_bank

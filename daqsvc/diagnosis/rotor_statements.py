@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.rotor.departure import threshold_for
-from daqsvc.rotor.severity import levels
+from daqsvc.rotor.synchronous.departure import threshold_for
+from daqsvc.rotor.synchronous.severity import levels
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.probe_checks import Verdict
     from daqsvc.diagnosis.record import DataQuality, Severity
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.identify import Identification
-    from daqsvc.rotor.watch import WatchReport, WatchRules
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.watch import WatchReport, WatchRules
 
     Complexes = NDArray[np.complex128]
 

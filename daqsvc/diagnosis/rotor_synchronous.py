@@ -13,16 +13,16 @@ from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.diagnosis.rotor_statements import DEPARTURE, UNDETERMINED, Standing, Stater
 from daqsvc.diagnosis.rotor_turns import SpeedReference, Turn, Turns
 from daqsvc.diagnosis.vector_checks import VectorChecks, speed_verdict, static_position_missing
-from daqsvc.rotor.watch import RotorWatch, WatchReport, WatchRules
+from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.diagnosis.detector import Window
     from daqsvc.dsp.revolutions import EdgeCounts
-    from daqsvc.rotor.calibration import Calibration
     from daqsvc.rotor.laval import LavalRotor
-    from daqsvc.rotor.synchronous import SynchronousVectors
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
 __all__ = [
     "DEPARTURE",

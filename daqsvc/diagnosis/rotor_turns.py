@@ -10,7 +10,7 @@ import numpy as np
 
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter, Revolutions
-from daqsvc.rotor.synchronous import SynchronousVectors, synchronous_vectors
+from daqsvc.rotor.synchronous.vectors import SynchronousVectors, synchronous_vectors
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,7 +19,7 @@ from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RotorSetup
 from daqsvc.cli import main
 from daqsvc.recording.recording import Recording
-from daqsvc.rotor.calibration_file import save_calibration
+from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
 
 if TYPE_CHECKING:

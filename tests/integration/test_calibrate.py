@@ -22,9 +22,9 @@ from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
 from daqsvc.commands.calibrate_live import calibrate_live
-from daqsvc.rotor.calibration import NotCalibratableError
-from daqsvc.rotor.calibration_file import load_calibration, load_record
+from daqsvc.rotor.calibration.file import load_calibration, load_record
 from daqsvc.rotor.laval import unbalance_response
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.settings import parse_machine_file
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from daqsvc.rotor.calibration.run_up import fit_run_up
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.run_up import fit_run_up
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.rotor.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 
 SEEDS = range(20)
 OMEGA_S, ZETA = 535.2191942310874, 0.18

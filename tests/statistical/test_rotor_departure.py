@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from daqsvc.rotor.departure import DepartureTest, Spread, threshold_for
+from daqsvc.rotor.synchronous.departure import DepartureTest, Spread, threshold_for
 
 pytestmark = pytest.mark.statistical
 

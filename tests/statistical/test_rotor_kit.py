@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from daqsvc.rotor.bode import fit_bode
-from daqsvc.rotor.calibration import Calibration
-from daqsvc.rotor.identify import Identification, NamingRules, identify
+from daqsvc.rotor.calibration.bode import fit_bode
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.synchronous.baseline import Calibration
+from daqsvc.rotor.synchronous.identify import Identification, NamingRules, identify
 
 if TYPE_CHECKING:
     from pathlib import Path

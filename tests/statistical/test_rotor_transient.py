@@ -14,8 +14,8 @@ import pytest
 
 from daqsvc.dsp.revolutions import FixedSpeedCutter
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.synchronous import synchronous_vectors
-from daqsvc.rotor.watch import RotorWatch
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+from daqsvc.rotor.synchronous.watch import RotorWatch
 
 pytestmark = [pytest.mark.statistical, pytest.mark.data]
 

@@ -9,10 +9,10 @@ import pytest
 from run_ups import RATE_HZ, record
 
 from daqsvc.dsp.shaft import Revolutions
-from daqsvc.rotor.bode import fit_bode
-from daqsvc.rotor.calibration import NotCalibratableError
+from daqsvc.rotor.calibration.bode import fit_bode
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.synchronous import synchronous_vectors
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 
 SPEED_RPM = np.linspace(1000.0, 2200.0, 80)
 RUNOUT = 3.0 - 1.0j

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daqsvc.rotor.calibration import Calibration
-from daqsvc.rotor.calibration_file import (
+from daqsvc.rotor.calibration.file import (
     CalibrationFileError,
     CalibrationRecord,
     load_calibration,
@@ -23,8 +22,9 @@ from daqsvc.rotor.calibration_file import (
     save_calibration,
     save_record,
 )
+from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.run_up_fit import RunUpFit
+from daqsvc.rotor.synchronous.baseline import Calibration
 
 HERE = Path("rotor.toml")
 positive = st.floats(min_value=1e-12, max_value=1e9)

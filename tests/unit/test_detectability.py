@@ -14,10 +14,10 @@ from machine_files import LAVAL, MOTOR, changed
 
 from daqsvc.cli import load
 from daqsvc.commands.detectability import DetectabilityCommand
-from daqsvc.rotor.detectability import detectability
+from daqsvc.rotor.detectability.foretell import detectability
+from daqsvc.rotor.detectability.visible_change import FAULTS
 from daqsvc.rotor.discretise import BankMode
 from daqsvc.rotor.model import NormalisedRotor
-from daqsvc.rotor.visible_change import FAULTS
 
 AMPLITUDE = 0.1 / (2 * 0.18)
 PER_REV = 64

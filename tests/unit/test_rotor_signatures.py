@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from rotor_orbits import HEALTHY, ROTOR, SPEED_RAD_S
 
-from daqsvc.rotor.healthy import Healthy
 from daqsvc.rotor.laval import compliance, unbalance_response
-from daqsvc.rotor.signatures import damping_misfit, likelihoods
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.healthy import Healthy
+from daqsvc.rotor.synchronous.signatures import damping_misfit, likelihoods
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 ORDER = np.array(HARMONICS)
 VARIANCE = np.full(5, (0.004 * abs(HEALTHY[1])) ** 2)

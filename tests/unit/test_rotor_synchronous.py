@@ -9,7 +9,7 @@ import pytest
 from rotor_orbits import HEALTHY, orbits
 
 from daqsvc.dsp.shaft import Revolutions
-from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors, synchronous_vectors
+from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors, synchronous_vectors
 
 VECTORS = np.array(
     [[3 - 4j, 20 + 1j, 2 - 1j, 0.5j, -0.25], [3 - 4j, 25j, 1 + 1j, 0.1, 0.2j], [1 + 1j, 5.0, -5.0, 2.0, 1.0]]

@@ -12,7 +12,7 @@ from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.watch import WatchRules
+from daqsvc.rotor.synchronous.watch import WatchRules
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.sensors import keyphasor_voltage
 

@@ -10,9 +10,9 @@ from machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
 
 from daqsvc import assembly
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
-from daqsvc.rotor.calibration import Calibration
-from daqsvc.rotor.calibration_file import save_calibration
+from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.settings import describe, parse_machine_file
 
 EXAMPLE = MACHINES / "rotor-synchronous.toml"

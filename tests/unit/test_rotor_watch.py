@@ -10,11 +10,11 @@ import pytest
 from rotor_orbits import HEALTHY, PER_REV, RATE_HZ, ROTOR, SPEED_RAD_S, orbits
 
 from daqsvc.dsp.shaft import Revolutions
-from daqsvc.rotor.calibration import NotCalibratableError, calibrate
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
-from daqsvc.rotor.severity import levels
-from daqsvc.rotor.synchronous import synchronous_vectors
-from daqsvc.rotor.watch import RotorWatch, WatchRules
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError, calibrate
+from daqsvc.rotor.synchronous.severity import levels
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+from daqsvc.rotor.synchronous.watch import RotorWatch, WatchRules
 
 NOISE_UM = 2.8  # 17 dB
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from run_ups import CENTRE, ECCENTRICITY, RATE_HZ, record
 
-from daqsvc.rotor.calibration import NotCalibratableError
+from daqsvc.rotor.calibration.run_up import fit_run_up
+from daqsvc.rotor.calibration.run_up_fit import NotLavalError
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.run_up import fit_run_up
-from daqsvc.rotor.run_up_fit import NotLavalError
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 
 
 def test_finds_every_figure_of_a_clean_run_up() -> None:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.healthy import DC, SPREADS, Healthy, log_mean
 from daqsvc.rotor.laval import compliance
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.healthy import DC, SPREADS, Healthy, log_mean
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -19,10 +19,19 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.rotor.healthy import BACKWARD, DC, FORWARD, SPREADS, Healthy, density, log_density, log_mean
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.pulses import crack, rub_pulse
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.healthy import (
+    BACKWARD,
+    DC,
+    FORWARD,
+    SPREADS,
+    Healthy,
+    density,
+    log_density,
+    log_mean,
+)
+from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.departure import Spread
-from daqsvc.rotor.healthy import Healthy
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
+from daqsvc.rotor.synchronous.departure import Spread
+from daqsvc.rotor.synchronous.healthy import Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.synchronous import SynchronousVectors
+    from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

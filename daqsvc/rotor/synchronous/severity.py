@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.pulses import likeliest_touch
+from daqsvc.rotor.synchronous.pulses import likeliest_touch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.identify import Identification
-    from daqsvc.rotor.signatures import RotorFault
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.signatures import RotorFault
 
 
 def levels(identification: Identification, calibration: Calibration) -> dict[RotorFault, dict[str, float]]:

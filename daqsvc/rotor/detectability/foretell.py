@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.evidence import Axis, Observation
-from daqsvc.rotor.passage import delay_samples
-from daqsvc.rotor.rub_evidence import simulate_rubs
-from daqsvc.rotor.visible_change import FAULTS, smallest_changes
+from daqsvc.rotor.detectability.evidence import Axis, Observation
+from daqsvc.rotor.detectability.passage import delay_samples
+from daqsvc.rotor.detectability.rub_evidence import simulate_rubs
+from daqsvc.rotor.detectability.visible_change import FAULTS, smallest_changes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.detectability.rub_evidence import RubPair
+    from daqsvc.rotor.detectability.visible_change import Fault, SmallestChange
     from daqsvc.rotor.discretise import BankMode
-    from daqsvc.rotor.rub_evidence import RubPair
-    from daqsvc.rotor.visible_change import Fault, SmallestChange
 
     Floats = NDArray[np.float64]
 

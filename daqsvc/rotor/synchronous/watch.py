@@ -15,17 +15,24 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.rotor.calibration import (
+from daqsvc.rotor.synchronous.baseline import (
     Calibration,
     NotCalibratableError,
     calibrate,
     compensated,
     with_more,
 )
-from daqsvc.rotor.departure import DepartureTest, Evidence, Spread, threshold_for
-from daqsvc.rotor.identify import Energy, Identification, NamingRules, identify
-from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors
-from daqsvc.rotor.transient import BEFORE, KNOWN_WITHIN, REVOLUTIONS, Comparison, Transient, compare
+from daqsvc.rotor.synchronous.departure import DepartureTest, Evidence, Spread, threshold_for
+from daqsvc.rotor.synchronous.identify import Energy, Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.transient import (
+    BEFORE,
+    KNOWN_WITHIN,
+    REVOLUTIONS,
+    Comparison,
+    Transient,
+    compare,
+)
+from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.synchronous import HARMONICS
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtr
 
-from daqsvc.rotor.evidence import growth_after, steady_growth
+from daqsvc.rotor.detectability.evidence import growth_after, steady_growth
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.evidence import Axis, Growth
+    from daqsvc.rotor.detectability.evidence import Axis, Growth
 
     Floats = NDArray[np.float64]
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.rotor.signatures import RotorFault, likelihoods
+from daqsvc.rotor.synchronous.signatures import RotorFault, likelihoods
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.calibration import Calibration
-    from daqsvc.rotor.transient import Comparison
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.transient import Comparison
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

@@ -19,11 +19,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from daqsvc.dsp.shaft import Revolutions
-from daqsvc.rotor.calibration import LEAST_REVOLUTIONS, NotCalibratableError
-from daqsvc.rotor.chirp import Chirp
+from daqsvc.rotor.calibration.chirp import Chirp
+from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.run_up_fit import RunUpFit
-from daqsvc.rotor.synchronous import HARMONICS, SynchronousVectors, synchronous_vectors
+from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, NotCalibratableError
+from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors, synchronous_vectors
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,7 +8,7 @@ shaft's runout and the response of modes far above:
 
 That is the response at steady speeds. A run-up that passes a lightly damped critical speed rings after it; if
 the vectors are those of a sweep with a known acceleration, each mode's response is computed along the sweep
-instead (`daqsvc.rotor.chirp`), ringing and late peak included.
+instead (`daqsvc.rotor.calibration.chirp`), ringing and late peak included.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import least_squares
 
-from daqsvc.rotor.calibration import NotCalibratableError
-from daqsvc.rotor.chirp import forcing_of, whirl_by_unbalance
+from daqsvc.rotor.calibration.chirp import forcing_of, whirl_by_unbalance
 from daqsvc.rotor.laval import unbalance_response
+from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.rotor.calibration import Calibration
-from daqsvc.rotor.calibration_reading import CalibrationFileError, Table
+from daqsvc.rotor.calibration.reading import CalibrationFileError, Table
+from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
-from daqsvc.rotor.run_up_fit import RunUpFit
+from daqsvc.rotor.synchronous.baseline import Calibration
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

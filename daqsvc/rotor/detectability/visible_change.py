@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from scipy.optimize import brentq
 
-from daqsvc.rotor.evidence import orbit_noise
-from daqsvc.rotor.passage import delay_samples
+from daqsvc.rotor.detectability.evidence import orbit_noise
+from daqsvc.rotor.detectability.passage import delay_samples
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from daqsvc.rotor.detectability.evidence import Axis
     from daqsvc.rotor.discretise import BankMode
-    from daqsvc.rotor.evidence import Axis
     from daqsvc.rotor.model import NormalisedRotor
 
 Fault = Literal["unbalance", "damping_loss", "stiffness_loss", "static_load"]

@@ -21,7 +21,7 @@ from daqsvc.rotor.laval import unbalance_response
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.healthy import Healthy
+    from daqsvc.rotor.synchronous.healthy import Healthy
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

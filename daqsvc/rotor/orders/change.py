@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from daqsvc.dsp.order_speed import ORDERS
-from daqsvc.rotor.order_causes import cause_evidence, surprise
+from daqsvc.rotor.orders.causes import cause_evidence, surprise
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.orders import OrderVectors
-    from daqsvc.rotor.order_causes import Cause
+    from daqsvc.rotor.orders.causes import Cause
 
     Floats: TypeAlias = NDArray[np.float64]
     Complexes: TypeAlias = NDArray[np.complex128]

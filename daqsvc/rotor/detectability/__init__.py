@@ -1,0 +1,1 @@
+"""What a bank can tell apart, before any fault happens."""
