@@ -67,5 +67,7 @@ def test_a_verb_that_cannot_be_loaded_is_left_out(
 ) -> None:
     broken = importlib.metadata.EntryPoint("orbit", "no_such_module:Verb", cli.COMMANDS)
     monkeypatch.setattr(cli, "entry_points", lambda group: [broken])
-    assert sorted(cli.commands()) == ["check", "run"]
+    known = cli.commands()
+    assert "orbit" not in known
+    assert {"analyze", "calibrate", "check", "detectability", "run"} <= set(known)
     assert "verb 'orbit' is left out: No module named 'no_such_module'" in capsys.readouterr().err
