@@ -152,7 +152,8 @@ class AlarmManager:
     def _events(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         yield from self._quality(diagnosis, at)
         for ruled in self._ruled:
-            if ruled.detector == diagnosis.detector and diagnosis.sensors:
+            # A statement without data changes nothing, not even what an alarm is known to rest on.
+            if ruled.detector == diagnosis.detector and diagnosis.sensors and diagnosis.quality != "missing":
                 ruled.sensors = frozenset(diagnosis.sensors)
         yield from self._suppression(diagnosis, at)
         for ruled in self._ruled:
@@ -178,7 +179,7 @@ class AlarmManager:
         if doubts:
             alarm = alarm or self._add(name, latching=False)
             worst = min(doubts.values(), key=lambda doubt: doubt.quality != "not_ok")
-            what = "samples are missing" if worst.quality == "missing" else "not OK"
+            what = "cannot be judged" if worst.quality == "missing" else "not OK"
             because = f": {worst.reason}" if worst.reason else ""
             finding = Finding(Level.ALERT, worst.quality, f"{subject} {what}{because}")
         elif alarm is not None:
