@@ -241,7 +241,7 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
             false_alarms_per_1000_rev=bank.false_alarms_per_1000_rev,
             mtbf_hours=bank.mtbf_hours,
             speed_rpm=machine.machine.speed_rpm,
-            samples_per_rev=60.0 * rate_hz / machine.machine.speed_rpm,
+            samples_per_rev=60.0 * rate_hz / abs(machine.machine.speed_rpm),
             modes=len(bank.modes),
         ),
         calibrate_revolutions=bank.calibrate_revolutions,

@@ -44,7 +44,10 @@ class DetectabilityCommand:
         """See `Command.add_arguments`."""
         parser.add_argument("file", type=Path, metavar="MACHINE", help="the machine file (TOML)")
         parser.add_argument(
-            "--speed-rpm", type=_positive, metavar="N", help="another speed than the machine file's"
+            "--speed-rpm",
+            type=_positive,
+            metavar="N",
+            help="another speed than the machine file's, in the same direction",
         )
         parser.add_argument(
             "--false-alarms-per-1000-rev",
@@ -112,7 +115,8 @@ def _varied(
 ) -> MachineFile:
     """The machine file at another speed or rate of false alarms."""
     if speed_rpm is not None:
-        at_speed = machine.machine.model_copy(update={"speed_rpm": speed_rpm})
+        signed_rpm = math.copysign(speed_rpm, machine.machine.speed_rpm)
+        at_speed = machine.machine.model_copy(update={"speed_rpm": signed_rpm})
         machine = machine.model_copy(update={"machine": at_speed})
     if false_alarms_per_1000_rev is not None and machine.pipeline.rotor_bank is not None:
         update = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev}

@@ -58,7 +58,8 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
     about = f" - {machine.machine.description}" if machine.machine.description else ""
     yield "Machine", f"{machine.machine.name}{about}"
     speed_rpm = machine.machine.speed_rpm
-    yield "Speed", f"{speed_rpm:g} rpm ({speed_rpm / 60:.4g} Hz)"
+    way = ", clockwise" if speed_rpm < 0.0 else ""
+    yield "Speed", f"{abs(speed_rpm):g} rpm ({abs(speed_rpm) / 60:.4g} Hz){way}"
     yield "Box", f"{machine.box} at site {machine.site}"
     rotor = machine.machine.rotor
     if rotor is not None:
@@ -174,10 +175,11 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
 
 def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
     *others, last = synchronous.sensors
+    speed_rpm = abs(machine.machine.speed_rpm)
     angle = {
         "keyphasor": "angle from the keyphasor",
-        "fixed": f"angle from {machine.machine.speed_rpm:g} rpm, taken as exact",
-        "orbit": f"angle from the orbit's 1X around {machine.machine.speed_rpm:g} rpm",
+        "fixed": f"angle from {speed_rpm:g} rpm, taken as exact",
+        "orbit": f"angle from the orbit's 1X around {speed_rpm:g} rpm",
     }
     healthy = (
         f"the first {synchronous.calibrate_revolutions} revolutions are the healthy state, kept over restarts"

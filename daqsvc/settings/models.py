@@ -100,12 +100,31 @@ class Rotor(Section):
     )
 
 
+def _turning(speed_rpm: float) -> float:
+    if speed_rpm == 0.0:
+        raise PydanticCustomError(
+            "standstill",
+            "is a shaft that stands still",
+            {"remedy": "write the nominal speed, negative if the shaft turns clockwise"},
+        )
+    return speed_rpm
+
+
 class Machine(Section):
     """The machine that is watched."""
 
     name: Annotated[Name, Field(description="name of the machine", examples=["laval-rig"])]
     description: str = Field(default="", description="what a person should know about it")
-    speed_rpm: Annotated[Positive, Field(le=1_000_000, description="nominal speed", examples=[600.0])]
+    speed_rpm: Annotated[
+        float,
+        AfterValidator(_turning),
+        Field(
+            ge=-1_000_000,
+            le=1_000_000,
+            description="nominal speed, negative if the shaft turns clockwise",
+            examples=[600.0],
+        ),
+    ]
     rotor: Rotor | None = Field(default=None, description="needed by the rotor's detectors")
 
 

@@ -179,7 +179,7 @@ def _samples_per_rev(draft: MachineFile, synchronous: RotorSynchronous) -> Itera
     probe = _named(draft).get(synchronous.probes[0])
     if probe is None or probe.stream not in draft.streams:
         return
-    rate_hz, speed_rpm = draft.streams[probe.stream].rate_hz, draft.machine.speed_rpm
+    rate_hz, speed_rpm = draft.streams[probe.stream].rate_hz, abs(draft.machine.speed_rpm)
     samples = 60.0 * rate_hz / speed_rpm
     if samples < _LEAST_SAMPLES_PER_REV:
         yield Finding(

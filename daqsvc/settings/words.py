@@ -49,6 +49,10 @@ def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) ->
     return close[0] if close else None
 
 
+def _shown(limit: float) -> str:
+    return f"{limit:g}" if abs(limit) < 1_000_000 else f"{limit:,.0f}"
+
+
 class Words:
     """Turns one error of pydantic into a message and a remedy.
 
@@ -160,14 +164,14 @@ class Words:
         return f"must be greater than {context['gt']:g}", self._write_example(path)
 
     def _greater_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
-        return f"must be {context['ge']:g} or more", self._write_example(path)
+        return f"must be {_shown(context['ge'])} or more", self._write_example(path)
 
     def _less_than(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         return f"must be less than {context['lt']:g}", self._write_example(path)
 
     def _less_than_equal(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
         limit = context["le"]
-        shown = hex(limit) if path[-1] == "id" else f"{limit:g}" if limit < 1_000_000 else f"{limit:,.0f}"
+        shown = hex(limit) if path[-1] == "id" else _shown(limit)
         return f"must be {shown} or less", self._write_example(path)
 
     def _string_pattern_mismatch(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
