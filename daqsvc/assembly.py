@@ -195,7 +195,10 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
     from daqsvc.rotor.model import RotorParameters  # noqa: PLC0415
 
     rotor = machine.machine.rotor
-    assert rotor is not None  # noqa: S101 - settings/rotor_checks.py: a rotor bank needs [machine.rotor]
+    # settings/rotor_checks.py: a rotor bank needs [machine.rotor], and these two in it.
+    assert rotor is not None  # noqa: S101
+    assert rotor.eccentricity_um is not None  # noqa: S101
+    assert rotor.contact_stiffness is not None  # noqa: S101
     stream = machine.sensor(bank.keyphasor).stream
     rate_hz = machine.streams[stream].rate_hz
     return RotorBankDetector(

@@ -63,13 +63,16 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
     yield "Box", f"{machine.box} at site {machine.site}"
     rotor = machine.machine.rotor
     if rotor is not None:
-        text = (
-            f"natural frequency {rotor.natural_frequency_hz:g} Hz, damping ratio {rotor.damping_ratio:g}, "
-            f"eccentricity {rotor.eccentricity_um:g} um at {rotor.heavy_spot_deg:g} deg, "
-            f"clearance {rotor.clearance_um:g} um, sag {rotor.static_sag_um:g} um, "
-            f"contact stiffness K* {rotor.contact_stiffness:g}"
-        )
-        yield "Rotor", text
+        parts = [
+            f"natural frequency {rotor.natural_frequency_hz:g} Hz",
+            f"damping ratio {rotor.damping_ratio:g}",
+        ]
+        if rotor.eccentricity_um is not None:
+            parts.append(f"eccentricity {rotor.eccentricity_um:g} um at {rotor.heavy_spot_deg:g} deg")
+        parts += [f"clearance {rotor.clearance_um:g} um", f"sag {rotor.static_sag_um:g} um"]
+        if rotor.contact_stiffness is not None:
+            parts.append(f"contact stiffness K* {rotor.contact_stiffness:g}")
+        yield "Rotor", ", ".join(parts)
 
 
 def _bus(machine: MachineFile, name: str) -> str:

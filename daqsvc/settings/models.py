@@ -81,7 +81,9 @@ class Rotor(Section):
         Positive, Field(description="undamped natural frequency, omega_s / 2 pi", examples=[10.0])
     ]
     damping_ratio: Annotated[DampingRatio, Field(description="zeta of the healthy rotor", examples=[0.18])]
-    eccentricity_um: Annotated[Positive, Field(description="mass eccentricity epsilon", examples=[10.0])]
+    eccentricity_um: Positive | None = Field(
+        default=None, description="mass eccentricity epsilon; for the model bank", examples=[10.0]
+    )
     heavy_spot_deg: AngleDeg = Field(default=0.0, description="angle of the heavy spot against the keyphasor")
     clearance_um: Annotated[
         Positive, Field(description="radial clearance c, the characteristic length", examples=[100.0])
@@ -89,9 +91,11 @@ class Rotor(Section):
     static_sag_um: Annotated[
         float, Field(ge=0, description="sag of the shaft under gravity, towards -y", examples=[10.0])
     ]
-    contact_stiffness: Annotated[
-        Positive, Field(description="K* = K_beta / (M c omega_s^2), dimensionless", examples=[30.0])
-    ]
+    contact_stiffness: Positive | None = Field(
+        default=None,
+        description="K* = K_beta / (M c omega_s^2), dimensionless; for the model bank",
+        examples=[30.0],
+    )
     contact_radius_um: Positive = Field(
         default=25_000.0, description="radius of the surface that rubs; sets how fast it slides"
     )

@@ -36,6 +36,7 @@ def rotor_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
     with suppress(UnusableValueError):
         if (bank := draft.pipeline.rotor_bank) is not None:
             yield _rotor(draft, _BANK, "the model bank")
+            yield _modelled(draft)
             yield _sensors(draft, _BANK, bank.probes, bank.keyphasor)
             yield _geometry(draft, _BANK, bank.probes, _LEAST_PROBE_ANGLE_DEG[ROTOR_BANK])
             yield from mode_checks(draft, bank)
@@ -85,6 +86,24 @@ def _rotor(draft: MachineFile, at: KeyPath, who: str) -> Iterator[Finding]:
             f"{who} needs the rotor's data",
             f"write a table [machine.rotor], or remove [{'.'.join(map(str, at))}]",
         )
+
+
+def _modelled(draft: MachineFile) -> Iterator[Finding]:
+    """What only the models of the bank need to know of the rotor."""
+    rotor = draft.machine.rotor
+    if rotor is None:
+        return  # said already
+    for key, about, example in (
+        ("eccentricity_um", "mass eccentricity", "10.0"),
+        ("contact_stiffness", "stiffness of the stator", "30.0"),
+    ):
+        with suppress(UnusableValueError):
+            if getattr(rotor, key) is None:
+                yield Finding(
+                    ("machine", "rotor", key),
+                    f"is missing: {about}; the model bank needs it",
+                    f"add e.g. {key} = {example} to [machine.rotor], or remove [pipeline.rotor_bank]",
+                )
 
 
 def _named(draft: MachineFile) -> dict[str, Sensor]:

@@ -198,3 +198,26 @@ def test_modes_and_rates_are_described():
         "from the first 20 revolutions",
     ):
         assert words in text
+
+
+ONLY_MODELLED = [
+    ("eccentricity_um = 10.0", "eccentricity_um"),
+    ("contact_stiffness = 30.0", "contact_stiffness"),
+]
+
+
+@pytest.mark.parametrize(("line", "key"), ONLY_MODELLED)
+def test_the_bank_needs_what_it_models(line, key):
+    text, _ = changed(LAVAL, (line, "#"))
+    (problem,) = problems_of(text)
+    assert problem.key == f"machine.rotor.{key}"
+    assert text.split("\n")[problem.line - 1].startswith("[machine.rotor]")
+    assert "the model bank needs it" in problem.message
+    assert f"add e.g. {line}" in problem.remedy
+
+
+def test_a_rotor_without_a_bank_need_not_be_modelled():
+    text = (MACHINES / "rotor-synchronous.toml").read_text(encoding="utf-8")
+    assert not any(f"{key} =" in text for _, key in ONLY_MODELLED)
+    described = describe(parse_machine_file(text, MACHINES / "rotor-synchronous.toml"))
+    assert "damping ratio 0.1, clearance 100 um, sag 10 um\n" in described
