@@ -1,0 +1,131 @@
+"""Kinematics of a rolling bearing: how often its parts meet, per revolution of the shaft.
+
+Pure rolling, inner ring turning, outer ring standing still. Real bearings slip by 1 to 2 %: the cage falls
+behind, and with it the rate at which balls pass the outer race, while they pass the inner race more often.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+SUM_TOLERANCE = 0.05
+"""Relative departure of stated orders from the kinematic laws at which they are refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class BearingOrders:
+    """Fault orders of a bearing: events per revolution of the shaft.
+
+    Attributes:
+        inner: BPFI, balls passing a point of the inner race.
+        outer: BPFO, balls passing a point of the outer race.
+        ball: BSF, revolutions of a ball about itself. A spot on a ball strikes twice in each, once
+            on either race: `ball_pass`.
+        cage: FTF, revolutions of the cage.
+
+    Raises:
+        ValueError: the four contradict each other, or cannot be those of a bearing with its outer ring at rest.
+    """
+
+    inner: float
+    outer: float
+    ball: float
+    cage: float
+
+    def __post_init__(self) -> None:
+        for name in ("inner", "outer", "ball", "cage"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(
+                    f"bearing order {name} is {value}; it must be a positive number per revolution"
+                )
+        if not self.cage < 0.5:
+            raise ValueError(
+                f"cage order (FTF) is {self.cage:g}; with the outer ring at rest it lies below 0.5: "
+                "give all orders per revolution of the shaft, not in Hz"
+            )
+        if not self.outer < self.inner:
+            raise ValueError(
+                f"outer order (BPFO) {self.outer:g} is not below the inner order (BPFI) {self.inner:g}; "
+                "they are exchanged, or the outer ring turns"
+            )
+        expected = self.outer / self.cage * (1.0 - self.cage)
+        if abs(self.inner / expected - 1.0) > SUM_TOLERANCE:
+            raise ValueError(
+                f"BPFI {self.inner:g} does not fit BPFO {self.outer:g} and FTF {self.cage:g}, which make it "
+                f"{expected:.4g}; check the four orders"
+            )
+
+    @property
+    def ball_pass(self) -> float:
+        """2 BSF: strikes of a spot on a ball per revolution of the shaft."""
+        return 2.0 * self.ball
+
+    def slipped(self, slip: float) -> BearingOrders:
+        """The orders when the cage falls behind pure rolling.
+
+        Args:
+            slip: share of the cage's speed that is lost, e.g. 0.01.
+
+        Raises:
+            ValueError: ``slip`` is not in [0, 1).
+        """
+        if not 0.0 <= slip < 1.0:
+            raise ValueError(f"cage slip is {slip}; it must be a share from 0 to below 1")
+        kept = 1.0 - slip
+        return BearingOrders(
+            inner=self.inner + self.outer * slip,
+            outer=self.outer * kept,
+            ball=self.ball * kept,
+            cage=self.cage * kept,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class BearingGeometry:
+    """The dimensions that decide a bearing's fault orders.
+
+    Attributes:
+        balls: number of rolling elements (of one row).
+        ball_diameter: in any unit, the same as ``pitch_diameter``.
+        pitch_diameter: diameter of the circle through the centres of the balls.
+        contact_angle_deg: 0 for a deep-groove bearing under radial load.
+
+    Raises:
+        ValueError: no bearing can have these dimensions.
+    """
+
+    balls: int
+    ball_diameter: float
+    pitch_diameter: float
+    contact_angle_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.balls < 3:
+            raise ValueError(f"a bearing with {self.balls} rolling elements does not run; give 3 or more")
+        if not 0.0 < self.ball_diameter < self.pitch_diameter:
+            raise ValueError(
+                f"ball diameter {self.ball_diameter:g} must be positive and below the pitch diameter "
+                f"{self.pitch_diameter:g}"
+            )
+        if not 0.0 <= self.contact_angle_deg < 90.0:
+            raise ValueError(
+                f"contact angle is {self.contact_angle_deg:g} deg; it must be from 0 to below 90"
+            )
+        room = self.pitch_diameter * math.sin(math.pi / self.balls)
+        if self.ball_diameter >= room:
+            raise ValueError(
+                f"{self.balls} balls of diameter {self.ball_diameter:g} do not fit on a pitch circle of "
+                f"{self.pitch_diameter:g}; the largest that do have {room:.4g}"
+            )
+
+    def orders(self) -> BearingOrders:
+        """The fault orders in pure rolling (Randall and Antoni 2011, eq. 1 to 4)."""
+        gamma = self.ball_diameter / self.pitch_diameter * math.cos(math.radians(self.contact_angle_deg))
+        return BearingOrders(
+            inner=0.5 * self.balls * (1.0 + gamma),
+            outer=0.5 * self.balls * (1.0 - gamma),
+            ball=0.5 * self.pitch_diameter / self.ball_diameter * (1.0 - gamma**2),
+            cage=0.5 * (1.0 - gamma),
+        )

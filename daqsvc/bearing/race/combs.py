@@ -1,0 +1,108 @@
+"""Combs of kinematic lines: the evidence of all lines of a part together, searched over slip."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.bearing.race.lines import LineEvidence
+    from daqsvc.bearing.race.verdict import Part
+
+    Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Tooth:
+    """A line of a comb at ``harmonic * fundamental + sideband * modulation``, with its weight."""
+
+    harmonic: int
+    sideband: int
+    weight: float
+
+
+INNER_TEETH = (
+    *(Tooth(h, 0, 1.0) for h in (1, 2, 3, 4)),
+    *(Tooth(h, s, 0.5) for h in (1, 2) for s in (-1, 1)),
+)
+OUTER_TEETH = (*(Tooth(h, 0, 1.0) for h in (1, 2, 3, 4)), Tooth(5, 0, 0.5))
+BALL_TEETH = (
+    *(Tooth(h, 0, 1.0) for h in (1, 2, 3)),
+    *(Tooth(h, s, 0.5) for h in (1, 2) for s in (-1, 1)),
+)
+TEETH: Mapping[Part, tuple[Tooth, ...]] = {"inner": INNER_TEETH, "outer": OUTER_TEETH, "ball": BALL_TEETH}
+CAGE_WEIGHT = 0.5
+HIGHEST_ORDER_SHARE = 1.02
+
+
+@dataclass(frozen=True, slots=True)
+class Comb:
+    """The best comb of a part.
+
+    Attributes:
+        score: weighted sum of the log evidences of its lines.
+        order: its fundamental order.
+    """
+
+    score: float
+    order: float
+
+
+def fundamental(orders: BearingOrders, part: Part) -> float:
+    """The order that a part's comb is made of."""
+    return orders.ball_pass if part == "ball" else float(getattr(orders, part))
+
+
+def highest_order(orders: BearingOrders) -> float:
+    """The highest order that any comb looks at."""
+    tops = [
+        max(t.harmonic * fundamental(orders, part) + t.sideband for t in teeth)
+        for part, teeth in TEETH.items()
+    ]
+    return HIGHEST_ORDER_SHARE * max(tops)
+
+
+def best_comb(evidence: LineEvidence, orders: BearingOrders, part: Part, slip: float) -> Comb:
+    """Search a part's comb over slip.
+
+    Args:
+        evidence: of the lines, up to `highest_order`.
+        orders: the stated orders.
+        part: whose comb.
+        slip: how far to search, as a share of the fundamental order.
+    """
+    base = fundamental(orders, part)
+    teeth = TEETH[part]
+    trials = _trials(base, slip, max(t.harmonic for t in teeth), evidence.bins_per_order)
+    modulation = orders.cage if part == "ball" else 1.0
+    score = np.zeros(len(trials))
+    for tooth in teeth:
+        score += tooth.weight * _at(evidence, tooth.harmonic * trials + tooth.sideband * modulation)
+    best = int(np.argmax(score))
+    total = float(score[best])
+    if part == "ball":
+        cages = _trials(orders.cage, slip, 4, evidence.bins_per_order)
+        cage = _at(evidence, 1.0 - cages) + _at(evidence, 1.0 + cages)
+        for harmonic in (1, 2, 3, 4):
+            cage += _at(evidence, harmonic * cages)
+        total += CAGE_WEIGHT * float(cage.max())
+    return Comb(total, float(trials[best]))
+
+
+def _trials(order: float, slip: float, harmonics: int, bins_per_order: float) -> Real:
+    """Orders to try: half a bin apart at the highest harmonic."""
+    step = 0.5 / harmonics / bins_per_order
+    count = int(np.ceil(slip * order / step))
+    return np.asarray(order + step * np.arange(-count, count + 1), dtype=np.float64)
+
+
+def _at(evidence: LineEvidence, orders: Real) -> Real:
+    bins = np.rint(orders * evidence.bins_per_order).astype(np.int64)
+    return evidence.log_ratio[np.minimum(bins, len(evidence.log_ratio) - 1)]

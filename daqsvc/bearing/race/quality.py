@@ -1,0 +1,101 @@
+"""Samples that no verdict must rest on: recognised before the test, named with a remedy."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.bearing.race.verdict import RaceInputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.race.rules import RaceRules
+
+    Real = NDArray[np.float64]
+
+MISSING_SHARE = 0.01
+CLIPPED_SHARE = 2e-3
+CLIPPED_RUN = 3
+"""Least run of samples at the same extreme value that only a limit makes."""
+DEAD_SHARE = 0.5
+LEAST_REVOLUTIONS = 25.0
+LEAST_BAND = 3.0
+"""Top of the analysed band over its bottom, at least."""
+
+
+def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -> Real:
+    """The samples as float64, fit for the test.
+
+    Single missing samples are replaced by their neighbours' line.
+
+    Args:
+        samples: ``[n]``, any unit proportional to acceleration.
+        rate_hz: their sample rate.
+        speed_rpm: stated speed of the shaft.
+        rules: the rules of the test.
+
+    Raises:
+        RaceInputError: no verdict can rest on these samples.
+    """
+    x = np.asarray(samples, dtype=np.float64)
+    if x.ndim != 1:
+        raise RaceInputError("samples", f"have shape {list(x.shape)}", "give one channel, [n]")
+    if not (np.isfinite(rate_hz) and rate_hz > 0.0):
+        raise RaceInputError("sample rate", f"is {rate_hz} Hz", "give the rate of the recording")
+    if not (np.isfinite(speed_rpm) and speed_rpm > 0.0):
+        raise RaceInputError(
+            "shaft speed", f"is {speed_rpm} rpm", "give the speed: kinematic lines lie at multiples of it"
+        )
+    top_hz = min(0.48 * rate_hz, rules.high_hz)
+    if top_hz < LEAST_BAND * rules.low_hz:
+        raise RaceInputError(
+            "sample rate",
+            f"is {rate_hz:g} Hz, which leaves the band {rules.low_hz:g} to {top_hz:g} Hz",
+            f"sample with {LEAST_BAND * rules.low_hz / 0.48:.0f} Hz or more",
+        )
+    revolutions = len(x) / rate_hz * speed_rpm / 60.0
+    if revolutions < LEAST_REVOLUTIONS:
+        raise RaceInputError(
+            "record",
+            f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
+            f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
+        )
+    return _clean(x)
+
+
+def _clean(x: Real) -> Real:
+    good = np.isfinite(x)
+    missing = 1.0 - float(good.mean())
+    if missing > MISSING_SHARE:
+        raise RaceInputError(
+            "channel", f"lacks {missing:.1%} of its samples (NaN or infinite)", "check sensor and cable"
+        )
+    if missing:
+        place = np.arange(len(x))
+        x = np.interp(place, place[good], x[good])
+    steady = float(np.mean(np.diff(x) == 0.0))
+    if steady > DEAD_SHARE:
+        raise RaceInputError(
+            "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
+        )
+    clipped = _clipped_share(x)
+    if clipped > CLIPPED_SHARE:
+        raise RaceInputError(
+            "channel",
+            f"is clipped: {clipped:.1%} of its samples stand at {x.min():.4g} or {x.max():.4g}",
+            "use a sensor or a gain with a larger range",
+        )
+    return x
+
+
+def _clipped_share(x: Real) -> float:
+    """Share of samples in runs at an extreme value."""
+    clipped = 0
+    for extreme in (x.min(), x.max()):
+        at = np.concatenate(([0], (x == extreme).astype(np.int8), [0]))
+        edges = np.flatnonzero(np.diff(at))
+        runs = edges[1::2] - edges[::2]
+        clipped += int(runs[runs >= CLIPPED_RUN].sum())
+    return clipped / len(x)

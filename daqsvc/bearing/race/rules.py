@@ -1,0 +1,58 @@
+"""The numbers of the race test: one set for all machines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class RaceRules:
+    """Settings of the race test; the defaults are what the documentation's table was measured with.
+
+    Attributes:
+        low_hz: where the analysed band begins: above the shaft's harmonics, below most resonances.
+        high_hz: where it ends, if the sample rate allows.
+        whitening_hz: width of the local median amplitude of the whitening.
+        speed_tolerance: how far the shaft may be from the stated speed, as a share.
+        slip: how far the fault orders may be from the stated ones, as a share.
+        z_limit: significance from which a part may be named.
+        z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
+        severity_limit: of a race; ``z`` times ``depth``.
+        ball_severity_limit: of a ball.
+        depth_limit: least size of a race's lines.
+        ball_depth_limit: least size of a ball's lines.
+        ball_weight: what a ball's severity counts against a race's.
+        group_factor: parts whose weights are within this factor cannot be told apart.
+        unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
+        ball_testable_bins: the same for a ball, below which it is not tested at all.
+        changed_db: change of the whole level that makes a record "changed" against a baseline.
+        changed_band_db: the same of one octave band.
+        changed_depth: least size of a race's lines where the level has changed.
+        changed_ball_depth: the same for a ball.
+        changed_growth: growth of size over the baseline that is needed there.
+        z_growth: growth of significance over the baseline that is needed there.
+        line_growth: growth of size that a line needs which was significant in the baseline already.
+    """
+
+    low_hz: float = 400.0
+    high_hz: float = 20_000.0
+    whitening_hz: float = 30.0
+    speed_tolerance: float = 0.012
+    slip: float = 0.015
+    z_limit: float = 5.0
+    z_unresolved: float = 1.5
+    severity_limit: float = 3.0
+    ball_severity_limit: float = 2.2
+    depth_limit: float = 0.12
+    ball_depth_limit: float = 0.20
+    ball_weight: float = 0.6
+    group_factor: float = 1.15
+    unresolved_bins: float = 4.0
+    ball_testable_bins: float = 2.5
+    changed_db: float = 2.0
+    changed_band_db: float = 3.0
+    changed_depth: float = 0.08
+    changed_ball_depth: float = 0.15
+    changed_growth: float = 1.8
+    z_growth: float = 4.0
+    line_growth: float = 1.3
