@@ -1,4 +1,4 @@
-"""Compiled recursions of the bank's observers and of the paper's rule; `cusum` holds those of the other.
+"""Compiled recursions of the bank's observers, one by one; `sweep` runs a whole bank with both rules.
 
 An observer's state is the deviation ``(x, x', y, y')`` of its estimate from its reference orbit. The
 linear part of the motion is then homogeneous, and the sum of orbit and deviation is the estimate.
@@ -32,7 +32,7 @@ UNDETERMINED = -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _orbit(observer: Observer, cos: float, sin: float) -> State:
+def orbit(observer: Observer, cos: float, sin: float) -> State:
     """Position and velocity on an observer's reference orbit at a shaft angle."""
     u = observer.a * cos - observer.b * sin
     v = observer.a * sin + observer.b * cos
@@ -50,7 +50,7 @@ def _flow(xx: float, xv: float, vx: float, vv: float, state: State) -> State:
 def _kick(observer: Observer, cos: float, sin: float, state: State) -> State:
     """Momentum from the contact in one sub-step: Hertzian repulsion and Coulomb friction."""
     dx, du, dy, dv = state
-    ox, ou, oy, ov = _orbit(observer, cos, sin)
+    ox, ou, oy, ov = orbit(observer, cos, sin)
     x = ox + dx
     y = oy + dy
     squared = x * x + y * y
@@ -64,7 +64,7 @@ def _kick(observer: Observer, cos: float, sin: float, state: State) -> State:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _predict_rub(observer: Observer, cos: float, sin: float, state: State) -> State:
+def predict_rub(observer: Observer, cos: float, sin: float, state: State) -> State:
     """One sample ahead with contact, by Strang splitting, from the shaft angle of the present sample."""
     c, s = observer.half_cos, observer.half_sin
     xx, xv, vx, vv = observer.half_xx, observer.half_xv, observer.half_vx, observer.half_vv
@@ -79,40 +79,46 @@ def _predict_rub(observer: Observer, cos: float, sin: float, state: State) -> St
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _predict(observer: Observer, cos: float, sin: float, state: State) -> State:
+def predict(observer: Observer, cos: float, sin: float, state: State) -> State:
     """One sample ahead."""
     if observer.substeps > 0:
-        return _predict_rub(observer, cos, sin, state)
+        return predict_rub(observer, cos, sin, state)
     return _flow(observer.xx, observer.xv, observer.vx, observer.vv, state)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _transfer(source: Observer, target: Observer, cos: float, sin: float, state: State) -> State:
+def transfer(source: Observer, target: Observer, cos: float, sin: float, state: State) -> State:
     """The deviation from the target's orbit that is the same estimate as ``state`` on the source's."""
     dx, du, dy, dv = state
-    sx, su, sy, sv = _orbit(source, cos, sin)
-    tx, tu, ty, tv = _orbit(target, cos, sin)
+    sx, su, sy, sv = orbit(source, cos, sin)
+    tx, tu, ty, tv = orbit(target, cos, sin)
     return dx + sx - tx, du + su - tu, dy + sy - ty, dv + sv - tv
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _guarded(observer: Observer, healthy: Observer, cos: float, sin: float, state: State) -> State:
+def guarded(observer: Observer, healthy: Observer, cos: float, sin: float, state: State) -> State:
     """The state of a rub observer, or a new start on the healthy orbit if it is lost (escaped or NaN)."""
-    ox, _, oy, _ = _orbit(observer, cos, sin)
+    ox, _, oy, _ = orbit(observer, cos, sin)
     x, y = ox + state[0], oy + state[2]
     if x * x + y * y < _ESCAPE_SQUARED and math.isfinite(state[1] + state[3]):
         return state
-    return _transfer(healthy, observer, cos, sin, (0.0, 0.0, 0.0, 0.0))
+    return transfer(healthy, observer, cos, sin, (0.0, 0.0, 0.0, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _correct(
-    observer: Observer, cos: float, sin: float, x: float, y: float, state: State
-) -> tuple[State, float]:
-    """Kalman update by one sample; also the log-likelihood of the innovation in nats."""
+def deviation(observer: Observer, cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
+    """A measured position, counted from an observer's reference orbit."""
+    return (
+        x - (observer.a * cos - observer.b * sin + observer.rest_x),
+        y - (observer.a * sin + observer.b * cos + observer.rest_y),
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def correct(observer: Observer, z_x: float, z_y: float, state: State) -> tuple[State, float]:
+    """Kalman update by one sample (its `deviation`); also the log-likelihood of the innovation in nats."""
     dx, du, dy, dv = state
-    ex = x - (observer.a * cos - observer.b * sin + observer.rest_x) - dx
-    ey = y - (observer.a * sin + observer.b * cos + observer.rest_y) - dy
+    ex, ey = z_x - dx, z_y - dy
     score = -0.5 * (ex * ex + ey * ey) * observer.precision - observer.log_norm
     a, b = observer.gain_x, observer.gain_v
     return (dx + a * ex, du + b * ex, dy + a * ey, dv + b * ey), score
@@ -131,7 +137,7 @@ def change_orbits(before: Observers, after: Observers, cos: float, sin: float, s
     """
     for i in range(len(states)):
         state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
-        state = _transfer(before[i], after[i], cos, sin, state)
+        state = transfer(before[i], after[i], cos, sin, state)
         states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
 
 
@@ -178,11 +184,12 @@ def _run_rub(
 ) -> State:
     """A rub observer over a block; its state after it."""
     for k in range(len(xy)):
-        state = _guarded(observer, healthy, cos[k], sin[k], state)
+        state = guarded(observer, healthy, cos[k], sin[k], state)
         scores[k] = 0.0
         if usable[k]:
-            state, scores[k] = _correct(observer, cos[k], sin[k], xy[k, 0], xy[k, 1], state)
-        state = _predict_rub(observer, cos[k], sin[k], state)
+            z_x, z_y = deviation(observer, cos[k], sin[k], xy[k, 0], xy[k, 1])
+            state, scores[k] = correct(observer, z_x, z_y, state)
+        state = predict_rub(observer, cos[k], sin[k], state)
     return state
 
 
@@ -208,71 +215,3 @@ def run_free(
         else:
             state = _run_linear(xy, usable, cos, sin, observers[i], state, scores[i])
         states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def decide_by_probability(  # noqa: C901 - one recursion: update, declare, hand over, predict
-    xy: Floats,
-    usable: Flags,
-    cos: Floats,
-    sin: Floats,
-    observers: Observers,
-    settling: int,
-    log_prior: Floats,
-    log_threshold: float,
-    states: Floats,
-    log_probability: Floats,
-    verdicts: Ints,
-) -> None:
-    """The paper's rule: conditional probabilities, declared at a threshold, then reset (section V).
-
-    At a declaration every observer takes over the declared one's estimate, and the probabilities go
-    back to their priors. Without the hand-over the observers that lost never learn that the machine
-    has changed.
-
-    Args:
-        xy: float64 ``[n, 2]``, measured position in clearances.
-        usable: bool ``[n]``.
-        cos: float64 ``[n]``, cosine of the shaft angle.
-        sin: float64 ``[n]``, its sine.
-        observers: ``[M]`` of `discretise.OBSERVER`.
-        settling: number of samples at the beginning that correct the observers but are no evidence.
-        log_prior: float64 ``[M]``.
-        log_threshold: logarithm of the probability that declares.
-        states: float64 ``[M, 4]``, deviations, changed in place.
-        log_probability: float64 ``[M]``, changed in place.
-        verdicts: int64 ``[n]``, out: mode declared at each sample, or -1.
-    """
-    count = len(states)
-    for k in range(len(xy)):
-        verdicts[k] = UNDETERMINED
-        best = 0
-        for i in range(count):
-            state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
-            if observers[i].substeps > 0:
-                state = _guarded(observers[i], observers[0], cos[k], sin[k], state)
-            if usable[k]:
-                state, score = _correct(observers[i], cos[k], sin[k], xy[k, 0], xy[k, 1], state)
-                if k >= settling:
-                    log_probability[i] += score
-            states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
-            if log_probability[i] > log_probability[best]:
-                best = i
-        largest = log_probability[best]
-        total = 0.0
-        for i in range(count):
-            total += math.exp(log_probability[i] - largest)
-        log_total = largest + math.log(total)
-        for i in range(count):
-            log_probability[i] -= log_total
-        if usable[k] and k >= settling and log_probability[best] > log_threshold:
-            verdicts[k] = best
-            declared = (states[best, 0], states[best, 1], states[best, 2], states[best, 3])
-            for i in range(count):
-                state = _transfer(observers[best], observers[i], cos[k], sin[k], declared)
-                states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state
-                log_probability[i] = log_prior[i]
-        for i in range(count):
-            state = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
-            state = _predict(observers[i], cos[k], sin[k], state)
-            states[i, 0], states[i, 1], states[i, 2], states[i, 3] = state

@@ -47,9 +47,8 @@ def test_evidence_is_what_the_observers_gather():
         angle = runs.DURATION * np.arange(40 * runs.PER_REV)
         z = rotor.orbit() * np.exp(1j * angle) + rotor.rest
         half, whole = len(z) // 2, np.column_stack((z.real, z.imag))
-        scores = []
+        scores, states = [], np.zeros((2, 4))
         for part in (slice(0, half), slice(half, None)):
-            states = bank._states
             score = np.empty((2, half))
             usable = np.ones(half, dtype=bool)
             kernels.run_free(

@@ -1,0 +1,324 @@
+"""A bank's one compiled call for a block: all observers and both rules, sample by sample.
+
+Loops over the lanes of a group become vector instructions; what is rare or branches (contact, a
+declaration, a lost observer) goes mode by mode. numba's cache on disk looks at the file of a function
+alone: after a change in `kernels`, `cusum` or `lanes` this file must be touched, or the cache emptied.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from numba import njit
+
+from daqsvc.rotor.cusum import first_verdict, gather, next_verdict, stand_by
+from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
+from daqsvc.rotor.lanes import DUEL, WIDTH
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Ints = NDArray[np.int64]
+    Observers = NDArray[np.void]
+    Lanes = NDArray[np.void]
+    Desks = NDArray[np.void]
+    Group = Any  # one element of Lanes: numba makes a record of it
+    Desk = Any
+    State = tuple[float, float, float, float]
+
+_REGISTER = 4
+"""Lanes are looped over in whole vector registers of this many."""
+_DRIFT = -1e3
+"""Logarithm of odds from which the paper's are counted from their leader anew, lest digits get lost."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _free(group: Group, lane: int) -> State:
+    return group.free_x[lane], group.free_u[lane], group.free_y[lane], group.free_v[lane]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_free(group: Group, lane: int, state: State) -> None:
+    group.free_x[lane], group.free_u[lane], group.free_y[lane], group.free_v[lane] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _paper(group: Group, lane: int) -> State:
+    return group.paper_x[lane], group.paper_u[lane], group.paper_y[lane], group.paper_v[lane]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_paper(group: Group, lane: int, state: State) -> None:
+    group.paper_x[lane], group.paper_u[lane], group.paper_y[lane], group.paper_v[lane] = state
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _width(lanes: Lanes, group: int, count: int) -> int:
+    """Lanes of a group that are worth stepping."""
+    return min(WIDTH, (count - group * WIDTH + _REGISTER - 1) // _REGISTER * _REGISTER)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def start_anew(observers: Observers, lanes: Lanes, pairs: Floats, desks: Desks) -> None:
+    """Forget estimates and evidence; the decision is held.
+
+    Linear observers start on their own orbits, rub observers on the healthy one. The revolution that
+    they need to find the machine is no evidence.
+
+    Args:
+        observers: ``[M]`` of `discretise.OBSERVER`.
+        lanes: memory of the bank.
+        pairs: float64 ``[2, M, M]``.
+        desks: ``[1]`` of `lanes.DESK`.
+    """
+    for m in range(len(observers)):
+        # NaN means lost: the guard puts a rub observer onto the healthy orbit at once.
+        start = math.nan if observers[m].substeps > 0 else 0.0
+        _set_free(lanes[m // WIDTH], m % WIDTH, (start, start, start, start))
+        _set_paper(lanes[m // WIDTH], m % WIDTH, (start, start, start, start))
+    for g in range(len(lanes)):
+        lanes[g].cusum[:] = 0.0
+        lanes[g].age[:] = 0
+        lanes[g].log_odds[:] = lanes[g].log_prior
+    pairs[DUEL] = 0.0
+    desk = desks[0]
+    desk.departed = 0
+    desk.paper_age = 0
+    desk.settling = desk.samples_per_rev
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _observe(group: Group, x: float, y: float, cos: float, sin: float, width: int) -> None:
+    """Innovations of a group's linear observers; the free-running ones are stepped to the next sample.
+
+    Update and prediction are one step of the closed loop, x+ = F (I - K C) x + F K z: it halves the chain
+    of operations from a state to the next.
+    """
+    a, b, rest_x, rest_y = group.a, group.b, group.rest_x, group.rest_y
+    xx, xv, vx, vv = group.closed_xx, group.closed_xv, group.closed_vx, group.closed_vv
+    drive_x, drive_v, weight, log_norm = group.drive_x, group.drive_v, group.weight, group.log_norm
+    free_x, free_u, free_y, free_v = group.free_x, group.free_u, group.free_y, group.free_v
+    paper_x, paper_y, z_x, z_y = group.paper_x, group.paper_y, group.z_x, group.z_y
+    score, paper_score = group.score, group.paper_score
+    for i in range(width):
+        zx = x - (a[i] * cos - b[i] * sin + rest_x[i])
+        zy = y - (a[i] * sin + b[i] * cos + rest_y[i])
+        dx, du, dy, dv = free_x[i], free_u[i], free_y[i], free_v[i]
+        ex, ey = zx - dx, zy - dy
+        score[i] = weight[i] * (ex * ex + ey * ey) - log_norm[i]
+        free_x[i] = xx[i] * dx + (xv[i] * du + drive_x[i] * zx)
+        free_u[i] = vx[i] * dx + (vv[i] * du + drive_v[i] * zx)
+        free_y[i] = xx[i] * dy + (xv[i] * dv + drive_x[i] * zy)
+        free_v[i] = vx[i] * dy + (vv[i] * dv + drive_v[i] * zy)
+        ex, ey = zx - paper_x[i], zy - paper_y[i]
+        paper_score[i] = weight[i] * (ex * ex + ey * ey) - log_norm[i]
+        z_x[i], z_y[i] = zx, zy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step_paper(group: Group, width: int) -> None:
+    """A group's linear observers under the paper's rule, stepped to the next sample."""
+    xx, xv, vx, vv = group.closed_xx, group.closed_xv, group.closed_vx, group.closed_vv
+    drive_x, drive_v, z_x, z_y = group.drive_x, group.drive_v, group.z_x, group.z_y
+    paper_x, paper_u, paper_y, paper_v = group.paper_x, group.paper_u, group.paper_y, group.paper_v
+    for i in range(width):
+        dx, du, dy, dv = paper_x[i], paper_u[i], paper_y[i], paper_v[i]
+        paper_x[i] = xx[i] * dx + (xv[i] * du + drive_x[i] * z_x[i])
+        paper_u[i] = vx[i] * dx + (vv[i] * du + drive_v[i] * z_x[i])
+        paper_y[i] = xx[i] * dy + (xv[i] * dv + drive_x[i] * z_y[i])
+        paper_v[i] = vx[i] * dy + (vv[i] * dv + drive_v[i] * z_y[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _observe_rub(observers: Observers, mode: int, group: Group, cos: float, sin: float) -> None:
+    """A rub observer with both rules: the free-running one is stepped, the paper's corrected."""
+    lane, observer = mode % WIDTH, observers[mode]
+    z_x, z_y = group.z_x[lane], group.z_y[lane]
+    state = guarded(observer, observers[0], cos, sin, _free(group, lane))
+    state, group.score[lane] = correct(observer, z_x, z_y, state)
+    _set_free(group, lane, predict_rub(observer, cos, sin, state))
+    state = guarded(observer, observers[0], cos, sin, _paper(group, lane))
+    state, group.paper_score[lane] = correct(observer, z_x, z_y, state)
+    _set_paper(group, lane, state)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _coast(observers: Observers, lanes: Lanes, cos: float, sin: float) -> None:
+    """Predict all estimates through a sample that is missing."""
+    for m in range(len(observers)):
+        observer, group, lane = observers[m], lanes[m // WIDTH], m % WIDTH
+        free, paper = _free(group, lane), _paper(group, lane)
+        if observer.substeps > 0:
+            free = guarded(observer, observers[0], cos, sin, free)
+            paper = guarded(observer, observers[0], cos, sin, paper)
+        _set_free(group, lane, predict(observer, cos, sin, free))
+        _set_paper(group, lane, predict(observer, cos, sin, paper))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(lanes: Lanes, pairs: Floats, desk: Desk) -> int:
+    """One sample's evidence by the CUSUM; the mode that it changes its decision to, or -1."""
+    if desk.decision == UNDETERMINED:
+        desk.departed = 0
+        return first_verdict(lanes, pairs, desk.first_threshold)
+    count = pairs.shape[1]
+    own = lanes[desk.decision // WIDTH].score[desk.decision % WIDTH]
+    enough = 0
+    for g in range(len(lanes)):
+        enough += gather(lanes[g], own, desk.lead_limit, _width(lanes, g, count))
+    if not enough:
+        desk.departed = 0
+        return UNDETERMINED
+    suspect, winner = next_verdict(lanes, pairs, desk)
+    departs = suspect != UNDETERMINED and winner == UNDETERMINED
+    desk.departed = desk.departed + 1 if departs else 0
+    return winner
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _believe_group(group: Group, top: float, bar: float, width: int) -> tuple[int, int]:
+    """Add one sample's evidence; how many modes are within the bar of the leader, and how many above it."""
+    log_odds, paper_score = group.log_odds, group.paper_score
+    near, above = 0, 0
+    for i in range(width):
+        odds = log_odds[i] + paper_score[i]
+        log_odds[i] = odds
+        near += odds > top - bar
+        above += odds > top
+    return near, above
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _believe(lanes: Lanes, count: int, desk: Desk) -> int:
+    """One sample's evidence by the paper's rule; the mode that passes the threshold, or -1.
+
+    One other mode that is close enough to the leader keeps it below the threshold; the exponentials of the
+    normaliser are needed only if there is none.
+    """
+    group, lane = lanes[desk.paper_leader // WIDTH], desk.paper_leader % WIDTH
+    top = group.log_odds[lane] + group.paper_score[lane]
+    near, above = 0, 0
+    for g in range(len(lanes)):
+        more = _believe_group(lanes[g], top, desk.odds_bar, _width(lanes, g, count))
+        near, above = near + more[0], above + more[1]
+    if above:
+        for m in range(count):
+            if lanes[m // WIDTH].log_odds[m % WIDTH] > top:
+                desk.paper_leader, top = m, lanes[m // WIDTH].log_odds[m % WIDTH]
+    elif near > 1:
+        if top < _DRIFT:
+            for g in range(len(lanes)):
+                lanes[g].log_odds[:] -= top
+        return UNDETERMINED
+    total = 0.0
+    for m in range(count):
+        total += math.exp(lanes[m // WIDTH].log_odds[m % WIDTH] - top)
+    return desk.paper_leader if total < desk.largest_total else UNDETERMINED
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hand_over(observers: Observers, lanes: Lanes, cos: float, sin: float, declared: int) -> None:
+    """Every observer under the paper's rule takes over the declared one's estimate, and is stepped."""
+    observer, group, lane = observers[declared], lanes[declared // WIDTH], declared % WIDTH
+    dx, du, dy, dv = _paper(group, lane)
+    if observer.substeps == 0:
+        (dx, du, dy, dv), _ = correct(observer, group.z_x[lane], group.z_y[lane], (dx, du, dy, dv))
+    ox, ou, oy, ov = orbit(observer, cos, sin)
+    for m in range(len(observers)):
+        tx, tu, ty, tv = orbit(observers[m], cos, sin)
+        state = (dx + ox - tx, du + ou - tu, dy + oy - ty, dv + ov - tv)
+        _set_paper(lanes[m // WIDTH], m % WIDTH, predict(observers[m], cos, sin, state))
+    for g in range(len(lanes)):
+        lanes[g].log_odds[:] = lanes[g].log_prior
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance(
+    xy: Floats,
+    cos: Floats,
+    sin: Floats,
+    begin: int,
+    observers: Observers,
+    lanes: Lanes,
+    rubs: Ints,
+    pairs: Floats,
+    desks: Desks,
+) -> int:
+    """Run a bank over a block, up to the next change of its decision.
+
+    Both rules run side by side, each over its own estimates. The paper's (section V): conditional
+    probabilities, declared at a threshold; then every observer takes over the declared one's estimate,
+    and the probabilities go back to their priors. Without the hand-over the observers that lost never
+    learn that the machine has changed.
+
+    Args:
+        xy: float64 ``[n, 2]``, measured position in clearances; farther out than can be, or NaN: missing.
+        cos: float64 ``[n]``, cosine of the shaft angle; NaN: not known.
+        sin: float64 ``[n]``, its sine.
+        begin: sample to begin at; not 0 to go on with a block after a change.
+        observers: ``[M]`` of `discretise.OBSERVER`.
+        lanes: memory of the bank, changed in place.
+        rubs: int64 ``[R]``, indices of the rub observers.
+        pairs: float64 ``[2, M, M]``, see `lanes.THRESHOLD` and `lanes.DUEL`, changed in place.
+        desks: ``[1]`` of `lanes.DESK`, changed in place.
+
+    Returns:
+        ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
+    """
+    desk, count = desks[0], len(observers)
+    if begin == 0:
+        desk.paper_declarations = 0
+    for k in range(begin, len(xy)):
+        x, y, c, s = xy[k, 0], xy[k, 1], cos[k], sin[k]
+        usable = x * x + y * y < desk.usable_squared and math.isfinite(c + s)
+        if usable:
+            if desk.unusable > desk.samples_per_rev:
+                start_anew(observers, lanes, pairs, desks)
+            desk.unusable = 0
+            for g in range(len(lanes)):
+                _observe(lanes[g], x, y, c, s, _width(lanes, g, count))
+            for r in range(len(rubs)):
+                _observe_rub(observers, rubs[r], lanes[rubs[r] // WIDTH], c, s)
+        else:
+            desk.unusable += 1
+            _coast(observers, lanes, c, s)
+        counts = usable and desk.settling == 0
+        desk.settling = max(0, desk.settling - 1)
+        if not counts:
+            for g in range(len(lanes)):
+                lanes[g].score[:] = 0.0
+
+        previous, paper_previous = desk.decision, desk.paper_decision
+        winner = _weigh(lanes, pairs, desk)
+        onset = 0
+        if winner != UNDETERMINED:
+            onset = k + 1 - lanes[winner // WIDTH].age[winner % WIDTH]
+            stand_by(winner, lanes, pairs, desk)
+
+        declared = _believe(lanes, count, desk) if counts else UNDETERMINED
+        desk.paper_age += 1
+        paper_onset = k + 1 - desk.paper_age
+        if declared != UNDETERMINED:
+            desk.paper_declarations += 1
+            desk.paper_decision = declared
+            desk.paper_age = 0
+            _hand_over(observers, lanes, c, s, declared)
+        elif usable:
+            for g in range(len(lanes)):
+                _step_paper(lanes[g], _width(lanes, g, count))
+            for r in range(len(rubs)):
+                group, lane = lanes[rubs[r] // WIDTH], rubs[r] % WIDTH
+                _set_paper(group, lane, predict_rub(observers[rubs[r]], c, s, _paper(group, lane)))
+
+        if desk.by_paper and declared != UNDETERMINED and declared != paper_previous:
+            desk.changed_from, desk.changed_onset = paper_previous, paper_onset
+            return -1 - k
+        if not desk.by_paper and winner != UNDETERMINED:
+            desk.changed_from, desk.changed_onset = previous, onset
+            return -1 - k
+    return len(xy)
