@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
     check_bus_load,
@@ -87,6 +88,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield _window(draft)
             yield _velocity_band(draft)
     yield from rotor_checks(draft)
+    yield from bearing_checks(draft)
     with suppress(UnusableValueError):
         for index, alarm in enumerate(draft.alarms):
             at = ("alarms", index)

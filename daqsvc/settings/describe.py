@@ -7,6 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm
+from daqsvc.settings.bearing import BEARING
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.layout_checks import bus_share, frame_facts
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
@@ -15,6 +16,7 @@ from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, Ve
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from daqsvc.settings.bearing import Bearing, WatchedBearing
     from daqsvc.settings.buses import Stream
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
     from daqsvc.settings.pipeline import Mode, RotorBank
@@ -174,6 +176,8 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         yield "rotor-bank", text
     if pipeline.rotor_synchronous is not None:
         yield ROTOR_SYNCHRONOUS, _synchronous(machine, pipeline.rotor_synchronous)
+    if pipeline.bearing is not None:
+        yield BEARING, _bearing(pipeline.bearing)
 
 
 def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
@@ -200,6 +204,34 @@ def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
     if machine.ac_coupled:
         parts.append("no mean position from AC-coupled probes, so no static load is seen")
     return "; ".join(parts)
+
+
+def _bearing(given: Bearing) -> str:
+    healthy = (
+        f"the first {given.calibrate_s:g} s are the healthy state, kept over restarts"
+        if given.calibration is None
+        else f"healthy state in {given.calibration}"
+    )
+    return "; ".join(
+        [
+            *(_watched(bearing) for bearing in given.bearings),
+            healthy,
+            f'false alarms of "changed" {given.false_alarm_probability:g} a look',
+        ]
+    )
+
+
+def _watched(bearing: WatchedBearing) -> str:
+    orders = bearing.orders
+    kinematics = (
+        f"{bearing.type}"
+        if orders is None
+        else f"BPFI {orders.bpfi:g}, BPFO {orders.bpfo:g}, BSF {orders.bsf:g}, FTF {orders.ftf:g}"
+    )
+    by = bearing.sensor
+    if bearing.rotor_sensor is not None:
+        by += f", races also by direction with {bearing.rotor_sensor}"
+    return f"{bearing.name} ({kinematics}) by {by}"
 
 
 def _thresholds(bank: RotorBank) -> str:

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
 from daqsvc.settings.alarms import Alarm, DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.bearing import BEARING, Bearing, WatchedBearing
 from daqsvc.settings.buses import (
     Bus,
     CanBus,
@@ -37,10 +38,12 @@ if TYPE_CHECKING:
     from daqsvc.settings.problems import Problem
 
 __all__ = [
+    "BEARING",
     "ROTOR_BANK",
     "ROTOR_SYNCHRONOUS",
     "Accelerometer",
     "Alarm",
+    "Bearing",
     "Bus",
     "CanBus",
     "Channel",
@@ -69,6 +72,7 @@ __all__ = [
     "Store",
     "Stream",
     "VelocitySensor",
+    "WatchedBearing",
 ]
 
 _DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
@@ -284,6 +288,7 @@ class MachineFile(Section):
         configured = {
             ROTOR_BANK: self.pipeline.rotor_bank,
             ROTOR_SYNCHRONOUS: self.pipeline.rotor_synchronous,
+            BEARING: self.pipeline.bearing,
         }
         return tuple(name for name, section in configured.items() if section is not None)
 

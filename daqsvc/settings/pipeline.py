@@ -1,4 +1,4 @@
-"""What is computed from the samples: level detectors, the rotor's model bank, the calibrated rotor."""
+"""What is computed from the samples: level detectors, the rotor's two detectors, the bearings'."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.bearing import Bearing  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.rotor import RotorSynchronous  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import DampingRatio, Name, NotNegative, Positive, Section
 
@@ -121,3 +122,4 @@ class Pipeline(Section):
     rotor_synchronous: RotorSynchronous | None = Field(
         default=None, description="the rotor against its own healthy state"
     )
+    bearing: Bearing | None = Field(default=None, description="the rolling bearings")

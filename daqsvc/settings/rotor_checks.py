@@ -6,6 +6,7 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from daqsvc.settings.bearing import BEARING
 from daqsvc.settings.mode_checks import mode_checks
 from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
@@ -58,7 +59,7 @@ def check_alarm_detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath)
         alarm: the alarm.
         at: where it stands in the file.
     """
-    tables = {ROTOR_BANK: "rotor_bank", ROTOR_SYNCHRONOUS: "rotor_synchronous"}
+    tables = {ROTOR_BANK: "rotor_bank", ROTOR_SYNCHRONOUS: "rotor_synchronous", BEARING: "bearing"}
     if alarm.detector not in tables:
         yield Finding((*at, "detector"), "there is no such detector", choice(alarm.detector, tables))
         return

@@ -1,0 +1,89 @@
+"""Rolling bearings: which are watched, by which accelerometers, and how sure an alarm must be."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - pydantic reads the annotations
+from typing import Annotated
+
+from pydantic import Field
+
+from daqsvc.settings.section import Name, Positive, Section
+
+BEARING = "bearing"
+"""Name of the bearings' detector."""
+
+WINDOW_S = 2.5
+"""The race test looks at so much at a time; `daqsvc.bearing.race.watch` says why."""
+
+Triple = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+
+
+class FaultOrders(Section):
+    """How often the parts of a bearing meet, per revolution of the shaft."""
+
+    bpfi: Annotated[Positive, Field(description="balls pass a point of the inner race", examples=[5.415])]
+    bpfo: Annotated[Positive, Field(description="balls pass a point of the outer race", examples=[3.585])]
+    bsf: Annotated[Positive, Field(description="a ball turns about itself", examples=[2.357])]
+    ftf: Annotated[Positive, Field(description="the cage turns", examples=[0.398])]
+
+
+class ThreeMasses(Section):
+    """The bearing as a chain of rotor, rolling elements and housing, to ground."""
+
+    masses_kg: Annotated[
+        Triple, Field(description="rotor, rolling elements, housing", examples=["[4.0, 0.0185, 2.0]"])
+    ]
+    stiffness_n_per_m: Annotated[
+        Triple, Field(description="shaft, contact, housing", examples=["[2e7, 1e8, 5e7]"])
+    ]
+    damping_n_s_per_m: Annotated[
+        Triple, Field(description="shaft, contact, housing", examples=["[200.0, 300.0, 2000.0]"])
+    ]
+
+
+class WatchedBearing(Section):
+    """One bearing with the accelerometer on its housing."""
+
+    name: Annotated[Name, Field(description="name of the bearing", examples=["drive-end"])]
+    sensor: Annotated[Name, Field(description="the accelerometer on its housing", examples=["accel-de"])]
+    type: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description='designation in the catalogue, e.g. "6205-2RS"; or orders'
+    )
+    orders: FaultOrders | None = Field(default=None, description="its fault orders, in place of type")
+    rotor_sensor: Name | None = Field(
+        default=None, description="accelerometer that moves with the rotor, to tell the races by direction"
+    )
+    model: ThreeMasses | None = Field(default=None, description="the bearing's masses and springs, for that")
+
+    @property
+    def sensors(self) -> tuple[Name, ...]:
+        """The sensors that it is judged by."""
+        return (self.sensor,) if self.rotor_sensor is None else (self.rotor_sensor, self.sensor)
+
+
+class Bearing(Section):
+    """Bearings judged by the lines of their kinematics, and against the healthy machine."""
+
+    bearings: Annotated[
+        tuple[WatchedBearing, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the bearings; all of one machine, so that they can be compared",
+            examples=['[{ name = "drive-end", sensor = "accel-de", type = "6205-2RS" }]'],
+        ),
+    ]
+    calibrate_s: Annotated[Positive, Field(ge=10, le=600)] = Field(
+        default=30.0, description="first seconds, which are the healthy state; kept over restarts"
+    )
+    calibration: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="file with the healthy state, in place of the first seconds"
+    )
+    false_alarm_probability: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(
+        default=1e-4, description='of calling the unchanged machine "changed", at each look'
+    )
+
+    @property
+    def sensors(self) -> tuple[Name, ...]:
+        """The sensors that it rests on, each once."""
+        return tuple(dict.fromkeys(name for bearing in self.bearings for name in bearing.sensors))
