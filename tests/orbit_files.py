@@ -18,7 +18,8 @@ RATE_HZ = SPEED_RPM / 60.0 * SAMPLES_PER_REV
 AMPLITUDE_UM = 40.0
 SAG_UM = 12.0
 NOISE_UM = 1.0
-ONSET = 80
+ONSET = 80.25
+"""In revolutions. Not at a mark: the rounding of a stated speed would decide which revolution it falls into."""
 
 OPTIONS = (
     *("--probes", "x,y", "--speed-rpm", f"{SPEED_RPM:g}", "--natural-frequency-hz", "60"),
@@ -33,7 +34,7 @@ class Orbit:
 
     Args:
         revolutions: whole revolutions.
-        change: complex change of the forward 1X vector from revolution `ONSET` on, in healthy amplitudes.
+        change: complex change of the forward 1X vector from `ONSET` on, in healthy amplitudes.
         seed: of the noise.
     """
 
