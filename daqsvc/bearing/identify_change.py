@@ -30,7 +30,7 @@ LOWEST_HZ = 400.0
 _WINDOWS_OF_SHORT = 16
 """A recording of less than as many windows is cut into so many shorter ones."""
 _LEAST_WINDOW_SAMPLES = 1024
-_HIGHEST = 0.48
+HIGHEST = 0.48
 """Of the sampling rate: above, the anti-aliasing filter."""
 _LOWEST = 0.08
 """Of the sampling rate: where that is below `LOWEST_HZ`."""
@@ -165,7 +165,12 @@ class ResidualChange(NamedTuple):
 
 
 def learn_healthy(
-    samples: Floats, rate_hz: float, *, window_s: float = WINDOW_S, most_order: int = MOST_ORDER
+    samples: Floats,
+    rate_hz: float,
+    *,
+    window_s: float = WINDOW_S,
+    most_order: int = MOST_ORDER,
+    highest: float = HIGHEST,
 ) -> HealthyResidual:
     """Learn the healthy machine from a recording of it.
 
@@ -174,6 +179,7 @@ def learn_healthy(
         rate_hz: sampling rate.
         window_s: length of a window; of short recordings less.
         most_order: highest order of the model.
+        highest: where the bands end, as a part of the sampling rate.
 
     Raises:
         NotIdentifiableError: the recording is too short or not steady, or the model cannot be made.
@@ -192,7 +198,7 @@ def learn_healthy(
     healthy = HealthyResidual(
         model=model,
         window_samples=window,
-        edges_hz=np.geomspace(low_hz, _HIGHEST * rate_hz, BANDS + 1),
+        edges_hz=np.geomspace(low_hz, highest * rate_hz, BANDS + 1),
         mean_db=blank,
         spread_db=blank,
         windows=0,

@@ -16,6 +16,7 @@ from daqsvc.commands.analyze_arguments import (
     add_rotor_arguments,
     misuse,
 )
+from daqsvc.commands.analyze_bearing import add_bearing_arguments, bearing_analyst, bearing_misuse, by_bearing
 from daqsvc.commands.analyze_orders import add_order_arguments, by_orders, order_analyst, order_misuse
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from daqsvc.analysis.many import Analyst, Outcome
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
 
     Load: TypeAlias = Callable[[Path], MachineFile | None]
@@ -50,9 +52,11 @@ class AnalyzeCommand:
         "than real time, and say which fault the rotor has, what else it might be, since when, and how large "
         "it is. Either the first file is a machine file (.toml), or options name probes, speed and rotor; "
         "the first revolutions of a recording are then the healthy machine. Accelerometers without a "
-        "keyphasor are compared with a recording of the healthy machine (--channels, --baseline). Verdicts: "
+        "keyphasor are compared with a recording of the healthy machine (--channels, --baseline); with "
+        "--bearing or --orders they say which part of a rolling bearing is damaged. Verdicts: "
         "normal, unbalance, damping_loss, static_load, stiffness_loss, rub, unmodelled (changed, but none "
-        "of these), small_change (too small for a name)."
+        "of these), small_change (too small for a name); of a bearing: normal, changed, inner, outer, ball, "
+        "inner_or_outer."
     )
 
     def __init__(self, load: Load, prepare_kernel_cache: Callable[[], None]) -> None:
@@ -71,6 +75,7 @@ class AnalyzeCommand:
         )
         add_rotor_arguments(parser)
         add_order_arguments(parser)
+        add_bearing_arguments(parser)
         add_machine_arguments(parser)
         add_output_arguments(parser)
 
@@ -78,13 +83,18 @@ class AnalyzeCommand:
         """See `Command.run`."""
         machine = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
         recordings = arguments.files[1:] if machine is not None else arguments.files
-        orders = by_orders(arguments)
-        if wrong := order_misuse(arguments, machine) if orders else misuse(arguments, machine, recordings):
+        if by_bearing(arguments):
+            wrong, make = bearing_misuse(arguments, machine), bearing_analyst
+        elif by_orders(arguments):
+            wrong, make = order_misuse(arguments, machine), order_analyst
+        else:
+            wrong, make = misuse(arguments, machine, recordings), None
+        if wrong:
             self._parser.error(wrong)
         if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
             return _fail(wrong, EXIT_FAILED)
-        if orders:
-            analyst = self._orders(arguments)
+        if make is not None:
+            analyst = self._accelerometers(make, arguments)
         else:
             analyst = self._rotor(arguments) if machine is None else self._machine(machine, arguments)
         if analyst is None:
@@ -114,11 +124,11 @@ class AnalyzeCommand:
                 retry=False,
             )
             threshold_for(rules.false_alarms_per_1000_rev)
-            calibration = None
+            calibrations: tuple[Calibration, ...] = ()
             if arguments.calibration is not None:
-                from daqsvc.analysis.baseline import load_baseline  # noqa: PLC0415
+                from daqsvc.rotor.calibration.file import load_healthy  # noqa: PLC0415
 
-                rotor, calibration = load_baseline(arguments.calibration, speed.rpm, arguments.clearance_um)
+                rotor, calibrations = load_healthy(arguments.calibration, speed.rpm, arguments.clearance_um)
             else:
                 rotor = LavalRotor(
                     natural_frequency_hz=arguments.natural_frequency_hz,
@@ -137,7 +147,7 @@ class AnalyzeCommand:
                 keyphasor=None if keyphasor is None else Keyphasor(keyphasor, arguments.keyphasor_threshold),
                 follow_orbit=speed.orbit or arguments.follow_orbit,
                 rules=rules,
-                calibration=calibration,
+                calibrations=calibrations,
                 ac_coupled=arguments.ac_coupled,
                 channels=arguments.map,
                 rate_hz=arguments.fs,
@@ -146,10 +156,12 @@ class AnalyzeCommand:
             self._parser.error(str(error))
         return RotorAnalyst(setup)
 
-    def _orders(self, arguments: argparse.Namespace) -> Analyst | None:
+    def _accelerometers(
+        self, make: Callable[[argparse.Namespace], Analyst], arguments: argparse.Namespace
+    ) -> Analyst | None:
         """An analyst of accelerometers; None after its error has been printed."""
         try:
-            return order_analyst(arguments)
+            return make(arguments)
         except ValueError as error:
             self._parser.error(str(error))
 

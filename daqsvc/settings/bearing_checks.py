@@ -106,10 +106,10 @@ def _direction(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iter
         )
         return
     sensor = _named(draft).get(bearing.sensor)
-    rate_hz = (
-        None if sensor is None or sensor.stream not in draft.streams else draft.streams[sensor.stream].rate_hz
-    )
-    if rate_hz is not None and rate_hz < _DIRECTION_RATE_HZ:
+    if sensor is None or sensor.stream not in draft.streams:
+        return
+    rate_hz = draft.streams[sensor.stream].rate_hz
+    if rate_hz < _DIRECTION_RATE_HZ:
         yield Finding(
             (*at, "rotor_sensor"),
             f"at {rate_hz:g} Hz inner and outer race look alike to any two sensors of most bearings",
@@ -141,8 +141,8 @@ def _speed(draft: MachineFile) -> Iterator[Finding]:
     if revolutions < _LEAST_REVOLUTIONS:
         yield Finding(
             _BEARING,
-            f"a window of {WINDOW_S:g} s has {revolutions:.3g} revolutions at {speed_rpm:g} rpm; the lines of "
-            f"a bearing need {_LEAST_REVOLUTIONS:g}",
+            f"a window of {WINDOW_S:g} s has {revolutions:.3g} revolutions at {speed_rpm:g} rpm; the lines "
+            f"of a bearing need {_LEAST_REVOLUTIONS:g}",
             "remove it: this machine is too slow for it",
         )
 

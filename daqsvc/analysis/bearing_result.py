@@ -1,0 +1,235 @@
+"""The verdict about the bearings of a recording, as data, as a JSON object and in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.analysis.result import finite
+from daqsvc.bearing.race.verdict import PARTS
+from daqsvc.diagnosis.bearing_finding import WORDS, severity_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.analysis.bearing_setup import BearingSetup
+    from daqsvc.analysis.quality import DataQuality
+    from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
+    from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
+    from daqsvc.diagnosis.bearing_finding import BearingFinding
+
+_TOLD_LINES = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BearingAnalysis:
+    """What a recording says about a machine's bearings.
+
+    Attributes:
+        recording: name of the recording.
+        baseline: name of the healthy run; None without one.
+        setup: what it was judged by.
+        quality: what is known against its samples.
+        refused: why it cannot be judged; None if it can.
+        finding: the verdict; None if refused.
+        races: what each channel shows, of those that could be judged.
+        unfit: why the others could not.
+        healthy: what the innovations were compared with; None if they were not.
+        change: how they differ; None if they were not compared.
+    """
+
+    recording: str
+    baseline: str | None
+    setup: BearingSetup
+    quality: DataQuality
+    refused: str | None = None
+    finding: BearingFinding | None = None
+    races: Mapping[str, RaceVerdict] = field(default_factory=dict)
+    unfit: Mapping[str, str] = field(default_factory=dict)
+    healthy: HealthyResidual | None = None
+    change: ResidualChange | None = None
+
+    @property
+    def leading(self) -> RaceVerdict | None:
+        """The channel that the verdict is about."""
+        return None if self.finding is None else self.races[self.finding.where]
+
+    def as_json(self) -> dict[str, Any]:
+        """A JSON object: all figures finite."""
+        finding, race, bearing = self.finding, self.leading, self.setup.bearing
+        found: dict[str, Any] = finite(
+            {
+                "recording": self.recording,
+                "baseline": self.baseline,
+                "verdict": None if finding is None else finding.verdict,
+                "group": [] if finding is None else list(finding.group),
+                "channel": None if finding is None else finding.where,
+                "probabilities": {}
+                if finding is None
+                else {word: finding.probabilities[word] for word in WORDS},
+                "severity": None if finding is None else finding.severity,
+                "margin": None if race is None else race.margin,
+                "evidence": {} if race is None else evidence_json(race),
+                "lines": [] if race is None else [line_json(line) for line in race.lines],
+                "residual": self._residual(),
+                "false_alarm_probability": self.setup.change.false_alarm_probability,
+                "race_false_alarm_probability": None if race is None else race.false_alarm_probability,
+                "bearing": {
+                    "name": self.setup.bearing_name or None,
+                    "bpfi": bearing.inner,
+                    "bpfo": bearing.outer,
+                    "bsf": bearing.ball,
+                    "ftf": bearing.cage,
+                },
+                "channels": {name: self._channel(name) for name in self.setup.channels},
+                "speed_rpm": None if race is None else race.speed_rpm,
+                "speed_stated_rpm": self.setup.speed_rpm,
+                "speed_seen": None if race is None else race.speed_seen,
+                "revolutions": 0 if race is None else race.revolutions,
+                "unit": self.setup.unit,
+                "notes": [] if race is None else list(race.notes),
+                "data_quality": self.quality.as_json(),
+                "refused": self.refused,
+            }
+        )
+        return found
+
+    def _channel(self, name: str) -> dict[str, Any]:
+        """What one channel says by itself."""
+        race = self.races.get(name)
+        if race is None:
+            return {
+                "verdict": None,
+                "group": [],
+                "severity": None,
+                "refused": self.unfit.get(name, self.refused),
+            }
+        return {
+            "verdict": race.verdict,
+            "group": list(race.group),
+            "severity": severity_of(race),
+            "margin": race.margin,
+            "evidence": evidence_json(race),
+            "lines": [line_json(line) for line in race.lines],
+            "level_db": race.level_db,
+            "speed_rpm": race.speed_rpm,
+            "notes": list(race.notes),
+            "refused": None,
+        }
+
+    def _residual(self) -> dict[str, Any] | None:
+        if self.change is None or self.healthy is None:
+            return None
+        change, healthy = self.change, self.healthy
+        return {
+            "changed": change.changed,
+            "ratio": change.ratio,
+            "rise_db": change.rise_db[0],
+            "limit_db": change.limit_db[0],
+            "departure": change.departure,
+            "bands": [
+                {"low_hz": low, "high_hz": high, "rise_db": rise, "limit_db": limit}
+                for low, high, rise, limit in zip(
+                    healthy.edges_hz[:-1],
+                    healthy.edges_hz[1:],
+                    change.rise_db[1:],
+                    change.limit_db[1:],
+                    strict=True,
+                )
+            ],
+            "windows": change.windows,
+            "model_order": healthy.model.order,
+            "healthy_windows": healthy.windows,
+        }
+
+    def describe(self) -> str:
+        """A few lines for a person."""
+        finding, race = self.finding, self.leading
+        if finding is None or race is None:
+            return f"{self.recording}: not judged: {self.refused}"
+        lines = [f"{self.recording}: {self._headline(finding)}"]
+        lines.append(
+            ", ".join(
+                f"{part} z {e.z:.1f} size {e.depth:.2f}" + ("" if e.testable else " (not testable)")
+                for part, e in ((part, race.evidence[part]) for part in PARTS)
+            )
+        )
+        told = [line for line in race.lines if line.part in finding.group][:_TOLD_LINES]
+        lines += [
+            f"{_line_name(line)} at {line.frequency_hz:.2f} Hz ({line.order:.3f} per revolution), modulation "
+            f"{line.depth:.2f}"
+            for line in told
+        ]
+        if self.change is not None:
+            change = self.change
+            lines.append(
+                f"what the healthy machine of {self.baseline} does not predict is {change.ratio:.2f} times "
+                f"what it was ({change.rise_db[0]:+.1f} dB, limit {change.limit_db[0]:.1f} dB; largest rise "
+                f"of a band {change.rise_db[1:].max():+.1f} dB)"
+            )
+        seen = "by its harmonics" if race.speed_seen else "as stated: no harmonic of the shaft stands out"
+        lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
+        lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
+        lines += race.notes
+        return "\n  ".join([*lines, *self.quality.problems])
+
+    def _headline(self, finding: BearingFinding) -> str:
+        words = {
+            "normal": "normal",
+            "changed": "changed, cause not known",
+            "inner": "inner race",
+            "outer": "outer race",
+            "ball": "ball",
+            "inner_or_outer": "inner or outer race (cannot be told apart)",
+        }
+        said = words[finding.verdict]
+        others = [words[name] for name in finding.group if name != finding.verdict and name in words]
+        if finding.verdict not in {"normal", "changed", "inner_or_outer"} and others:
+            said += f" or {' or '.join(others)}"
+        if finding.verdict in {"normal", "changed"}:
+            return said
+        return f"{said} at {finding.where}, severity {finding.severity:.1f}"
+
+
+def evidence_json(race: RaceVerdict) -> dict[str, Any]:
+    """What speaks for each part, for the output."""
+    return {
+        part: {
+            "z": e.z,
+            "z_limit": e.z_limit,
+            "size": e.depth,
+            "severity": e.severity,
+            "severity_limit": e.limit,
+            "false_alarm_probability": e.false_alarm_probability,
+            "order": e.order,
+            "testable": e.testable,
+            "reason": e.reason or None,
+        }
+        for part, e in race.evidence.items()
+    }
+
+
+def line_json(line: RaceLine) -> dict[str, Any]:
+    """A line, for the output."""
+    return {
+        "part": line.part,
+        "harmonic": line.harmonic,
+        "sideband": line.sideband,
+        "frequency_hz": line.frequency_hz,
+        "order": line.order,
+        "evidence_nats": line.evidence,
+        "size": line.depth,
+    }
+
+
+def _line_name(line: RaceLine) -> str:
+    """``2 x BPFO``, ``BPFI - shaft``, ``2 x BSF + cage``."""
+    base = {"inner": "BPFI", "outer": "BPFO", "ball": "2 BSF"}[line.part]
+    by = "cage" if line.part == "ball" else "shaft"
+    if line.harmonic == 0:
+        return f"{abs(line.sideband)} x {by}"
+    name = base if line.harmonic == 1 else f"{line.harmonic} x {base}"
+    if not line.sideband:
+        return name
+    apart = by if abs(line.sideband) == 1 else f"{abs(line.sideband)} x {by}"
+    return f"{name} {'+' if line.sideband > 0 else '-'} {apart}"
