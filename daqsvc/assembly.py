@@ -16,7 +16,12 @@ from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limit
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.publish.mqtt import MqttSettings
-from daqsvc.rotor.calibration.file import CalibrationFileError, load_calibration, save_calibration
+from daqsvc.rotor.calibration.file import (
+    CalibrationFileError,
+    load_calibration,
+    load_healthy,
+    save_calibration,
+)
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.watch import WatchRules
 from daqsvc.settings.models import (
@@ -252,17 +257,29 @@ def _rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
     )
 
 
-def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Path | None) -> Detector:
+def healthy_rotor(
+    machine: MachineFile, given: RotorSynchronous, calibration: Path | None = None
+) -> tuple[LavalRotor, tuple[Calibration, ...]]:
+    """What is known of the calibrated rotor: by its calibration if there is one, else by the machine file.
+
+    Args:
+        machine: the machine file.
+        given: its calibrated rotor.
+        calibration: file to take in place of the one that the machine file names.
+
+    Returns:
+        See `load_healthy`: at most one baseline, that of the machine's speed.
+
+    Raises:
+        CalibrationFileError: the calibration cannot be used at the machine's speed.
+    """
     rotor = machine.machine.rotor
     assert rotor is not None  # noqa: S101 - settings/rotor_checks.py: it needs [machine.rotor]
-    stream = machine.sensor(given.probes[0]).stream
-    reference: SpeedReference
-    if given.reference == "keyphasor":
-        assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
-        reference = _keyphasor(machine, given.keyphasor)
-    else:
-        reference = given.reference
-    known = LavalRotor(
+    if calibration is None and given.calibration is not None:
+        calibration = machine.resolve(given.calibration)
+    if calibration is not None:
+        return load_healthy(calibration, machine.machine.speed_rpm, rotor.clearance_um)
+    stated = LavalRotor(
         natural_frequency_hz=rotor.natural_frequency_hz,
         damping_ratio=rotor.damping_ratio,
         natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
@@ -270,12 +287,27 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Pat
         clearance_um=rotor.clearance_um,
         static_sag_um=rotor.static_sag_um,
     )
-    calibration, kept = None, None
-    if given.calibration is not None:
-        calibration = _calibration(machine, given.calibration)
-    elif store is not None:
+    return stated, ()
+
+
+def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Path | None) -> Detector:
+    try:
+        rotor, baselines = healthy_rotor(machine, given)
+    except CalibrationFileError as error:
+        raise AssemblyError(
+            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(given.calibration)!r}: {error}"
+        ) from error
+    calibration, kept = (baselines[0] if baselines else None), None
+    if calibration is None and store is not None:
         kept = store / f"{ROTOR_SYNCHRONOUS}.toml"
-        calibration = _kept_calibration(kept, machine.machine.speed_rpm, known)
+        calibration = _kept_calibration(kept, machine.machine.speed_rpm, rotor)
+    stream = machine.sensor(given.probes[0]).stream
+    reference: SpeedReference
+    if given.reference == "keyphasor":
+        assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
+        reference = _keyphasor(machine, given.keyphasor)
+    else:
+        reference = given.reference
     return RotorSynchronousDetector(
         machine=machine.machine.name,
         stream=stream,
@@ -283,7 +315,7 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Pat
         speed_rpm=machine.machine.speed_rpm,
         probes=_probes(machine, given.probes),
         reference=reference,
-        rotor=known,
+        rotor=rotor,
         rules=WatchRules(
             calibrate_revolutions=given.calibrate_revolutions,
             false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
@@ -293,15 +325,6 @@ def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Pat
         ac_coupled=machine.ac_coupled,
         keep=None if kept is None else partial(_keep_calibration, kept),
     )
-
-
-def _calibration(machine: MachineFile, path: Path) -> Calibration:
-    try:
-        return load_calibration(machine.resolve(path), machine.machine.speed_rpm)
-    except CalibrationFileError as error:
-        raise AssemblyError(
-            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(path)!r}: {error}"
-        ) from error
 
 
 def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibration | None:

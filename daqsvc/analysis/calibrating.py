@@ -157,7 +157,7 @@ def _baseline(recording: Recording, taken: RotorSetup) -> Calibration:
 
 def _with_revolutions(taken: RotorSetup, revolutions: int) -> RotorSetup:
     rules = replace(taken.rules, calibrate_revolutions=revolutions, retry=False)
-    return replace(taken, rules=rules, calibration=None)
+    return replace(taken, rules=rules, calibrations=())
 
 
 def _refuse_short(turns: float) -> None:

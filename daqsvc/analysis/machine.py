@@ -10,7 +10,6 @@ import numpy as np
 
 from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
-from daqsvc.analysis.baseline import load_baseline
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
@@ -20,7 +19,6 @@ from daqsvc.analysis.statements import Statements, listen
 from daqsvc.recording.channels import UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
-from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.watch import WatchRules
 from daqsvc.settings import load_machine_file, models
 
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
 
     Floats = NDArray[np.float64]
@@ -74,7 +71,7 @@ class MachineAnalyst:
                 f"{', '.join(sensor.name for sensor in machine.sensors)}"
             )
         if machine.pipeline.rotor_synchronous is not None:
-            self._rotor(machine, machine.pipeline.rotor_synchronous)
+            assembly.healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
         elif self.calibration is not None:
             raise ValueError(
                 f"--calibration: {self.machine} has no [pipeline.rotor_synchronous] that would use it; add it"
@@ -144,7 +141,7 @@ class MachineAnalyst:
         if given.reference == "keyphasor" and given.keyphasor is not None:
             sensor = cast("models.Keyphasor", machine.sensor(given.keyphasor))
             keyphasor = Keyphasor(sensor.name, sensor.threshold_v, sensor.edge, sensor.hysteresis_v)
-        rotor, calibration = self._rotor(machine, given)
+        rotor, calibrations = assembly.healthy_rotor(machine, given, self.calibration)
         return RotorSetup(
             probes=(x.name, y.name),
             probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),
@@ -159,31 +156,8 @@ class MachineAnalyst:
                 probe_drift_um=given.probe_drift_um,
                 retry=False,
             ),
-            calibration=calibration,
+            calibrations=calibrations,
             ac_coupled=machine.ac_coupled,
-        )
-
-    def _rotor(
-        self, machine: MachineFile, given: models.RotorSynchronous
-    ) -> tuple[LavalRotor, Calibration | None]:
-        """The rotor by the calibration if there is one, else by the machine file."""
-        rotor = machine.machine.rotor
-        assert rotor is not None  # noqa: S101 - the settings check it
-        path = self.calibration
-        if path is None and given.calibration is not None:
-            path = machine.resolve(given.calibration)
-        if path is not None:
-            return load_baseline(path, machine.machine.speed_rpm, rotor.clearance_um)
-        return (
-            LavalRotor(
-                natural_frequency_hz=rotor.natural_frequency_hz,
-                damping_ratio=rotor.damping_ratio,
-                natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
-                damping_tolerance=given.damping_tolerance_percent / 100.0,
-                clearance_um=rotor.clearance_um,
-                static_sag_um=rotor.static_sag_um,
-            ),
-            None,
         )
 
     def _statements(self, machine: MachineFile, recording: Recording) -> dict[str, Statements]:

@@ -24,6 +24,7 @@ from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.probe_checks import Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.recording.channels import to_um
+from daqsvc.rotor.calibration.record import baseline_at
 from daqsvc.rotor.synchronous.baseline import Calibration, compensated
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.severity import levels
@@ -138,7 +139,7 @@ def _judge(
         reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
         rotor=setup.rotor,
         rules=replace(setup.rules, speed_uncertainty=speed.uncertainty),
-        calibration=setup.calibration,
+        calibration=_healthy_state(setup, speed.rpm),
         ac_coupled=setup.ac_coupled or checks.lacks_mean(samples[:, :2]),
         listener=watched.take,
     )
@@ -150,6 +151,17 @@ def _judge(
     vectors = SynchronousVectors.joined(watched.vectors)
     reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, tuple(complaints))
     return reading.verdict(quality)
+
+
+def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
+    """The calibration that the recording is held against; None to make one of its first revolutions."""
+    if len(setup.calibrations) < 2:
+        # Whether a single one is of this speed, the detector asks at every revolution.
+        return setup.calibrations[0] if setup.calibrations else None
+    try:
+        return baseline_at(setup.calibrations, speed_rpm)
+    except ValueError as error:
+        raise RefusedError(str(error)) from None
 
 
 def _feed(
@@ -202,7 +214,7 @@ class _Reading:
         for complaint in self.complaints:
             quality = quality.with_problem(complaint)
         calibration = watch.calibration
-        calibrated = 0 if self.setup.calibration is not None else self.setup.rules.calibrate_revolutions
+        calibrated = 0 if self.setup.calibrations else self.setup.rules.calibrate_revolutions
         if calibration is None:
             raise RefusedError(too_short(len(self.vectors), calibrated + LEAST_JUDGED, self.setup))
         last = self._last_look()

@@ -55,7 +55,8 @@ class RotorSetup:
         keyphasor: the keyphasor, if there is one.
         follow_orbit: take speed and angle from the orbit's own 1X, about ``speed_rpm``.
         rules: of calibration, departure and naming.
-        calibration: of an earlier time; made of the first revolutions if None.
+        calibrations: healthy states of an earlier time, each at another speed, of which the measured speed
+            chooses; without any the first revolutions are the healthy state.
         ac_coupled: whether the probes lack their mean position.
         channels: what a channel is called in the file, where that is not its name here.
         rate_hz: samples per second; None: what the file says.
@@ -73,7 +74,7 @@ class RotorSetup:
     keyphasor: Keyphasor | None = None
     follow_orbit: bool = False
     rules: WatchRules = field(default_factory=lambda: WatchRules(retry=False))
-    calibration: Calibration | None = None
+    calibrations: tuple[Calibration, ...] = ()
     ac_coupled: bool = False
     channels: Mapping[str, str] = field(default_factory=dict)
     rate_hz: float | None = None

@@ -74,12 +74,12 @@ def speed_of(
         return _keyphasor_speed(recording, setup, setup.keyphasor, samples[:, 2], quality)
     assert setup.speed_rpm is not None  # noqa: S101 - see RotorSetup
     revolutions = len(samples) * abs(setup.speed_rpm) / 60.0 / recording.rate_hz
-    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    needed = LEAST_JUDGED + (0 if setup.calibrations else setup.rules.calibrate_revolutions)
     if revolutions < needed:
         raise RefusedError(too_short(revolutions, needed, setup))
     if setup.follow_orbit:
         return Speed(setup.speed_rpm), quality
-    if setup.calibration is not None:
+    if setup.calibrations:
         quality = quality.with_problem(
             "without a keyphasor the phases of the calibration hold only if this recording begins at the "
             "same shaft angle as the healthy one"
@@ -90,9 +90,9 @@ def speed_of(
 def too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:
     """Why a recording of so many revolutions is refused."""
     made_of = (
-        f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
-        if setup.calibration is None
-        else "to judge"
+        "to judge"
+        if setup.calibrations
+        else f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
     )
     return (
         f"the recording is too short: {revolutions:.1f} revolutions, at least {needed} are needed "
@@ -147,7 +147,7 @@ def _keyphasor_speed(
     places = np.array([sample + fraction for sample, fraction in edges])
     found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
     rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
-    needed = LEAST_JUDGED + (setup.rules.calibrate_revolutions if setup.calibration is None else 0)
+    needed = LEAST_JUDGED + (0 if setup.calibrations else setup.rules.calibrate_revolutions)
     if len(edges) - 1 < needed:
         raise RefusedError(too_short(len(edges) - 1, needed, setup))
     if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:

@@ -10,6 +10,7 @@ import numpy as np
 
 from daqsvc.diagnosis.probe_checks import Verdict
 from daqsvc.diagnosis.probe_quality import blind_probe
+from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
     Complexes = NDArray[np.complex128]
 
-SPEED_TOLERANCE = 0.05
-"""A revolution at a speed farther from the calibrated one is not judged: its healthy 1X is another."""
 _LENGTHS = (4, 8, 12, 32)
 """Revolutions looked at together: short for what is clear, before a change gets a name; long for noise."""
 _SLIP_LENGTH = 12

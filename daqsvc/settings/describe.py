@@ -191,7 +191,8 @@ def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
     healthy = (
         f"the first {synchronous.calibrate_revolutions} revolutions are the healthy state, kept over restarts"
         if synchronous.calibration is None
-        else f"healthy state in {synchronous.calibration}"
+        else f"healthy state in {synchronous.calibration} (that of the first "
+        f"{synchronous.calibrate_revolutions} revolutions if a run-up is all that it holds)"
     )
     parts = [
         f"{', '.join(others)} and {last}",

@@ -35,7 +35,9 @@ class RotorSynchronous(Section):
         description="first revolutions, which are the healthy state without calibration; kept over restarts",
     )
     calibration: Annotated[Path, Field(strict=False)] | None = Field(
-        default=None, description="file with the healthy state, in place of the first revolutions"
+        default=None,
+        description="file of daqsvc calibrate: the rotor, and the healthy state in place of the first "
+        "revolutions unless it holds a run-up only",
     )
     false_alarms_per_1000_rev: Annotated[float, Field(ge=1e-9, le=10)] = Field(
         default=0.1, description="accepted on a healthy machine"

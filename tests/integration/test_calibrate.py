@@ -140,6 +140,20 @@ def test_a_run_up_and_two_speeds_make_one_file(tmp_path: Path, capsys) -> None:
     assert verdict["calibration"]["revolutions"] == slow.revolutions
 
 
+def test_a_recording_chooses_its_baseline_by_the_speed_that_its_keyphasor_measures(
+    tmp_path: Path, capsys
+) -> None:
+    out = tmp_path / "rotor.toml"
+    slow, fast, between = (save(tmp_path / f"{hz:g}.npz", steady(hz), RATE_HZ) for hz in (30.0, 50.0, 40.0))
+    assert calibrate(capsys, slow, fast, *OPTIONS, *ROTOR, "--out", out)[0] == 0
+    code = main(["analyze", slow, fast, between, *OPTIONS, "--calibration", str(out), "--json"])
+    assert code == 3
+    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [one["verdict"] for one in found[:2]] == ["normal", "normal"]
+    assert [round(one["calibration"]["speed_rpm"]) for one in found[:2]] == [1800, 3000]
+    assert "no baseline within 5 % of 2400.0 rpm, but at 1800.0, 3000.0 rpm" in found[2]["refused"]
+
+
 def test_a_person_reads_what_was_found_and_what_cannot_be_told_apart(tmp_path: Path, capsys) -> None:
     out = tmp_path / "rotor.toml"
     recording = save(tmp_path / "slow.npz", steady(30.0), RATE_HZ)

@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
+from run_ups import RATE_HZ, record
 
 from daqsvc import assembly
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
-from daqsvc.rotor.calibration.file import save_calibration
+from daqsvc.rotor.calibration.file import CalibrationRecord, save_calibration, save_record
+from daqsvc.rotor.calibration.run_up import fit_run_up
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.settings import describe, parse_machine_file
@@ -178,3 +180,40 @@ def test_a_kept_healthy_state_is_used_with_what_the_file_says_of_the_rotor_now(t
     path.write_text("rubbish = 1", encoding="utf-8")
     assert kept().state == "calibrating"
     assert "measured anew" in caplog.text
+
+
+def test_a_run_up_tells_the_rotor_and_the_healthy_state_is_learnt_live(tmp_path):
+    fit = fit_run_up(*record(5.0), RATE_HZ)
+    rotor = fit.rotor(clearance_um=400.0, static_sag_um=150.0)
+    save_record(CalibrationRecord(rotor=rotor, run_up=fit, run_up_source="up.npz"), tmp_path / "up.toml")
+    text, _ = changed(EXAMPLE, ("probe_drift_um = 0.0", 'calibration = "up.toml"'))
+    given = parse_machine_file(text, tmp_path / "m.toml")
+    assert "that of the first 50 revolutions if a run-up is all that it holds" in " ".join(
+        describe(given).split()
+    )
+    store = tmp_path / "store"
+    store.mkdir()
+
+    def watch():
+        made = assembly.detectors(given, store)
+        return next(d for d in made if isinstance(d, RotorSynchronousDetector)).watch
+
+    learning = watch()
+    assert (learning.state, learning.calibration) == ("calibrating", None)
+    assert learning.rotor.natural_frequency_hz == fit.natural_frequency_hz == pytest.approx(40.0, rel=1e-3)
+    assert learning.rotor.natural_frequency_tolerance == 0.02
+    assert learning.rotor.clearance_um == 100.0, "that of the machine file"
+    # What was learnt is kept, and comes back with the rotor of the run-up.
+    kept = Calibration(
+        rotor=LavalRotor(natural_frequency_hz=31.0, damping_ratio=0.1),
+        speed_rpm=1500.0,
+        revolutions=50,
+        baseline=np.array([-10j, 16.0, 0.1, 0.0, 0.0]),
+        variance=np.full(5, 0.01),
+        noise=0.5,
+        noise_variance=0.02,
+        samples_per_rev=64.0,
+    )
+    save_calibration(kept, store / "rotor-synchronous.toml")
+    assert watch().state == "watching"
+    assert watch().calibration.rotor == learning.rotor

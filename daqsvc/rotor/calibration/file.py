@@ -1,6 +1,7 @@
 """Calibrations on disk: a TOML file that a person can read, and that comes back to the last bit.
 
-`load_calibration` reads the healthy machine at one speed; `load_record` reads everything that a file holds.
+`load_calibration` reads the healthy machine at one speed, `load_healthy` as far as the file knows it, and
+`load_record` everything that a file holds.
 """
 
 from __future__ import annotations
@@ -8,13 +9,14 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daqsvc.rotor.calibration.reading import CalibrationFileError, Table
+from daqsvc.rotor.calibration.record import CalibrationRecord
 from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
@@ -27,6 +29,7 @@ __all__ = [
     "CalibrationFileError",
     "CalibrationRecord",
     "load_calibration",
+    "load_healthy",
     "load_record",
     "parse_record",
     "record_text",
@@ -35,9 +38,6 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
-
-SPEED_TOLERANCE = 0.05
-"""A baseline holds for speeds that differ by no more than this part: beyond, 1X itself is another."""
 
 _COMPONENTS = (
     "mean_position_um",
@@ -51,54 +51,6 @@ _PREAMBLE = """\
 # The healthy machine, as `daqsvc calibrate` saw it. Lengths in um, angles in degrees from the keyphasor's
 # mark in the direction of rotation (x is mirrored if the shaft turns clockwise). +- is a standard deviation.
 """
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationRecord:
-    """What is known about a healthy machine.
-
-    Attributes:
-        rotor: the rotor, as it was given or as the run-up shows it.
-        steady: baselines, one for each speed.
-        steady_sources: the recording that each baseline comes from.
-        run_up: what a run-up showed, if there was one.
-        run_up_source: the recording of it.
-        written: label of the date, ISO 8601; empty if not known.
-    """
-
-    rotor: LavalRotor
-    steady: tuple[Calibration, ...] = ()
-    steady_sources: tuple[str, ...] = ()
-    run_up: RunUpFit | None = None
-    run_up_source: str = ""
-    written: str = ""
-
-    def at(self, speed_rpm: float | None = None) -> Calibration:
-        """The baseline of a speed.
-
-        Args:
-            speed_rpm: shaft speed of either sign; may be left out if there is one baseline only.
-
-        Raises:
-            ValueError: there is none of that speed, or several and no speed was given.
-        """
-        speeds = ", ".join(f"{calibration.speed_rpm:.1f}" for calibration in self.steady)
-        if not self.steady:
-            raise ValueError(
-                "the calibration holds a run-up only and no steady baseline; calibrate again with a "
-                "recording at the speed that is watched"
-            )
-        if speed_rpm is None:
-            if len(self.steady) > 1:
-                raise ValueError(f"the calibration holds baselines at {speeds} rpm; say at which speed")
-            return self.steady[0]
-        nearest = min(self.steady, key=lambda one: abs(one.speed_rpm - abs(speed_rpm)))
-        if abs(abs(speed_rpm) / nearest.speed_rpm - 1.0) > SPEED_TOLERANCE:
-            raise ValueError(
-                f"the calibration holds no baseline within {100.0 * SPEED_TOLERANCE:.0f} % of "
-                f"{abs(speed_rpm):.1f} rpm, but at {speeds} rpm; calibrate at that speed"
-            )
-        return nearest
 
 
 def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibration:
@@ -116,6 +68,36 @@ def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibr
         return record.at(speed_rpm)
     except ValueError as error:
         raise CalibrationFileError(f"{path}: {error}") from None
+
+
+def load_healthy(
+    path: Path | str, speed_rpm: float | None, clearance_um: float | None = None
+) -> tuple[LavalRotor, tuple[Calibration, ...]]:
+    """What a file says about the healthy machine, at one speed or at any.
+
+    Args:
+        path: the file.
+        speed_rpm: shaft speed of either sign; None where it is not known yet.
+        clearance_um: radial clearance, in place of the file's.
+
+    Returns:
+        The rotor, and the baseline of the speed, or of every speed if it is not known. None at all if the
+        file holds a run-up only: the first revolutions have to be the baseline then.
+
+    Raises:
+        CalibrationFileError: the file cannot be read or used, or has baselines, but none of that speed.
+    """
+    record = load_record(path)
+    rotor, baselines = record.rotor, record.steady
+    if baselines and speed_rpm is not None:
+        try:
+            baselines = (record.at(speed_rpm),)
+        except ValueError as error:
+            raise CalibrationFileError(f"{path}: {error}") from None
+    if clearance_um is not None:
+        rotor = replace(rotor, clearance_um=clearance_um)
+        baselines = tuple(replace(baseline, rotor=rotor) for baseline in baselines)
+    return rotor, baselines
 
 
 def load_record(path: Path | str) -> CalibrationRecord:

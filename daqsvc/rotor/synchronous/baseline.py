@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 LEAST_REVOLUTIONS = 20
+SPEED_TOLERANCE = 0.05
+"""A baseline holds for speeds that differ by no more than this part: beyond, 1X itself is another."""
 
 _FLOOR = 0.002
 """Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
