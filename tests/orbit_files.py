@@ -19,7 +19,7 @@ AMPLITUDE_UM = 40.0
 SAG_UM = 12.0
 NOISE_UM = 1.0
 ONSET = 80.25
-"""In revolutions. Not at a mark: the rounding of a stated speed would decide which revolution it falls into."""
+"""In revolutions; not at a mark, where the rounding of the stated speed decides which one it falls into."""
 
 OPTIONS = (
     *("--probes", "x,y", "--speed-rpm", f"{SPEED_RPM:g}", "--natural-frequency-hz", "60"),

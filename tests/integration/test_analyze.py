@@ -86,7 +86,7 @@ def test_a_growing_unbalance_is_found_and_placed(analyze: Callable[..., Any], tm
     assert found["calibration"]["noise_um"] == pytest.approx(1.0, rel=0.1)
     assert found["calibration"]["revolutions"] == 50
     assert found["speed_rpm"] == pytest.approx(SPEED_RPM)
-    assert found["revolutions"] == 120
+    assert found["revolutions"] in {119, 120}
     assert found["history"][0] == {"revolution": 81, "verdict": None, "group": [], "named": False}
     assert found["history"][-1]["named"] is True
     assert found["refused"] is None
