@@ -10,17 +10,7 @@ import numpy as np
 from daqsvc.rotor import kernels, sweep
 from daqsvc.rotor.decision import DecisionRules, Declaration
 from daqsvc.rotor.discretise import BankMode, at_speed, discretise
-from daqsvc.rotor.lanes import (
-    FREE,
-    PAPER,
-    THRESHOLD,
-    new_desk,
-    new_lanes,
-    set_constants,
-    set_each,
-    set_states,
-    states,
-)
+from daqsvc.rotor.lanes import FREE, PAPER, BankMemory
 from daqsvc.rotor.likeness import alike
 from daqsvc.rotor.report import BankReport
 
@@ -79,14 +69,12 @@ class ModelBank:
         if not UNDETERMINED <= decision < count:
             raise ValueError(f"rotor bank: there is no mode {decision}; the {count} modes count from 0")
         self._duration = duration
-        self._lanes = new_lanes(self.observers, self.rules.log_priors(names))
-        self._rubs = np.flatnonzero(self.observers["substeps"]).astype(np.int64)
-        self._pairs = np.zeros((2, count, count))
-        self._desk = new_desk(
+        self._memory = BankMemory.new(self.observers, self.rules.log_priors(names))
+        self._memory.set_rules(
             self.rules,
-            decision=decision,
-            usable_squared=(kernels.ESCAPE_RADIUS + 6.0 * noise) ** 2,
+            noise=noise,
             samples_per_rev=max(1, round(2.0 * math.pi / (speed * duration))),
+            decision=decision,
         )
         self._compare()
         self.reseed()
@@ -94,16 +82,14 @@ class ModelBank:
     @property
     def decision(self) -> int:
         """Index of the declared mode, -1 while undetermined."""
-        return int(self._desk["paper_decision" if self.rules.rule == "paper" else "decision"][0])
+        return int(self._memory.desk["paper_decision" if self.rules.rule == "paper" else "decision"])
 
     def reseed(self) -> None:
         """Start every observer anew, for instance after a long gap; the decision is held.
 
         The revolution that they need to find the machine is no evidence.
         """
-        sweep.start_anew(self.observers, self._lanes, self._pairs, self._desk)
-        # As after a gap: the settling begins with the first sample that is usable.
-        self._desk["unusable"] = self._desk["samples_per_rev"] + 1
+        sweep.start_anew(self._memory.memory)
 
     def retune(self, speed: float, angle_rad: float) -> None:
         """Follow the shaft to another speed: the reference orbits move, the estimates do not.
@@ -119,14 +105,12 @@ class ModelBank:
             raise ValueError(f"rotor bank: normalised speed {speed} is not one of a shaft that keeps turning")
         moved = at_speed(self.observers, self.modes, speed, duration=self._duration)
         for fields in (FREE, PAPER):
-            estimates = states(self._lanes, fields, len(self.modes))
-            kernels.change_orbits(
-                self.observers, moved, math.cos(angle_rad), math.sin(angle_rad), estimates
-            )
-            set_states(self._lanes, fields, estimates)
+            states = self._memory.states(fields)
+            kernels.change_orbits(self.observers, moved, math.cos(angle_rad), math.sin(angle_rad), states)
+            self._memory.set_states(fields, states)
         self.observers = moved
         self.speed = speed
-        set_constants(self._lanes, moved)
+        self._memory.set_observers(moved)
         self._compare()
 
     def process(self, xy: Floats, cos: Floats, sin: Floats) -> BankReport:
@@ -146,22 +130,21 @@ class ModelBank:
         cos = np.ascontiguousarray(cos, dtype=np.float64)
         sin = np.ascontiguousarray(sin, dtype=np.float64)
         declarations: tuple[Declaration, ...] = ()
-        memory = (self.observers, self._lanes, self._rubs, self._pairs, self._desk)
-        end = sweep.advance(xy, cos, sin, 0, *memory)
+        memory = self._memory.memory
+        end = sweep.advance(xy, cos, sin, 0, memory)
         while end < 0:
             declarations += (self._declaration(-1 - end),)
-            end = sweep.advance(xy, cos, sin, -end, *memory)
-        return BankReport(declarations, self.rules, self._alike, self._lanes.tobytes(), self._desk.tobytes())
+            end = sweep.advance(xy, cos, sin, -end, memory)
+        return BankReport(declarations, self.rules, self._alike, self._memory.copy())
 
     def _declaration(self, sample: int) -> Declaration:
         """The change of the decision that is on the desk."""
-        previous, onset = int(self._desk["changed_from"][0]), int(self._desk["changed_onset"][0])
-        return Declaration(sample, self.decision, previous, onset)
+        desk = self._memory.desk
+        return Declaration(sample, self.decision, int(desk["changed_from"]), int(desk["changed_onset"]))
 
     def _compare(self) -> None:
         """See which modes look alike at the present speed: there is no change between them."""
         self._alike = alike(self.observers, self._duration, self.rules.alike_nats_per_rev)
-        self._pairs[THRESHOLD] = np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes)))
-        decision = int(self._desk["decision"][0])
-        if decision != UNDETERMINED:
-            set_each(self._lanes, "threshold", self._pairs[THRESHOLD, decision], math.inf)
+        self._memory.set_thresholds(
+            np.where(self._alike, math.inf, self.rules.thresholds(len(self.modes)))
+        )

@@ -1,6 +1,8 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
-A group of `LANES` holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane
+All that a bank knows lies in one piece, `BankMemory`, which is handed over, copied and compared as a whole:
+a desk (`DESK`), groups of lanes (`LANES`), the constants of the observers, the indices of those with rub, and
+evidence of pairs of modes. A group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane
 m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop
 over lanes into vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
 """
@@ -11,18 +13,24 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
+
+from daqsvc.rotor.discretise import OBSERVER
+from daqsvc.rotor.kernels import ESCAPE_RADIUS, UNDETERMINED
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from numpy.typing import NDArray
 
     from daqsvc.rotor.decision import DecisionRules
 
+    Bytes = NDArray[np.uint8]
     Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
     Ints = NDArray[np.int64]
     Observers = NDArray[np.void]
     Lanes = NDArray[np.void]
-    Desk = NDArray[np.void]
+    Desks = NDArray[np.void]
 
 WIDTH = 8
 """Lanes in a group: two or one vector registers of float64."""
@@ -52,6 +60,8 @@ LANES = np.dtype([*((name, np.float64, (WIDTH,)) for name in _FLOATS), ("age", n
 
 DESK = np.dtype(
     [
+        # what else there is: modes, groups of lanes, rub observers
+        ("modes", np.int64), ("groups", np.int64), ("rubs", np.int64),
         # rules
         ("usable_squared", np.float64), ("lead_limit", np.float64), ("first_threshold", np.float64),
         ("identity_nats", np.float64), ("settling_wait", np.int64), ("samples_per_rev", np.int64),
@@ -64,99 +74,179 @@ DESK = np.dtype(
         ("changed_from", np.int64), ("changed_onset", np.int64),
     ],
 )  # fmt: skip
-"""What a bank knows besides its lanes: an array of one."""
+"""What a bank knows besides its modes: an array of one."""
 
 THRESHOLD = 0
 """Of the pairs of modes: nats that change the decision from row to column, infinite where they look alike."""
 DUEL = 1
 """Of the pairs of modes: evidence of row over column, as long as there is no decision."""
 
+_DESK_BYTES = DESK.itemsize
+_LANES_BYTES = LANES.itemsize
+_OBSERVER_BYTES = OBSERVER.itemsize
+_WORD = 8
 
-def new_lanes(observers: Observers, log_prior: Floats) -> Lanes:
-    """Memory of a bank that has not seen anything yet.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sections(memory: Bytes) -> tuple[Desks, Lanes, Observers, Ints, Floats]:
+    """The parts of a bank's memory.
 
     Args:
-        observers: ``[M]`` of `discretise.OBSERVER`.
-        log_prior: float64 ``[M]``, logarithms of the probabilities that the paper's rule starts from.
+        memory: uint8 ``[n]``.
 
     Returns:
-        ``[ceil(M / WIDTH)]`` of `LANES`.
+        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER`, int64 ``[R]``, indices of the
+        rub observers, and float64 ``[2, M, M]``, `THRESHOLD` and `DUEL` of pairs of modes.
     """
-    lanes = np.zeros(math.ceil(len(observers) / WIDTH), dtype=LANES)
-    lanes["threshold"] = math.inf
-    set_each(lanes, "log_prior", log_prior, -math.inf)
-    lanes["log_odds"] = lanes["log_prior"]
-    set_constants(lanes, observers)
-    return lanes
+    desks = memory[:_DESK_BYTES].view(DESK)
+    modes = desks[0]["modes"]
+    lanes = _DESK_BYTES + desks[0]["groups"] * _LANES_BYTES
+    observers = lanes + modes * _OBSERVER_BYTES
+    rubs = observers + desks[0]["rubs"] * _WORD
+    return (
+        desks,
+        memory[_DESK_BYTES:lanes].view(LANES),
+        memory[lanes:observers].view(OBSERVER),
+        memory[observers:rubs].view(np.int64),
+        memory[rubs:].view(np.float64).reshape((2, modes, modes)),
+    )
 
 
-def set_constants(lanes: Lanes, observers: Observers) -> None:
-    """Take over the constants of observers; estimates and evidence stay.
-
-    The lane of a rub observer stands still in the vector loops and adds no evidence there; its own step
-    does both.
+class BankMemory:
+    """All that a bank of M modes knows, in one piece.
 
     Args:
-        lanes: memory of the bank.
-        observers: ``[M]`` of `discretise.OBSERVER`.
+        memory: uint8 ``[n]``, as `sections` has it; see `new` for one of a new bank.
+
+    Attributes:
+        memory: the same.
     """
-    linear = observers["substeps"] == 0
-    for name in _SAME:
-        set_each(lanes, name, observers[name])
-    drive_x = observers["xx"] * observers["gain_x"] + observers["xv"] * observers["gain_v"]
-    drive_v = observers["vx"] * observers["gain_x"] + observers["vv"] * observers["gain_v"]
-    set_each(lanes, "closed_xx", np.where(linear, observers["xx"] - drive_x, 1.0))
-    set_each(lanes, "closed_xv", np.where(linear, observers["xv"], 0.0))
-    set_each(lanes, "closed_vx", np.where(linear, observers["vx"] - drive_v, 0.0))
-    set_each(lanes, "closed_vv", np.where(linear, observers["vv"], 1.0))
-    set_each(lanes, "drive_x", np.where(linear, drive_x, 0.0))
-    set_each(lanes, "drive_v", np.where(linear, drive_v, 0.0))
-    set_each(lanes, "weight", np.where(linear, -0.5 * observers["precision"], 0.0))
-    set_each(lanes, "log_norm", np.where(linear, observers["log_norm"], 0.0), math.inf)
 
+    __slots__ = ("memory",)
 
-def new_desk(rules: DecisionRules, *, decision: int, usable_squared: float, samples_per_rev: int) -> Desk:
-    """The desk of a bank.
+    def __init__(self, memory: Bytes) -> None:
+        self.memory = memory
 
-    Args:
-        rules: thresholds and the rule that declares.
-        decision: index of the mode that is known to be true at the start, or -1.
-        usable_squared: square of the distance from the centre beyond which a sample is wrong, clearances.
-        samples_per_rev: samples in a revolution.
-    """
-    desk = np.zeros(1, dtype=DESK)
-    desk["usable_squared"] = usable_squared
-    desk["lead_limit"] = _LEAD_LIMIT * rules.threshold_nats
-    desk["first_threshold"] = rules.threshold_nats
-    desk["identity_nats"] = rules.identity_nats
-    desk["settling_wait"] = round(rules.settle_revolutions * samples_per_rev)
-    desk["samples_per_rev"] = samples_per_rev
-    # P(leader) > p takes odds of p / (1 - p) over every other mode, and all modes' sum below 1 / p.
-    desk["odds_bar"] = math.log(rules.probability_threshold / (1.0 - rules.probability_threshold))
-    desk["largest_total"] = 1.0 / rules.probability_threshold
-    desk["by_paper"] = rules.rule == "paper"
-    desk["decision"] = desk["paper_decision"] = desk["changed_from"] = decision
-    return desk
+    @classmethod
+    def new(cls, observers: Observers, log_prior: Floats) -> Self:
+        """Memory of a bank that has not seen anything yet.
 
+        Args:
+            observers: ``[M]`` of `discretise.OBSERVER`.
+            log_prior: float64 ``[M]``, logarithms of the probabilities that the paper's rule starts from.
+        """
+        count = len(observers)
+        groups = math.ceil(count / WIDTH)
+        rubs = np.flatnonzero(observers["substeps"]).astype(np.int64)
+        size = _DESK_BYTES + groups * _LANES_BYTES + count * _OBSERVER_BYTES
+        memory = np.zeros(size + (len(rubs) + 2 * count**2) * _WORD, dtype=np.uint8)
+        desk = memory[:_DESK_BYTES].view(DESK)
+        desk["modes"], desk["groups"], desk["rubs"] = count, groups, len(rubs)
+        subject = cls(memory)
+        subject._sections()[3][:] = rubs
+        subject.lanes["threshold"] = math.inf
+        subject.put("log_prior", log_prior, -math.inf)
+        subject.put("log_odds", log_prior, -math.inf)
+        subject.set_observers(observers)
+        return subject
 
-def each(lanes: Lanes, name: str, count: int) -> Floats:
-    """A figure of each mode, float64 ``[M]`` (int64 for ``age``); a copy if there are several groups."""
-    return np.asarray(lanes[name].reshape(-1)[:count])
+    def copy(self) -> BankMemory:
+        """The memory as it is now."""
+        return BankMemory(self.memory.copy())
 
+    @property
+    def desk(self) -> np.void:
+        """The desk, one of `DESK`."""
+        return self._sections()[0][0]
 
-def states(lanes: Lanes, fields: tuple[str, ...], count: int) -> Floats:
-    """Deviations of the estimates, float64 ``[M, 4]``, of `FREE` or `PAPER`."""
-    return np.stack([each(lanes, name, count) for name in fields], axis=1)
+    @property
+    def lanes(self) -> Lanes:
+        """Observers and evidence, ``[G]`` of `LANES`."""
+        return self._sections()[1]
 
+    @property
+    def observers(self) -> Observers:
+        """Constants of the observers, ``[M]`` of `discretise.OBSERVER`; see `set_observers`."""
+        return self._sections()[2]
 
-def set_states(lanes: Lanes, fields: tuple[str, ...], values: Floats) -> None:
-    """Put deviations ``[M, 4]`` back."""
-    for column, name in enumerate(fields):
-        set_each(lanes, name, values[:, column])
+    @property
+    def pairs(self) -> Floats:
+        """Evidence of pairs of modes, float64 ``[2, M, M]``: `THRESHOLD` and `DUEL`."""
+        return self._sections()[4]
 
+    def each(self, name: str) -> Floats:
+        """A figure of each mode, float64 ``[M]`` (int64 for ``age``), copied."""
+        return np.array(self.lanes[name].reshape(-1)[: int(self.desk["modes"])])
 
-def set_each(lanes: Lanes, name: str, values: Floats, rest: float = 0.0) -> None:
-    """Set a figure of each mode, float64 ``[M]``; lanes without a mode get ``rest``."""
-    padded = np.full(len(lanes) * WIDTH, rest)
-    padded[: len(values)] = values
-    lanes[name] = padded.reshape(len(lanes), WIDTH)
+    def put(self, name: str, values: Floats, rest: float = 0.0) -> None:
+        """Set a figure of each mode, float64 ``[M]``; lanes without a mode get ``rest``."""
+        lanes = self.lanes
+        padded = np.full(len(lanes) * WIDTH, rest)
+        padded[: len(values)] = values
+        lanes[name] = padded.reshape(len(lanes), WIDTH)
+
+    def states(self, fields: tuple[str, ...]) -> Floats:
+        """Deviations of the estimates, float64 ``[M, 4]``, of `FREE` or `PAPER`; copied."""
+        return np.stack([self.each(name) for name in fields], axis=1)
+
+    def set_states(self, fields: tuple[str, ...], values: Floats) -> None:
+        """Put deviations ``[M, 4]`` back."""
+        for column, name in enumerate(fields):
+            self.put(name, values[:, column])
+
+    def set_observers(self, observers: Observers) -> None:
+        """Take over the constants of observers; estimates and evidence stay.
+
+        The lane of a rub observer stands still in the vector loops and adds no evidence there; its own step
+        does both.
+
+        Args:
+            observers: ``[M]`` of `discretise.OBSERVER`, with rub where there was.
+        """
+        self._sections()[2][:] = observers
+        linear = observers["substeps"] == 0
+        for name in _SAME:
+            self.put(name, observers[name])
+        drive_x = observers["xx"] * observers["gain_x"] + observers["xv"] * observers["gain_v"]
+        drive_v = observers["vx"] * observers["gain_x"] + observers["vv"] * observers["gain_v"]
+        self.put("closed_xx", np.where(linear, observers["xx"] - drive_x, 1.0))
+        self.put("closed_xv", np.where(linear, observers["xv"], 0.0))
+        self.put("closed_vx", np.where(linear, observers["vx"] - drive_v, 0.0))
+        self.put("closed_vv", np.where(linear, observers["vv"], 1.0))
+        self.put("drive_x", np.where(linear, drive_x, 0.0))
+        self.put("drive_v", np.where(linear, drive_v, 0.0))
+        self.put("weight", np.where(linear, -0.5 * observers["precision"], 0.0))
+        self.put("log_norm", np.where(linear, observers["log_norm"], 0.0), math.inf)
+
+    def set_rules(self, rules: DecisionRules, *, noise: float, samples_per_rev: int, decision: int) -> None:
+        """Put the rules on the desk, and the decision to begin with.
+
+        Args:
+            rules: thresholds and the rule that declares.
+            noise: standard deviation of the measured position, in clearances.
+            samples_per_rev: samples in a revolution.
+            decision: index of the mode that is known to be true at the start, or -1.
+        """
+        desk = self.desk
+        desk["usable_squared"] = (ESCAPE_RADIUS + 6.0 * noise) ** 2
+        desk["lead_limit"] = _LEAD_LIMIT * rules.threshold_nats
+        desk["first_threshold"] = rules.threshold_nats
+        desk["identity_nats"] = rules.identity_nats
+        desk["settling_wait"] = round(rules.settle_revolutions * samples_per_rev)
+        desk["samples_per_rev"] = samples_per_rev
+        # P(leader) > p takes odds of p / (1 - p) over every other mode, and all modes' sum below 1 / p.
+        desk["odds_bar"] = math.log(rules.probability_threshold / (1.0 - rules.probability_threshold))
+        desk["largest_total"] = 1.0 / rules.probability_threshold
+        desk["by_paper"] = rules.rule == "paper"
+        desk["decision"] = desk["paper_decision"] = desk["changed_from"] = decision
+
+    def set_thresholds(self, thresholds: Floats) -> None:
+        """Set what it takes to change the decision, float64 ``[M, M]``, infinite where modes look alike."""
+        self.pairs[THRESHOLD] = thresholds
+        decision = int(self.desk["decision"])
+        if decision != UNDETERMINED:
+            self.put("threshold", thresholds[decision], math.inf)
+
+    def _sections(self) -> tuple[Desks, Lanes, Observers, Ints, Floats]:
+        parts: tuple[Desks, Lanes, Observers, Ints, Floats] = sections.py_func(self.memory)
+        return parts

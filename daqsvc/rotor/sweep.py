@@ -14,7 +14,7 @@ from numba import njit
 
 from daqsvc.rotor.cusum import first_verdict, gather, next_verdict, stand_by
 from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
-from daqsvc.rotor.lanes import DUEL, WIDTH
+from daqsvc.rotor.lanes import DUEL, WIDTH, sections
 
 if TYPE_CHECKING:
     from typing import Any
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    Bytes = NDArray[np.uint8]
     Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
     Observers = NDArray[np.void]
     Lanes = NDArray[np.void]
-    Desks = NDArray[np.void]
-    Group = Any  # one element of Lanes: numba makes a record of it
+    Observer = Any  # one element of Observers: numba makes a record of it
+    Group = Any
     Desk = Any
     State = tuple[float, float, float, float]
 
@@ -58,23 +58,17 @@ def _set_paper(group: Group, lane: int, state: State) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _width(lanes: Lanes, group: int, count: int) -> int:
+def _width(group: int, count: int) -> int:
     """Lanes of a group that are worth stepping."""
     return min(WIDTH, (count - group * WIDTH + _REGISTER - 1) // _REGISTER * _REGISTER)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def start_anew(observers: Observers, lanes: Lanes, pairs: Floats, desks: Desks) -> None:
+def _forget(observers: Observers, lanes: Lanes, pairs: Floats, desk: Desk) -> None:
     """Forget estimates and evidence; the decision is held.
 
     Linear observers start on their own orbits, rub observers on the healthy one. The revolution that
     they need to find the machine is no evidence.
-
-    Args:
-        observers: ``[M]`` of `discretise.OBSERVER`.
-        lanes: memory of the bank.
-        pairs: float64 ``[2, M, M]``.
-        desks: ``[1]`` of `lanes.DESK`.
     """
     for m in range(len(observers)):
         # NaN means lost: the guard puts a rub observer onto the healthy orbit at once.
@@ -86,10 +80,21 @@ def start_anew(observers: Observers, lanes: Lanes, pairs: Floats, desks: Desks) 
         lanes[g].age[:] = 0
         lanes[g].log_odds[:] = lanes[g].log_prior
     pairs[DUEL] = 0.0
-    desk = desks[0]
     desk.departed = 0
     desk.paper_age = 0
     desk.settling = desk.samples_per_rev
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def start_anew(memory: Bytes) -> None:
+    """Start every observer of a bank anew with the next sample that is usable, as after a long gap.
+
+    Args:
+        memory: uint8 ``[n]``, see `lanes.sections`; changed in place.
+    """
+    desks, lanes, observers, _, pairs = sections(memory)
+    _forget(observers, lanes, pairs, desks[0])
+    desks[0].unusable = desks[0].samples_per_rev + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -135,14 +140,15 @@ def _step_paper(group: Group, width: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _observe_rub(observers: Observers, mode: int, group: Group, cos: float, sin: float) -> None:
+def _observe_rub(
+    observer: Observer, healthy: Observer, group: Group, lane: int, cos: float, sin: float
+) -> None:
     """A rub observer with both rules: the free-running one is stepped, the paper's corrected."""
-    lane, observer = mode % WIDTH, observers[mode]
     z_x, z_y = group.z_x[lane], group.z_y[lane]
-    state = guarded(observer, observers[0], cos, sin, _free(group, lane))
+    state = guarded(observer, healthy, cos, sin, _free(group, lane))
     state, group.score[lane] = correct(observer, z_x, z_y, state)
     _set_free(group, lane, predict_rub(observer, cos, sin, state))
-    state = guarded(observer, observers[0], cos, sin, _paper(group, lane))
+    state = guarded(observer, healthy, cos, sin, _paper(group, lane))
     state, group.paper_score[lane] = correct(observer, z_x, z_y, state)
     _set_paper(group, lane, state)
 
@@ -162,18 +168,10 @@ def _coast(observers: Observers, lanes: Lanes, cos: float, sin: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _weigh(lanes: Lanes, pairs: Floats, desk: Desk) -> int:
-    """One sample's evidence by the CUSUM; the mode that it changes its decision to, or -1."""
+    """What the CUSUM makes of evidence that is enough; the mode that it changes its decision to, or -1."""
     if desk.decision == UNDETERMINED:
         desk.departed = 0
         return first_verdict(lanes, pairs, desk.first_threshold)
-    count = pairs.shape[1]
-    own = lanes[desk.decision // WIDTH].score[desk.decision % WIDTH]
-    enough = 0
-    for g in range(len(lanes)):
-        enough += gather(lanes[g], own, desk.lead_limit, _width(lanes, g, count))
-    if not enough:
-        desk.departed = 0
-        return UNDETERMINED
     suspect, winner = next_verdict(lanes, pairs, desk)
     departs = suspect != UNDETERMINED and winner == UNDETERMINED
     desk.departed = desk.departed + 1 if departs else 0
@@ -195,30 +193,20 @@ def _believe_group(group: Group, top: float, bar: float, width: int) -> tuple[in
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _believe(lanes: Lanes, count: int, desk: Desk) -> int:
-    """One sample's evidence by the paper's rule; the mode that passes the threshold, or -1.
-
-    One other mode that is close enough to the leader keeps it below the threshold; the exponentials of the
-    normaliser are needed only if there is none.
-    """
-    group, lane = lanes[desk.paper_leader // WIDTH], desk.paper_leader % WIDTH
-    top = group.log_odds[lane] + group.paper_score[lane]
-    near, above = 0, 0
-    for g in range(len(lanes)):
-        more = _believe_group(lanes[g], top, desk.odds_bar, _width(lanes, g, count))
-        near, above = near + more[0], above + more[1]
-    if above:
-        for m in range(count):
-            if lanes[m // WIDTH].log_odds[m % WIDTH] > top:
-                desk.paper_leader, top = m, lanes[m // WIDTH].log_odds[m % WIDTH]
-    elif near > 1:
-        if top < _DRIFT:
-            for g in range(len(lanes)):
-                lanes[g].log_odds[:] -= top
-        return UNDETERMINED
+    """The mode that passes the paper's threshold, or -1."""
+    leader = desk.paper_leader
+    top = lanes[leader // WIDTH].log_odds[leader % WIDTH]
+    for m in range(count):
+        if lanes[m // WIDTH].log_odds[m % WIDTH] > top:
+            leader, top = m, lanes[m // WIDTH].log_odds[m % WIDTH]
     total = 0.0
     for m in range(count):
         total += math.exp(lanes[m // WIDTH].log_odds[m % WIDTH] - top)
-    return desk.paper_leader if total < desk.largest_total else UNDETERMINED
+    if top < _DRIFT:
+        for g in range(len(lanes)):
+            lanes[g].log_odds[:] -= top
+    desk.paper_leader = leader
+    return leader if total < desk.largest_total else UNDETERMINED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -238,17 +226,7 @@ def _hand_over(observers: Observers, lanes: Lanes, cos: float, sin: float, decla
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(
-    xy: Floats,
-    cos: Floats,
-    sin: Floats,
-    begin: int,
-    observers: Observers,
-    lanes: Lanes,
-    rubs: Ints,
-    pairs: Floats,
-    desks: Desks,
-) -> int:
+def advance(xy: Floats, cos: Floats, sin: Floats, begin: int, memory: Bytes) -> int:
     """Run a bank over a block, up to the next change of its decision.
 
     Both rules run side by side, each over its own estimates. The paper's (section V): conditional
@@ -261,15 +239,12 @@ def advance(
         cos: float64 ``[n]``, cosine of the shaft angle; NaN: not known.
         sin: float64 ``[n]``, its sine.
         begin: sample to begin at; not 0 to go on with a block after a change.
-        observers: ``[M]`` of `discretise.OBSERVER`.
-        lanes: memory of the bank, changed in place.
-        rubs: int64 ``[R]``, indices of the rub observers.
-        pairs: float64 ``[2, M, M]``, see `lanes.THRESHOLD` and `lanes.DUEL`, changed in place.
-        desks: ``[1]`` of `lanes.DESK`, changed in place.
+        memory: uint8 ``[n]``, the bank's, see `lanes.sections`; changed in place.
 
     Returns:
         ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
     """
+    desks, lanes, observers, rubs, pairs = sections(memory)
     desk, count = desks[0], len(observers)
     if begin == 0:
         desk.paper_declarations = 0
@@ -278,12 +253,13 @@ def advance(
         usable = x * x + y * y < desk.usable_squared and math.isfinite(c + s)
         if usable:
             if desk.unusable > desk.samples_per_rev:
-                start_anew(observers, lanes, pairs, desks)
+                _forget(observers, lanes, pairs, desk)
             desk.unusable = 0
             for g in range(len(lanes)):
-                _observe(lanes[g], x, y, c, s, _width(lanes, g, count))
+                _observe(lanes[g], x, y, c, s, _width(g, count))
             for r in range(len(rubs)):
-                _observe_rub(observers, rubs[r], lanes[rubs[r] // WIDTH], c, s)
+                m = rubs[r]
+                _observe_rub(observers[m], observers[0], lanes[m // WIDTH], m % WIDTH, c, s)
         else:
             desk.unusable += 1
             _coast(observers, lanes, c, s)
@@ -294,13 +270,31 @@ def advance(
                 lanes[g].score[:] = 0.0
 
         previous, paper_previous = desk.decision, desk.paper_decision
-        winner = _weigh(lanes, pairs, desk)
-        onset = 0
+        enough = int(previous == UNDETERMINED)
+        if previous != UNDETERMINED:
+            own = lanes[previous // WIDTH].score[previous % WIDTH]
+            for g in range(len(lanes)):
+                enough += gather(lanes[g], own, desk.lead_limit, _width(g, count))
+        winner, onset = UNDETERMINED, 0
+        if enough:
+            winner = _weigh(lanes, pairs, desk)
+        else:
+            desk.departed = 0
         if winner != UNDETERMINED:
             onset = k + 1 - lanes[winner // WIDTH].age[winner % WIDTH]
             stand_by(winner, lanes, pairs, desk)
 
-        declared = _believe(lanes, count, desk) if counts else UNDETERMINED
+        declared = UNDETERMINED
+        if counts:
+            group, lane = lanes[desk.paper_leader // WIDTH], desk.paper_leader % WIDTH
+            top = group.log_odds[lane] + group.paper_score[lane]
+            near, above = 0, 0
+            for g in range(len(lanes)):
+                more = _believe_group(lanes[g], top, desk.odds_bar, _width(g, count))
+                near, above = near + more[0], above + more[1]
+            # One other mode close to the leader keeps it below the threshold: no need for exponentials.
+            if above or near <= 1 or top < _DRIFT:
+                declared = _believe(lanes, count, desk)
         desk.paper_age += 1
         paper_onset = k + 1 - desk.paper_age
         if declared != UNDETERMINED:
@@ -310,7 +304,7 @@ def advance(
             _hand_over(observers, lanes, c, s, declared)
         elif usable:
             for g in range(len(lanes)):
-                _step_paper(lanes[g], _width(lanes, g, count))
+                _step_paper(lanes[g], _width(g, count))
             for r in range(len(rubs)):
                 group, lane = lanes[rubs[r] // WIDTH], rubs[r] % WIDTH
                 _set_paper(group, lane, predict_rub(observers[rubs[r]], c, s, _paper(group, lane)))

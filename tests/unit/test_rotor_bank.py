@@ -11,7 +11,7 @@ import pytest
 from daqsvc.rotor.bank import UNDETERMINED, ModelBank
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.discretise import BankMode
-from daqsvc.rotor.lanes import FREE, PAPER, states
+from daqsvc.rotor.lanes import FREE, PAPER
 from daqsvc.rotor.model import NormalisedRotor
 
 PER_REV = 64
@@ -135,14 +135,14 @@ def test_nothing_is_left_of_a_lost_rub_observer():
 def test_speed_change_keeps_the_estimates():
     subject = bank()
     subject.process(*steady("N", 10.0, noise=0.0))
-    before = states(subject._lanes, FREE, 4)
+    before = subject._memory.states(FREE)
     orbits = subject.observers.copy()
     angle = 0.7
     subject.retune(1.03, angle)
     z_before = (orbits["a"] + 1j * orbits["b"]) * np.exp(1j * angle) + before[:, 0] + 1j * before[:, 2]
     moved = subject.observers
     z_after = (moved["a"] + 1j * moved["b"]) * np.exp(1j * angle)
-    after = states(subject._lanes, FREE, 4)
+    after = subject._memory.states(FREE)
     z_after += after[:, 0] + 1j * after[:, 2]
     assert np.abs(moved["a"] - orbits["a"]).max() > 0.01
     np.testing.assert_allclose(z_after, z_before, atol=1e-12)
@@ -204,7 +204,7 @@ def test_paper_rule_hands_the_declared_estimate_over():
         if subject.process(xy[one], cos[one], sin[one]).paper_declarations:
             break
     assert subject.decision != UNDETERMINED
-    observers, paper, free = subject.observers, *(states(subject._lanes, f, 4) for f in (PAPER, FREE))
+    observers, paper, free = subject.observers, *(subject._memory.states(f) for f in (PAPER, FREE))
     turn = np.exp(1j * DURATION * (k + 1))
     z = (observers["a"] + 1j * observers["b"]) * turn + 1j * observers["rest_y"]
     z += paper[:, 0] + 1j * paper[:, 2]
