@@ -16,6 +16,7 @@ from daqsvc.analysis import quality as checks
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed import LEAST_JUDGED, speed_of
+from daqsvc.dsp.probe_axes import probes_to_xy, shaft_axes_deg
 from daqsvc.dsp.revolutions import KeyphasorCutter
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration.file import CalibrationRecord
@@ -201,7 +202,7 @@ def _even_sweep(
     begin, end = (rpm * math.pi / 30.0 / recording.rate_hz for rpm in sweep_rpm)
     place = np.arange(len(samples), dtype=np.float64)
     angle = begin * place + (end - begin) / (2.0 * len(samples)) * place**2
-    return _Sweep(_shaft_axes(taken, samples[:, :2]), angle)
+    return _Sweep(_orbit(taken, samples[:, :2]), angle)
 
 
 def _keyphasor_sweep(recording: Recording, taken: RotorSetup, samples: Floats) -> tuple[_Sweep, float] | None:
@@ -216,7 +217,7 @@ def _keyphasor_sweep(recording: Recording, taken: RotorSetup, samples: Floats) -
         period_samples=60.0 * recording.rate_hz / abs(speed.rpm),
         edge=marks.edge,
     )
-    cut = cutter.process(_shaft_axes(taken, samples[:, :2]), samples[:, 2])
+    cut = cutter.process(_orbit(taken, samples[:, :2]), samples[:, 2])
     first, last = _longest(cut.trusted)
     periods = cut.period_samples[first:last]
     if len(periods) < LEAST_REVOLUTIONS:
@@ -240,10 +241,7 @@ def _longest(trusted: NDArray[np.bool_]) -> tuple[int, int]:
     return int(begins[best]), int(ends[best])
 
 
-def _shaft_axes(taken: RotorSetup, probes_um: Floats) -> Floats:
-    """Positions along two probes as x and y; a shaft that turns clockwise is looked at from its other end."""
-    axes = np.radians(taken.probe_angles_deg)
-    xy = probes_um @ np.linalg.inv(np.vstack((np.cos(axes), np.sin(axes))))
-    if (taken.speed_rpm or 1.0) < 0.0:
-        xy[:, 0] = -xy[:, 0]
-    return xy
+def _orbit(taken: RotorSetup, probes_um: Floats) -> Floats:
+    """Positions along x and y, the shaft turning from x to y."""
+    clockwise = (taken.speed_rpm or 1.0) < 0.0
+    return probes_um @ probes_to_xy(shaft_axes_deg(taken.probe_angles_deg, clockwise=clockwise))

@@ -51,15 +51,8 @@ class MachineRecordings:
         Raises:
             ValueError: the map names what is no sensor or channel.
         """
-        sensors = self._machine.sensors
-        known = {name for sensor in sensors for name in (sensor.name, sensor.channel)}
-        for name in self._analyst.channels:
-            if name not in known:
-                raise ValueError(
-                    f"--map names {name!r}, which is no sensor of {self._machine.path}; there are "
-                    f"{', '.join(sensor.name for sensor in sensors)}"
-                )
-        taken = self._analyst._setup(self._machine, self._given)  # noqa: SLF001 - one reading of a machine file
+        self._analyst.check_map(self._machine)
+        taken = self._analyst.setup(self._machine, self._given)
         return CalibrationSetup(taken=taken, sweep_rpm=sweep_rpm)
 
     def load(self, path: str) -> Recording:
@@ -69,6 +62,6 @@ class MachineRecordings:
             RecordingError: it cannot be read.
             RefusedError: it lacks one of them.
         """
-        columns = self._analyst._columns(self._machine, path)  # noqa: SLF001
+        columns = self._analyst.columns(self._machine, path)
         needed = {name: columns[name] for name in self._given.sensors}
         return load_recording(path, needed, self._analyst.rate_hz)

@@ -64,17 +64,28 @@ class MachineAnalyst:
             MachineFileError: the machine file cannot be used.
         """
         machine = load_machine_file(Path(self.machine))
-        known = {name for sensor in machine.sensors for name in (sensor.name, sensor.channel)}
-        if unknown := [name for name in self.channels if name not in known]:
-            raise ValueError(
-                f"--map names {unknown[0]!r}, which is no sensor of {self.machine}; there are "
-                f"{', '.join(sensor.name for sensor in machine.sensors)}"
-            )
+        self.check_map(machine)
         if machine.pipeline.rotor_synchronous is not None:
             assembly.healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
         elif self.calibration is not None:
             raise ValueError(
                 f"--calibration: {self.machine} has no [pipeline.rotor_synchronous] that would use it; add it"
+            )
+
+    def check_map(self, machine: MachineFile) -> None:
+        """See whether the map names sensors or channels of a machine.
+
+        Args:
+            machine: the machine file, loaded.
+
+        Raises:
+            ValueError: it does not.
+        """
+        known = {name for sensor in machine.sensors for name in (sensor.name, sensor.channel)}
+        if unknown := [name for name in self.channels if name not in known]:
+            raise ValueError(
+                f"--map names {unknown[0]!r}, which is no sensor of {self.machine}; there are "
+                f"{', '.join(sensor.name for sensor in machine.sensors)}"
             )
 
     def judge(
@@ -83,14 +94,14 @@ class MachineAnalyst:
         """See `daqsvc.analysis.many.Analyst.judge`."""
         machine = load_machine_file(Path(self.machine))
         try:
-            columns = self._columns(machine, recording)
+            columns = self.columns(machine, recording)
             loaded = load_recording(recording, columns, self.rate_hz)
         except (RecordingError, RefusedError) as error:
             return _outcome(RotorAnalysis.not_judged(recording, str(error)), ())
         machine = _as_recorded(machine, loaded)
         analysis: RotorAnalysis | None = None
         if machine.pipeline.rotor_synchronous is not None:
-            setup = self._setup(machine, machine.pipeline.rotor_synchronous)
+            setup = self.setup(machine, machine.pipeline.rotor_synchronous)
             analysis = analyse(loaded, setup, progress)
             if figures is not None and analysis.trace is not None:
                 from daqsvc.analysis.plots import draw  # noqa: PLC0415 - brings matplotlib
@@ -109,8 +120,17 @@ class MachineAnalyst:
             analysis = RotorAnalysis(recording=recording, quality=count_bad(loaded.names, loaded.samples))
         return _outcome(analysis, tuple(statements.values()))
 
-    def _columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
-        """The variable of each sensor that the recording has."""
+    def columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
+        """The variable of each sensor that a recording has.
+
+        Args:
+            machine: the machine file, loaded.
+            recording: path of the recording.
+
+        Raises:
+            RecordingError: it cannot be read.
+            RefusedError: it lacks a sensor of the rotor's detector, or has none at all.
+        """
         there = list_channels(recording)
         found = {}
         for sensor in machine.sensors:
@@ -134,8 +154,16 @@ class MachineAnalyst:
             )
         return found
 
-    def _setup(self, machine: MachineFile, given: models.RotorSynchronous) -> RotorSetup:
-        """The calibrated rotor of the machine file, as `analyse` wants it."""
+    def setup(self, machine: MachineFile, given: models.RotorSynchronous) -> RotorSetup:
+        """The calibrated rotor of a machine file, as `analyse` wants it.
+
+        Args:
+            machine: the machine file, loaded.
+            given: its calibrated rotor.
+
+        Raises:
+            CalibrationFileError: its calibration cannot be used.
+        """
         x, y = (cast("models.ProximityProbe", machine.sensor(name)) for name in given.probes)
         keyphasor = None
         if given.reference == "keyphasor" and given.keyphasor is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
+from daqsvc.dsp.probe_axes import probes_to_xy, shaft_axes_deg
 from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter, Revolutions
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors, synchronous_vectors
 
@@ -109,12 +110,11 @@ class Turns:
         self.sensors: tuple[Probe | KeyphasorProbe, ...] = probes
         if isinstance(reference, KeyphasorProbe):
             self.sensors = (*probes, reference)
-        self.axes_deg = tuple(180.0 - p.angle_deg if self.clockwise else p.angle_deg for p in probes)
+        self.axes_deg = shaft_axes_deg((probes[0].angle_deg, probes[1].angle_deg), clockwise=self.clockwise)
         self._reference = reference
         self._columns = [sensor.column for sensor in self.sensors]
         self._um_per_unit = np.array([probe.um_per_unit for probe in probes])
-        angles = np.radians(self.axes_deg)
-        self._to_xy = np.linalg.inv(np.vstack((np.cos(angles), np.sin(angles))))
+        self._to_xy = probes_to_xy(self.axes_deg)
         self._cutter = self._new_cutter()
         self.origin = 0
         """Absolute index of the first sample."""
