@@ -172,7 +172,18 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
         made.append(_rotor_bank(machine, machine.pipeline.rotor_bank))
     if machine.pipeline.rotor_synchronous is not None:
         made.append(_rotor_synchronous(machine, machine.pipeline.rotor_synchronous, store))
+    if machine.pipeline.bearing is not None:
+        made.append(_bearing(machine, store))
     return made
+
+
+def _bearing(machine: MachineFile, store: Path | None) -> Detector:
+    from daqsvc.assembly_bearing import bearing_detector  # noqa: PLC0415 - brings SciPy's statistics
+
+    try:
+        return bearing_detector(machine, store)
+    except ValueError as error:
+        raise AssemblyError(f"{machine.path}: {error}") from error
 
 
 def _column(machine: MachineFile, sensor: Sensor) -> int:

@@ -55,7 +55,7 @@ def analyse_bearings(
         before = None if baseline is None else baseline.races[name]
         try:
             races[name] = race_test(
-                column, recording.rate_hz, setup.speed_rpm, setup.bearing, setup.race, before
+                column, recording.rate_hz, setup.speed_rpm, setup.bearings[name], setup.race, before
             )
         except RaceInputError as error:
             unfit[name] = str(error)

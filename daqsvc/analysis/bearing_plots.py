@@ -65,7 +65,7 @@ def _envelope(analysis: BearingAnalysis, name: str, race: RaceVerdict) -> Figure
     axes.plot(
         spectrum.order[shown], spectrum.floor[shown], color=_QUIET, linewidth=1.0, label="local noise level"
     )
-    _mark(axes, race, analysis.setup.bearing, last)
+    _mark(axes, race, analysis.setup.bearings[name], last)
     axes.set_xlim(0.0, last)
     axes.set_ylim(0.0, 1.15 * float(spectrum.amplitude[shown][1:].max()))
     axes.set_xlabel("events per revolution of the shaft")

@@ -56,7 +56,7 @@ class BearingAnalysis:
 
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite."""
-        finding, race, bearing = self.finding, self.leading, self.setup.bearing
+        finding, race = self.finding, self.leading
         found: dict[str, Any] = finite(
             {
                 "recording": self.recording,
@@ -74,13 +74,6 @@ class BearingAnalysis:
                 "residual": self._residual(),
                 "false_alarm_probability": self.setup.change.false_alarm_probability,
                 "race_false_alarm_probability": None if race is None else race.false_alarm_probability,
-                "bearing": {
-                    "name": self.setup.bearing_name or None,
-                    "bpfi": bearing.inner,
-                    "bpfo": bearing.outer,
-                    "bsf": bearing.ball,
-                    "ftf": bearing.cage,
-                },
                 "channels": {name: self._channel(name) for name in self.setup.channels},
                 "speed_rpm": None if race is None else race.speed_rpm,
                 "speed_stated_rpm": self.setup.speed_rpm,
@@ -96,6 +89,19 @@ class BearingAnalysis:
 
     def _channel(self, name: str) -> dict[str, Any]:
         """What one channel says by itself."""
+        return {"bearing": self._bearing(name), **self._judged(name)}
+
+    def _bearing(self, name: str) -> dict[str, Any]:
+        orders = self.setup.bearings[name]
+        return {
+            "name": self.setup.designations.get(name),
+            "bpfi": orders.inner,
+            "bpfo": orders.outer,
+            "bsf": orders.ball,
+            "ftf": orders.cage,
+        }
+
+    def _judged(self, name: str) -> dict[str, Any]:
         race = self.races.get(name)
         if race is None:
             return {

@@ -36,8 +36,8 @@ class BearingSetup:
     Attributes:
         channels: accelerometers on the bearings' housings, one or two.
         speed_rpm: shaft speed, right to about 1 %.
-        bearing: fault orders.
-        bearing_name: designation; empty if orders were given.
+        bearings: fault orders of the bearing at each channel.
+        designations: of the bearings; those that were given by their orders have none.
         unit: of the samples; ``"V"`` if the sensors' sensitivity is not known.
         map: what a channel is called in the file, where that is not its name here.
         rate_hz: samples per second; None: what the file says.
@@ -47,8 +47,8 @@ class BearingSetup:
 
     channels: tuple[str, ...]
     speed_rpm: float
-    bearing: BearingOrders
-    bearing_name: str = ""
+    bearings: Mapping[str, BearingOrders]
+    designations: Mapping[str, str] = field(default_factory=dict)
     unit: AccelerationUnit = "g"
     map: Mapping[str, str] = field(default_factory=dict)
     rate_hz: float | None = None
@@ -97,7 +97,7 @@ class BearingSetup:
             dict(zip(recording.names, samples.T, strict=True)),
             recording.rate_hz if rate_hz is None else rate_hz,
             self.speed_rpm,
-            dict.fromkeys(self.channels, self.bearing),
+            self.bearings,
             [(name,) for name in self.channels] + [self.channels] * (len(self.channels) > 1),
             highest=highest,
             source=str(recording.source),

@@ -92,8 +92,8 @@ def bearing_analyst(arguments: argparse.Namespace) -> Analyst:
     setup = BearingSetup(
         channels=arguments.channels,
         speed_rpm=abs(arguments.speed_rpm.rpm),
-        bearing=_orders(arguments),
-        bearing_name=arguments.bearing or "",
+        bearings=dict.fromkeys(arguments.channels, _orders(arguments)),
+        designations=dict.fromkeys(arguments.channels if arguments.bearing else (), arguments.bearing),
         unit=arguments.unit or "g",
         map=arguments.map,
         rate_hz=arguments.fs,

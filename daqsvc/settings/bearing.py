@@ -73,7 +73,7 @@ class Bearing(Section):
             examples=['[{ name = "drive-end", sensor = "accel-de", type = "6205-2RS" }]'],
         ),
     ]
-    calibrate_s: Annotated[Positive, Field(ge=10, le=600)] = Field(
+    calibrate_s: Annotated[Positive, Field(ge=10, le=120)] = Field(
         default=30.0, description="first seconds, which are the healthy state; kept over restarts"
     )
     calibration: Annotated[Path, Field(strict=False)] | None = Field(

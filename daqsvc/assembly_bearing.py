@@ -1,0 +1,145 @@
+"""The bearings' detector out of a machine file."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from typing import TYPE_CHECKING
+
+from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.identify_change import ChangeRules
+from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.diagnosis.bearing import BearingDetector, HousedBearing
+from daqsvc.settings.bearing import BEARING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.settings.bearing import WatchedBearing
+    from daqsvc.settings.models import MachineFile
+
+log = logging.getLogger(__name__)
+
+_SAME_RATE = 1e-3
+_SAME_SPEED = 0.05
+
+
+def bearing_detector(
+    machine: MachineFile, store: Path | None, calibration: Path | None = None
+) -> BearingDetector:
+    """The detector that ``[pipeline.bearing]`` asks for.
+
+    Args:
+        machine: the machine file.
+        store: directory of the state that survives restarts; None to begin without any and leave none.
+        calibration: file with the healthy machine, in place of what the machine file names.
+
+    Raises:
+        ValueError: a bearing is not in the catalogue, its orders contradict each other, or a file with the
+            healthy machine cannot be used.
+    """
+    given = machine.pipeline.bearing
+    assert given is not None  # noqa: S101 - the caller has looked
+    stream = machine.sensor(given.bearings[0].sensor).stream
+    rate_hz = machine.streams[stream].rate_hz
+    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
+    if calibration is None and given.calibration is not None:
+        calibration = machine.resolve(given.calibration)
+    baseline: BearingBaseline | None = None
+    kept: Path | None = None
+    if calibration is not None:
+        baseline = _fitting(calibration, bearings, rate_hz, machine.machine.speed_rpm)
+    elif store is not None:
+        kept = store / f"{BEARING}.toml"
+        baseline = _kept(kept, bearings, rate_hz, machine.machine.speed_rpm)
+    return BearingDetector(
+        machine=machine.machine.name,
+        stream=stream,
+        rate_hz=rate_hz,
+        speed_rpm=machine.machine.speed_rpm,
+        bearings=bearings,
+        rules=ChangeRules(false_alarm_probability=given.false_alarm_probability),
+        baseline=baseline,
+        calibrate_s=given.calibrate_s,
+        name=BEARING,
+        keep=None if kept is None else partial(_keep, kept),
+    )
+
+
+def _housed(machine: MachineFile, index: int, given: WatchedBearing) -> HousedBearing:
+    sensor = machine.sensor(given.sensor)
+    column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+    return HousedBearing(given.name, given.sensor, column, orders_of(given, index))
+
+
+def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
+    """Fault orders of a bearing of a machine file.
+
+    Args:
+        given: the bearing.
+        index: its place in ``pipeline.bearing.bearings``.
+
+    Raises:
+        ValueError: the catalogue does not know it, or its orders contradict each other.
+    """
+    at = f"pipeline.bearing.bearings[{index}]"
+    if given.orders is None:
+        assert given.type is not None  # noqa: S101 - settings/bearing_checks.py: one of the two
+        try:
+            return bearing_orders(given.type)
+        except KeyError as error:
+            raise ValueError(f"{at}.type: {error.args[0]}") from None
+    orders = given.orders
+    try:
+        return BearingOrders(inner=orders.bpfi, outer=orders.bpfo, ball=orders.bsf, cage=orders.ftf)
+    except ValueError as error:
+        raise ValueError(f"{at}.orders: {error}") from None
+
+
+def _fitting(path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float) -> BearingBaseline:
+    """The healthy machine of a file, if it is that of these accelerometers at this rate and speed.
+
+    Raises:
+        BaselineFileError: it is not, or the file cannot be used.
+    """
+    found = load_bearing_baseline(path)
+    lacking = [
+        b.sensor for b in bearings if (b.sensor,) not in found.residuals or b.sensor not in found.races
+    ]
+    if lacking:
+        known = ", ".join(found.races) or "none"
+        raise BaselineFileError(
+            f"{path}: holds nothing of {', '.join(lacking)}, but of {known}; calibrate with all of them"
+        )
+    for what, value, wanted, tolerance in (
+        ("sampled at {:g} Hz", found.rate_hz, rate_hz, _SAME_RATE),
+        ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm), _SAME_SPEED),
+    ):
+        if abs(value / wanted - 1.0) > tolerance:
+            raise BaselineFileError(
+                f"{path}: is {what.format(value)}, not {what.format(wanted)}; calibrate as it is watched"
+            )
+    return found
+
+
+def _kept(
+    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float
+) -> BearingBaseline | None:
+    """The healthy machine that was learnt before a restart."""
+    if not path.exists():
+        return None
+    try:
+        return _fitting(path, bearings, rate_hz, speed_rpm)
+    except BaselineFileError as error:
+        log.warning("the healthy state of the bearings is learnt anew: %s", error)
+        return None
+
+
+def _keep(path: Path, baseline: BearingBaseline) -> None:
+    """Keep the healthy state, so that a restart does not take a faulty machine for a healthy one."""
+    try:
+        save_bearing_baseline(baseline, path)
+    except BaselineFileError as error:
+        log.error("the healthy state of the bearings will be lost at the next restart: %s", error)  # noqa: TRY400
