@@ -49,7 +49,7 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
         cusum[i] = evidence if gathers else 0.0
         age[i] = age[i] + 1 if gathers else 0
         led = lead[i] + own - score[i]
-        lead[i] = led if led < lead_limit else lead_limit
+        lead[i] = min(lead_limit, led)
         enough += evidence >= threshold[i]
     return enough
 

@@ -1,10 +1,10 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
-All that a bank knows lies in one piece, `BankMemory`, which is handed over, copied and compared as a whole:
-a desk (`DESK`), groups of lanes (`LANES`), the constants of the observers, the indices of those with rub, and
-evidence of pairs of modes. A group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane
-m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop
-over lanes into vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
+All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a desk
+(`DESK`), groups of lanes (`LANES`), constants of the observers, indices of those with rub, and evidence of
+pairs of modes. A group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is
+lane m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a
+loop over lanes into vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def sections(memory: Bytes) -> tuple[Desks, Lanes, Observers, Ints, Floats]:
         memory: uint8 ``[n]``.
 
     Returns:
-        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER`, int64 ``[R]``, indices of the
-        rub observers, and float64 ``[2, M, M]``, `THRESHOLD` and `DUEL` of pairs of modes.
+        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER`, int64 ``[R]``, indices
+        of the rub observers, and float64 ``[2, M, M]``, `THRESHOLD` and `DUEL` of pairs of modes.
     """
     desks = memory[:_DESK_BYTES].view(DESK)
     modes = desks[0]["modes"]
@@ -143,36 +143,28 @@ class BankMemory:
         desk = memory[:_DESK_BYTES].view(DESK)
         desk["modes"], desk["groups"], desk["rubs"] = count, groups, len(rubs)
         subject = cls(memory)
-        subject._sections()[3][:] = rubs
+        sections(memory)[3][:] = rubs
         subject.lanes["threshold"] = math.inf
         subject.put("log_prior", log_prior, -math.inf)
         subject.put("log_odds", log_prior, -math.inf)
         subject.set_observers(observers)
         return subject
 
-    def copy(self) -> BankMemory:
-        """The memory as it is now."""
-        return BankMemory(self.memory.copy())
+    @classmethod
+    def of_bytes(cls, memory: bytes) -> Self:
+        """A memory to look at."""
+        return cls(np.frombuffer(memory, dtype=np.uint8))
 
     @property
     def desk(self) -> np.void:
         """The desk, one of `DESK`."""
-        return self._sections()[0][0]
+        desk: np.void = np.ndarray(1, DESK, self.memory)[0]
+        return desk
 
     @property
     def lanes(self) -> Lanes:
         """Observers and evidence, ``[G]`` of `LANES`."""
-        return self._sections()[1]
-
-    @property
-    def observers(self) -> Observers:
-        """Constants of the observers, ``[M]`` of `discretise.OBSERVER`; see `set_observers`."""
-        return self._sections()[2]
-
-    @property
-    def pairs(self) -> Floats:
-        """Evidence of pairs of modes, float64 ``[2, M, M]``: `THRESHOLD` and `DUEL`."""
-        return self._sections()[4]
+        return np.ndarray(int(self.desk["groups"]), LANES, self.memory, _DESK_BYTES)
 
     def each(self, name: str) -> Floats:
         """A figure of each mode, float64 ``[M]`` (int64 for ``age``), copied."""
@@ -203,7 +195,7 @@ class BankMemory:
         Args:
             observers: ``[M]`` of `discretise.OBSERVER`, with rub where there was.
         """
-        self._sections()[2][:] = observers
+        sections(self.memory)[2][:] = observers
         linear = observers["substeps"] == 0
         for name in _SAME:
             self.put(name, observers[name])
@@ -242,11 +234,8 @@ class BankMemory:
 
     def set_thresholds(self, thresholds: Floats) -> None:
         """Set what it takes to change the decision, float64 ``[M, M]``, infinite where modes look alike."""
-        self.pairs[THRESHOLD] = thresholds
+        pairs = sections(self.memory)[4]
+        pairs[THRESHOLD] = thresholds
         decision = int(self.desk["decision"])
         if decision != UNDETERMINED:
             self.put("threshold", thresholds[decision], math.inf)
-
-    def _sections(self) -> tuple[Desks, Lanes, Observers, Ints, Floats]:
-        parts: tuple[Desks, Lanes, Observers, Ints, Floats] = sections.py_func(self.memory)
-        return parts

@@ -9,12 +9,12 @@ import numpy as np
 
 from daqsvc.rotor.decision import Departure
 from daqsvc.rotor.kernels import UNDETERMINED
+from daqsvc.rotor.lanes import BankMemory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.rotor.decision import Declaration, DecisionRules
-    from daqsvc.rotor.lanes import BankMemory
+    from daqsvc.rotor.decision import DecisionRules, Declaration
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
@@ -29,7 +29,7 @@ class BankReport:
         declarations: see the attribute.
         rules: thresholds and the rule that declares.
         alike: bool ``[M, M]``, modes that look alike at the present speed.
-        memory: copy of the bank's memory.
+        memory: the bank's memory, as bytes.
 
     Attributes:
         declarations: changes of the declared mode within the block, in order.
@@ -42,7 +42,7 @@ class BankReport:
         declarations: tuple[Declaration, ...],
         rules: DecisionRules,
         alike: Flags,
-        memory: BankMemory,
+        memory: bytes,
     ) -> None:
         self.declarations = declarations
         self._rules = rules
@@ -62,14 +62,14 @@ class BankReport:
     @property
     def probabilities(self) -> Floats:
         """Conditional probabilities of the paper's rule, float64 ``[M]``."""
-        log_odds = self._memory.each("log_odds")
+        log_odds = self._each("log_odds")
         odds = np.exp(log_odds - log_odds.max())
         return np.asarray(odds / odds.sum(), dtype=np.float64)
 
     @property
     def cusum_nats(self) -> Floats:
         """Evidence of each mode against the decision since its onset, float64 ``[M]``."""
-        return self._memory.each("cusum")
+        return self._each("cusum")
 
     @property
     def lead_nats(self) -> Floats:
@@ -77,7 +77,7 @@ class BankReport:
 
         It is counted up to one and a half thresholds; infinite for the decision itself.
         """
-        lead = self._memory.each("lead")
+        lead = self._each("lead")
         if (decision := self._figure("decision")) != UNDETERMINED:
             lead[decision] = math.inf
         return lead
@@ -92,7 +92,7 @@ class BankReport:
         decision = self._figure("decision")
         if decision == UNDETERMINED or decision != self.decision:
             return ()
-        close = (self._memory.each("lead") < self._rules.group_nats) | self._alike[decision]
+        close = (self._each("lead") < self._rules.group_nats) | self._alike[decision]
         close[decision] = True
         return tuple(np.flatnonzero(close).tolist()) if np.count_nonzero(close) > 1 else ()
 
@@ -107,11 +107,14 @@ class BankReport:
             return None
         rivals = ~self._alike[decision]
         rivals[decision] = False
-        evidence = np.where(rivals, self._memory.each("cusum"), -math.inf)
+        evidence = np.where(rivals, self._each("cusum"), -math.inf)
         leader = int(np.argmax(evidence))
         close = rivals & ((evidence > evidence[leader] - self._rules.group_nats) | self._alike[leader])
-        onset = 1 - int(self._memory.each("age")[leader])
+        onset = 1 - int(self._each("age")[leader])
         return Departure(1 - departed, onset, tuple(np.flatnonzero(close).tolist()))
 
     def _figure(self, name: str) -> int:
-        return int(self._memory.desk[name])
+        return int(BankMemory.of_bytes(self._memory).desk[name])
+
+    def _each(self, name: str) -> Floats:
+        return BankMemory.of_bytes(self._memory).each(name)

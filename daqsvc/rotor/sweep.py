@@ -226,7 +226,9 @@ def _hand_over(observers: Observers, lanes: Lanes, cos: float, sin: float, decla
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def advance(xy: Floats, cos: Floats, sin: Floats, begin: int, memory: Bytes) -> int:
+def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, declare, predict
+    xy: Floats, cos: Floats, sin: Floats, begin: int, memory: Bytes
+) -> int:
     """Run a bank over a block, up to the next change of its decision.
 
     Both rules run side by side, each over its own estimates. The paper's (section V): conditional
@@ -309,7 +311,7 @@ def advance(xy: Floats, cos: Floats, sin: Floats, begin: int, memory: Bytes) -> 
                 group, lane = lanes[rubs[r] // WIDTH], rubs[r] % WIDTH
                 _set_paper(group, lane, predict_rub(observers[rubs[r]], c, s, _paper(group, lane)))
 
-        if desk.by_paper and declared != UNDETERMINED and declared != paper_previous:
+        if desk.by_paper and declared not in (UNDETERMINED, paper_previous):
             desk.changed_from, desk.changed_onset = paper_previous, paper_onset
             return -1 - k
         if not desk.by_paper and winner != UNDETERMINED:
