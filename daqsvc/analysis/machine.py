@@ -10,6 +10,7 @@ import numpy as np
 
 from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
+from daqsvc.analysis.bearing_machine import analyse_machine_bearings, check_bearings, present
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.analysis.bearing_machine import MachineBearings
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
@@ -67,10 +69,13 @@ class MachineAnalyst:
         self.check_map(machine)
         if machine.pipeline.rotor_synchronous is not None:
             assembly.healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
-        elif self.calibration is not None:
+        elif self.calibration is not None and machine.pipeline.bearing is None:
             raise ValueError(
-                f"--calibration: {self.machine} has no [pipeline.rotor_synchronous] that would use it; add it"
+                f"--calibration: {self.machine} has neither [pipeline.rotor_synchronous] nor "
+                "[pipeline.bearing] that would use it; add it"
             )
+        if machine.pipeline.bearing is not None:
+            check_bearings(machine, self._of_bearings(machine))
 
     def check_map(self, machine: MachineFile) -> None:
         """See whether the map names sensors or channels of a machine.
@@ -116,9 +121,13 @@ class MachineAnalyst:
                 draw_bank(loaded, bank, f"{figures}-bank")
             if analysis is None:
                 analysis = bank_analysis(loaded, bank)
-        if analysis is None:
+        if analysis is None and machine.pipeline.bearing is None:
             analysis = RotorAnalysis(recording=recording, quality=count_bad(loaded.names, loaded.samples))
-        return _outcome(analysis, tuple(statements.values()))
+        try:
+            bearings = self._bearings(machine, loaded, figures)
+        except ValueError as error:
+            analysis, bearings = RotorAnalysis.not_judged(recording, str(error)), None
+        return _outcome(analysis, tuple(statements.values()), bearings)
 
     def columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
         """The variable of each sensor that a recording has.
@@ -188,9 +197,32 @@ class MachineAnalyst:
             ac_coupled=machine.ac_coupled,
         )
 
+    def _bearings(
+        self, machine: MachineFile, recording: Recording, figures: str | None
+    ) -> MachineBearings | None:
+        """What the bearings' detector says; None without one.
+
+        Raises:
+            ValueError: its calibration cannot be used.
+        """
+        if machine.pipeline.bearing is None:
+            return None
+        stream = machine.sensor(machine.pipeline.bearing.bearings[0].sensor).stream
+        samples = self._stream(machine, stream, recording)
+        found = analyse_machine_bearings(machine, recording, samples, self._of_bearings(machine))
+        if figures is not None and found.analysis.races:
+            from daqsvc.analysis.bearing_plots import draw_envelopes  # noqa: PLC0415 - brings matplotlib
+
+            draw_envelopes(found.analysis, figures)
+        return found
+
+    def _of_bearings(self, machine: MachineFile) -> Path | None:
+        """The calibration that was given, if it is for the bearings: a rotor's comes first."""
+        return self.calibration if machine.pipeline.rotor_synchronous is None else None
+
     def _statements(self, machine: MachineFile, recording: Recording) -> dict[str, Statements]:
         """What the other detectors say, by name."""
-        pipeline = machine.pipeline.model_copy(update={"rotor_synchronous": None})
+        pipeline = machine.pipeline.model_copy(update={"rotor_synchronous": None, "bearing": None})
         others = machine.model_copy(update={"pipeline": pipeline})
         streams = {name: self._stream(machine, name, recording) for name in machine.streams}
         return {
@@ -223,6 +255,7 @@ def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
     update: dict[str, Any] = {}
     if bank is not None and not {*bank.probes, bank.keyphasor} <= set(recording.names):
         update["rotor_bank"] = None
+    update["bearing"] = present(machine.pipeline.bearing, recording.names)
     streams = {
         name: stream.model_copy(update={"rate_hz": recording.rate_hz})
         for name, stream in machine.streams.items()
@@ -236,8 +269,20 @@ def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
     )
 
 
-def _outcome(analysis: RotorAnalysis, statements: tuple[Statements, ...]) -> Outcome:
-    found = analysis.as_json()
+def _outcome(
+    analysis: RotorAnalysis | None,
+    statements: tuple[Statements, ...],
+    bearings: MachineBearings | None = None,
+) -> Outcome:
+    """The rotor's verdict comes first; the bearings' if nothing watches the rotor."""
+    first = analysis if analysis is not None or bearings is None else bearings.analysis
+    assert first is not None  # noqa: S101 - one of the two is there
+    found = first.as_json()
+    texts = [first.describe(), *(said.describe() for said in statements)]
+    if bearings is not None:
+        statements = (*statements, bearings.statements)
+        if first is analysis:
+            found["bearing"] = bearings.analysis.as_json()
+            texts.append(f"bearings of {bearings.analysis.describe()}")
     found["detectors"] = {said.detector: said.as_json() for said in statements}
-    text = "\n  ".join([analysis.describe(), *(said.describe() for said in statements)])
-    return Outcome(found, text, analysis.refused is not None)
+    return Outcome(found, "\n  ".join(texts), first.refused is not None)
