@@ -59,6 +59,7 @@ class OrbitWatch:
         self._covered = 0
         self._forward = False
         self._motions: deque[SteadyMotion] = deque(maxlen=_SLIP_REVOLUTIONS)
+        self._doubt = ""
 
     def add(self, xy: Floats, cos: Floats, sin: Floats, revolution: int) -> None:
         """Take in a block.
@@ -75,6 +76,7 @@ class OrbitWatch:
             return
         if self._fit.samples > revolution // 2:
             self._motions.append(self._fit.solve())
+            self._look()
         self._fit, self._covered = SteadyFit(), 0
 
     @property
@@ -84,18 +86,22 @@ class OrbitWatch:
         Until then the models may not be compared: what is strange to all of them favours the one that
         expects the least.
         """
+        return self._forward
+
+    def doubt(self) -> str:
+        """What cannot be true, with the remedy; empty if nothing is wrong."""
+        return self._doubt
+
+    def _look(self) -> None:
+        """Look at the orbit with one more revolution."""
         motions = list(self._motions)
-        if not self._forward and motions:
+        self._doubt = self._direction() or self._static_position() or self._slip()
+        if not self._forward:
             forward = _radius([motion.forward for motion in motions])
             backward = _radius([motion.backward for motion in motions])
             rest = _radius([motion.rest for motion in motions])
             clear = forward > max(backward, _SIGNIFICANT * self._sigma(motions))
             self._forward = clear or forward + backward + rest > _CONTACT_FREE
-        return self._forward
-
-    def doubt(self) -> str:
-        """What cannot be true, with the remedy; empty if nothing is wrong."""
-        return self._direction() or self._static_position() or self._slip()
 
     def _sigma(self, motions: list[SteadyMotion]) -> float:
         """Standard deviation of a mean of one part, complex, over several revolutions."""

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.record import DataQuality
@@ -65,44 +63,6 @@ class Verdict:
     reason: str = ""
 
 
-def judge_probes(
-    samples: Floats, probes: Sequence[Probe], *, revolution: int, least_motion_um: float
-) -> Verdict | None:
-    """What is wrong with the last revolution of the probes, or None.
-
-    Args:
-        samples: float64 ``[n, probes]``, micrometres, NaN where missing; short at the start.
-        probes: the probes, in the order of the columns.
-        revolution: samples in a revolution.
-        least_motion_um: standard deviation that a probe must show.
-    """
-    n = len(samples)
-    for column, probe in enumerate(probes):
-        signal = samples[:, column]
-        signal = signal[~np.isnan(signal)]
-        if n - len(signal) > n / 2:
-            return Verdict(
-                "missing",
-                f"{probe.name}: {n - len(signal)} of the last {n} samples are missing; "
-                "check the bus and the device",
-            )
-        if n < revolution:
-            continue
-        if (deviation := float(signal.std())) < least_motion_um:
-            return Verdict(
-                "not_ok",
-                f"{probe.name}: moved by {deviation:.3g} um rms in the last revolution, at least "
-                f"{least_motion_um:.3g} um is expected; check the probe, its cable and driver",
-            )
-        if (clipped := clipped_at(signal)) is not None:
-            return Verdict(
-                "not_ok",
-                f"{probe.name}: clipped at {clipped:.6g} um in the last revolution; "
-                "check the gap and the range of the converter",
-            )
-    return None
-
-
 def stands_still(probes: Floats) -> bool:
     """Whether a probe repeats one value through a block, as none does that sees a turning shaft.
 
@@ -121,9 +81,12 @@ def clipped_at(signal: Floats) -> float | None:
     A coarse converter repeats its values between the extremes as well, and a sine only twice as often at
     its top as elsewhere: a clipped signal repeats its extreme four times as often as any other value.
     """
+    least = max(_CLIPPED * len(signal), 3.0)
+    if all(np.count_nonzero(signal == extreme) < least for extreme in (signal.min(), signal.max())):
+        return None
     values, counts = np.unique(signal, return_counts=True)
     usual = int(counts[1:-1].max(initial=0))
-    least = max(_CLIPPED * len(signal), 4.0 * usual, 3.0)
+    least = max(least, 4.0 * usual)
     for extreme in (0, -1):
         if counts[extreme] >= least:
             return float(values[extreme])

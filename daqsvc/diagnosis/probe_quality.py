@@ -1,7 +1,7 @@
-"""What the revolutions of two probes are worth, one by one: missing, standing still, dead, clipped.
+"""What the revolutions of two probes are worth: missing, standing still, dead, clipped.
 
-A revolution that is worth nothing must not reach the synchronous vectors: a dead probe makes a straight orbit
-and a clipped one makes harmonics, and both look like a fault of the machine.
+A revolution that is worth nothing must not reach a bank or the synchronous vectors: a dead probe makes a
+straight orbit and a clipped one makes harmonics, and both look like a fault of the machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 POOLED_REVOLUTIONS = 4
-"""Clipping is looked for in so many revolutions together as well: in noise it shows in some of them only."""
+"""So many revolutions together are searched for clipping."""
 _MISSING = 0.25
 """Part of a revolution's samples that may be missing."""
 _DEAD = 0.05
@@ -39,19 +39,42 @@ _CLEAR = 4.0
 
 
 class RevolutionJudge:
-    """Looks at the samples of one revolution after the other.
+    """Looks at the samples of a revolution: of one after the other, or of the last one again and again.
 
     Args:
         probes: the two probes, in the order of the columns.
+        missing: part of a revolution's samples that may be missing.
+        pooled: clipping is looked for in so many revolutions together as well: in noise it shows in some of
+            them only. 1 where the revolutions overlap.
     """
 
-    def __init__(self, probes: tuple[Probe, Probe]) -> None:
+    def __init__(
+        self, probes: tuple[Probe, Probe], *, missing: float = _MISSING, pooled: int = POOLED_REVOLUTIONS
+    ) -> None:
         self._probes = probes
-        self._pool: deque[Floats] = deque(maxlen=POOLED_REVOLUTIONS)
+        self._missing = missing
+        self._pool: deque[Floats] = deque(maxlen=pooled)
 
     def reset(self) -> None:
         """Forget the revolutions before a gap."""
         self._pool.clear()
+
+    def missing(self, samples: Floats) -> Verdict | None:
+        """Whether too many samples of a revolution, or of a part of one, are missing.
+
+        Args:
+            samples: float64 ``[n, 2]``, NaN where missing.
+        """
+        present = np.isfinite(samples)
+        n, missing = len(samples), int(np.count_nonzero(~present.all(axis=1)))
+        if n and missing <= self._missing * n:
+            return None
+        worst = int(present.sum(axis=0).argmin())
+        return Verdict(
+            "missing",
+            f"{self._probes[worst].name}: {'all' if missing == n else f'{missing} of {n}'} samples of a "
+            "revolution are missing; check the bus and the device",
+        )
 
     def judge(self, samples: Floats, least_motion_um: float) -> Verdict:
         """What a revolution is worth.
@@ -60,18 +83,11 @@ class RevolutionJudge:
             samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
             least_motion_um: standard deviation that each probe must show at least.
         """
-        there = np.isfinite(samples).all(axis=1)
-        n, missing = len(samples), int(np.count_nonzero(~there))
-        if not n or missing > _MISSING * n:
-            worst = int(np.isfinite(samples).sum(axis=0).argmin())
-            return Verdict(
-                "missing",
-                f"{self._probes[worst].name}: {'all' if missing == n else f'{missing} of {n}'} samples of a "
-                "revolution are missing; check the bus and the device",
-            )
-        known = samples[there]
+        if (missing := self.missing(samples)) is not None:
+            return missing
+        known = samples[np.isfinite(samples).all(axis=1)]
         self._pool.append(known)
-        pooled = np.concatenate(self._pool)
+        signals = [known] if len(self._pool) == 1 else [known, np.concatenate(self._pool)]
         deviations = known.std(axis=0)
         for column, probe in enumerate(self._probes):
             if stands_still(known[:, column : column + 1]):
@@ -87,8 +103,8 @@ class RevolutionJudge:
                     f"{probe.name}: moved by {deviations[column]:.3g} um rms in a revolution, at least "
                     f"{least:.3g} um is expected; check the probe, its cable and driver",
                 )
-            for signal in (known[:, column], pooled[:, column]):
-                if (clipped := clipped_at(signal)) is not None:
+            for signal in signals:
+                if (clipped := clipped_at(signal[:, column])) is not None:
                     return Verdict(
                         "not_ok",
                         f"{probe.name}: clipped at {clipped:.6g} um; "

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.diagnosis.bank_statements import DEPARTURE, UNDETERMINED_DECISION, BankStater, Moment
 from daqsvc.diagnosis.orbit_checks import OrbitWatch
-from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe, Verdict, judge_probes, stands_still
-from daqsvc.diagnosis.record import Diagnosis, Severity, silence_reason
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe, Verdict, stands_still
+from daqsvc.diagnosis.probe_quality import RevolutionJudge
 from daqsvc.diagnosis.rotor_modes import RotorMode, bank_modes, fault_of
 from daqsvc.dsp.keyphasor import KeyphasorTracker
 from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.rotor.discretise import BankMode
     from daqsvc.rotor.model import RotorParameters
 
@@ -29,20 +31,14 @@ if TYPE_CHECKING:
 
 __all__ = ["DEPARTURE", "KeyphasorProbe", "Probe", "RotorBankDetector", "RotorMode"]
 
-MODEL = "laval-rotor-rub/1"
-
-DEPARTURE = "departure"
-"""Decision while the machine has left the declared mode and the cause is not yet known."""
-
-UNDETERMINED_DECISION = "undetermined"
-_SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
-
 _MIN_PROBE_SPREAD = 0.5
 """Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
 _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
 _BLIND_REVOLUTIONS = 3.0
 """So long the angle is trusted without an edge."""
+_MISSING = 0.5
+"""Part of the last revolution's samples that the observers predict through."""
 _DEAD = 0.05
 """A probe that moves less than this part of what it must is dead."""
 
@@ -113,7 +109,6 @@ class RotorBankDetector:
             )
         self.name = name
         self.stream = stream
-        self._machine = machine
         self._probes = probes
         self._keyphasor = keyphasor
         self._modes = tuple(modes)
@@ -121,7 +116,6 @@ class RotorBankDetector:
         self._direction = math.copysign(1.0, speed_rpm)
         self._duration = rotor.natural_frequency_rad_s / rate_hz
         self._nominal_period = 60.0 * rate_hz / abs(speed_rpm)
-        self._sensors = (probes[0].name, probes[1].name, keyphasor.name)
         self._rate_hz = rate_hz
         self.block = max(1, round(self._nominal_period / 4.0))
 
@@ -143,6 +137,15 @@ class RotorBankDetector:
             rub_process_noise=rub_process_noise,
             ac_coupled=ac_coupled,
         )
+        self._stater = BankStater(
+            machine=machine,
+            detector=name,
+            stream=stream,
+            sensors=(probes[0].name, probes[1].name, keyphasor.name),
+            modes=self._modes,
+            rules=self._rules,
+        )
+        self._judge = RevolutionJudge(probes, missing=_MISSING, pooled=1)
         self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
         self._noise = noise_um / rotor.clearance_um / abs(spread)
@@ -232,26 +235,8 @@ class RotorBankDetector:
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
-        names = [mode.name for mode in self._modes]
         index = self._next_index or 0
-        known = self._decision in names and self._rules.rule == "cusum"
-        return [
-            Diagnosis(
-                machine=self._machine,
-                detector=self.name,
-                t_ns=t_ns,
-                stream=self.stream,
-                first_index=index,
-                end_index=index,
-                decision=self._decision,
-                severity=self._modes[names.index(self._decision)].severity if known else "normal",
-                revolutions=self._revolutions,
-                quality="missing",
-                reason=silence_reason(self.stream, silence_s),
-                sensors=self._sensors,
-                model=MODEL,
-            )
-        ]
+        return [self._stater.silence(silence_s, self._decision, index, t_ns, self._revolutions)]
 
     @property
     def _columns(self) -> list[int]:
@@ -279,7 +264,7 @@ class RotorBankDetector:
         if stands_still(samples[:, :2]):
             xy[:] = np.nan
         self._watch.add(xy, cos, sin, revolution)
-        verdict = self._judge()
+        verdict = self._verdict()
         self._follow_speed(float(angle[0]))
         unsure = self._bank.decision == UNDETERMINED and not self._watch.confirmed
         if verdict.quality != "good" or unsure:
@@ -365,15 +350,14 @@ class RotorBankDetector:
         if abs(speed / self._bank.speed - 1.0) > _RETUNE:
             self._bank.retune(speed, angle_rad)
 
-    def _judge(self) -> Verdict:
+    def _verdict(self) -> Verdict:
         """What the last revolution is worth."""
-        bad = judge_probes(
-            self._last_revolution[:, :2],
-            self._probes,
-            revolution=round(self._tracker.period_samples),
-            least_motion_um=self._least_motion_um,
-        )
-        if bad is not None:
+        probes = self._last_revolution[:, :2]
+        if len(probes) < round(self._tracker.period_samples):
+            bad = self._judge.missing(probes) or Verdict()
+        else:
+            bad = self._judge.judge(probes, self._least_motion_um)
+        if bad.quality != "good":
             return bad
         if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
             expected_rpm = 60.0 * self._rate_hz / self._nominal_period
@@ -398,61 +382,8 @@ class RotorBankDetector:
         *,
         changed: bool,
     ) -> Diagnosis:
-        names = [mode.name for mode in self._modes]
-        probabilities, evidence = report.probabilities, {}
-        if decision != UNDETERMINED and self._rules.rule == "cusum":
-            probabilities, evidence = _odds(report), _evidence(report, names)
-        group, severity = report.group, self._severity(decision)
-        stated = self._decision
-        if report.departure is not None and not changed:
-            group = report.departure.candidates
-            stated = DEPARTURE
-            mildest = min(_SEVERITIES.index(self._severity(i)) for i in group)
-            severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
-        statistics = {"speed": 60.0 * self._rate_hz / self._tracker.period_samples}
-        statistics |= {f"paper.{name}": float(p) for name, p in zip(names, report.probabilities, strict=True)}
-        return Diagnosis(
-            machine=self._machine,
-            detector=self.name,
-            t_ns=t_ns,
-            stream=self.stream,
-            first_index=first_index,
-            end_index=end_index,
-            decision=stated,
-            changed=changed,
-            severity=severity,
-            probabilities=dict(zip(names, probabilities.tolist(), strict=True)),
-            group=tuple(names[i] for i in group),
-            statistics=statistics,
-            units={"speed": "rpm"},
-            thresholds={
-                "cusum": self._rules.threshold_nats,
-                "cusum.back": self._rules.back_threshold_nats,
-                "probability": self._rules.probability_threshold,
-            },
-            evidence=evidence,
-            revolutions=self._revolutions,
-            quality=verdict.quality,
-            reason=verdict.reason,
-            sensors=self._sensors,
-            model=MODEL,
+        speed_rpm = 60.0 * self._rate_hz / self._tracker.period_samples
+        moment = Moment(first_index, end_index, t_ns, self._revolutions, speed_rpm)
+        return self._stater.state(
+            report, verdict, moment, decision=decision, stated=self._decision, changed=changed
         )
-
-    def _severity(self, mode: int) -> Severity:
-        """How bad a declared mode is; the paper's rule raises no alarm."""
-        known = mode != UNDETERMINED and self._rules.rule == "cusum"
-        return self._modes[mode].severity if known else "normal"
-
-
-def _odds(report: BankReport) -> Floats:
-    """Posterior probabilities of the modes by the evidence of the declared one over each."""
-    against = report.lead_nats.copy()  # the decision leads itself by infinity in the report
-    against[report.decision] = 0.0
-    odds = np.exp(against.min() - against)
-    return np.asarray(odds / odds.sum(), dtype=np.float64)
-
-
-def _evidence(report: BankReport, names: Sequence[str]) -> dict[str, float]:
-    others = [i for i in range(len(names)) if i != report.decision]
-    evidence = {f"lead.{names[i]}": float(report.lead_nats[i]) for i in others}
-    return evidence | {f"cusum.{names[i]}": float(report.cusum_nats[i]) for i in others}

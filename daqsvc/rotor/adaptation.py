@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
     from daqsvc.rotor.discretise import BankMode
 
-    Complex = NDArray[np.complex128]
     Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 VARIANCE_FACTOR = 1.5
 """How much larger than their own figure the innovations' variance is taken to be after an adaptation: room
@@ -51,7 +49,8 @@ class SteadyFit:
     """Least squares of z on {exp(i theta), exp(-i theta), 1}, gathered block by block."""
 
     def __init__(self) -> None:
-        self._normal = np.zeros((3, 3), dtype=np.complex128)
+        # Sums over the samples: exp(i theta), exp(2 i theta); z exp(-i theta), z exp(i theta), z.
+        self._turn = self._twice = 0j
         self._moment = np.zeros(3, dtype=np.complex128)
         self.samples = 0
 
@@ -63,11 +62,14 @@ class SteadyFit:
             cos: float64 ``[n]``, cosine of the shaft angle.
             sin: float64 ``[n]``, its sine.
         """
-        known = np.isfinite(xy).all(axis=1) & np.isfinite(cos) & np.isfinite(sin)
-        turn = cos[known] + 1j * sin[known]
-        A = np.column_stack((turn, turn.conj(), np.ones_like(turn)))
-        self._normal += A.conj().T @ A
-        self._moment += A.conj().T @ (xy[known, 0] + 1j * xy[known, 1])
+        turn = np.column_stack((cos, sin)).view(np.complex128)[:, 0]
+        z = np.ascontiguousarray(xy).view(np.complex128)[:, 0]
+        known = np.isfinite(turn) & np.isfinite(z)
+        if not known.all():
+            turn, z = turn[known], z[known]
+        self._turn += complex(turn.sum())
+        self._twice += complex(np.dot(turn, turn))
+        self._moment += (np.vdot(turn, z), np.dot(turn, z), z.sum())
         self.samples += len(turn)
 
     def solve(self) -> SteadyMotion:
@@ -76,9 +78,17 @@ class SteadyFit:
         Raises:
             ValueError: the samples do not cover enough of a revolution to tell the three parts apart.
         """
-        if self.samples < 3 or np.linalg.cond(self._normal) > 1e6:
+        n, once, twice = self.samples, self._turn, self._twice
+        normal = np.array(
+            [
+                [n, twice.conjugate(), once.conjugate()],
+                [twice, n, once],
+                [once, once.conjugate(), n],
+            ]
+        )
+        if n < 3 or np.linalg.cond(normal) > 1e6:
             raise ValueError(f"{self.samples} samples do not cover a revolution; take more of them")
-        forward, backward, rest = np.linalg.solve(self._normal, self._moment).tolist()
+        forward, backward, rest = np.linalg.solve(normal, self._moment).tolist()
         return SteadyMotion(forward, backward, rest, self.samples)
 
 

@@ -231,13 +231,13 @@ def keyphasor_gone(part):
 @pytest.mark.parametrize(
     ("spoil", "quality", "reason"),
     [
-        (dead, "not_ok", "probe-x: moved by"),
+        (dead, "not_ok", "probe-x: stood still at 12.5 um"),
         (nearly_dead, "not_ok", "probe-y: moved by"),
         (clipped, "not_ok", "probe-x: clipped at -15"),
         (at_the_rail, "not_ok", "probe-y: clipped at 5"),
         (gone, "missing", "probe-x: "),
         (infinite, "missing", "probe-y: "),
-        (half_gone, "missing", "samples are missing"),
+        (half_gone, "missing", "43 of 64 samples of a revolution are missing"),
         (no_keyphasor, "missing", "keyphasor: no pulse"),
         (keyphasor_gone, "missing", "keyphasor: no pulse"),
     ],
