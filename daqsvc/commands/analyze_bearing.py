@@ -92,7 +92,7 @@ def bearing_analyst(arguments: argparse.Namespace) -> Analyst:
     setup = BearingSetup(
         channels=arguments.channels,
         speed_rpm=abs(arguments.speed_rpm.rpm),
-        bearings=dict.fromkeys(arguments.channels, _orders(arguments)),
+        bearings=dict.fromkeys(arguments.channels, orders_given(arguments)),
         designations=dict.fromkeys(arguments.channels if arguments.bearing else (), arguments.bearing),
         unit=arguments.unit or "g",
         map=arguments.map,
@@ -105,7 +105,7 @@ def bearing_analyst(arguments: argparse.Namespace) -> Analyst:
     return BearingAnalyst(setup, healthy)
 
 
-def _orders(arguments: argparse.Namespace) -> BearingOrders:
+def orders_given(arguments: argparse.Namespace) -> BearingOrders:
     """Fault orders as given, or out of the catalogue.
 
     Raises:

@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING
 
 from daqsvc.commands.analyze_arguments import SpeedOption
 from daqsvc.commands.calibrate_arguments import add_calibrate_arguments, misuse
+from daqsvc.commands.calibrate_bearing import (
+    add_bearing_arguments,
+    bearing_misuse,
+    by_bearing,
+    calibrate_bearings,
+    shared_misuse,
+)
 
 if TYPE_CHECKING:
     import argparse
@@ -40,7 +47,8 @@ class CalibrateCommand:
     description = (
         "Learn what the healthy machine looks like, with uncertainties, and what its model can and cannot "
         "tell apart. A recording through which the speed goes up or down by more than 10 % is a run-up and "
-        "tells natural frequency, damping and unbalance; one at steady speed tells the baseline there. Data "
+        "tells natural frequency, damping and unbalance; one at steady speed tells the baseline there. With "
+        "--channels, or a machine file with [pipeline.bearing], the healthy state of rolling bearings. Data "
         "that cannot be a healthy machine are refused, and nothing is written."
     )
 
@@ -58,24 +66,24 @@ class CalibrateCommand:
             "wrong usage, 1 if something else failed."
         )
         add_calibrate_arguments(parser)
+        add_bearing_arguments(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
         machine_path = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
         recordings = arguments.files[1:] if machine_path is not None else arguments.files
+        if by_bearing(arguments):
+            return self._bearings(recordings, arguments, bearing_misuse(arguments, machine_path, recordings))
         if wrong := misuse(arguments, machine_path, recordings):
             self._parser.error(wrong)
-        if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
-            self._parser.error(f"--out {arguments.out}: there is no such directory; make it first")
+        self._need_directory(arguments)
         machine = None
         if machine_path is not None:
             machine = self._load(Path(machine_path))
             if machine is None:
                 return EXIT_USAGE
             if machine.pipeline.rotor_synchronous is None:
-                self._parser.error(
-                    f"{machine_path} has no [pipeline.rotor_synchronous] to be calibrated; add it"
-                )
+                return self._without_rotor(recordings, arguments, machine)
             self._prepare_kernel_cache()
         from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
@@ -93,6 +101,35 @@ class CalibrateCommand:
         except _FailedError as error:
             return _fail(str(error))
         return _keep(record, arguments)
+
+    def _need_directory(self, arguments: argparse.Namespace) -> None:
+        if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
+            self._parser.error(f"--out {arguments.out}: there is no such directory; make it first")
+
+    def _without_rotor(
+        self, recordings: Sequence[str], arguments: argparse.Namespace, machine: MachineFile
+    ) -> int:
+        if machine.pipeline.bearing is None:
+            self._parser.error(
+                f"{machine.path} has neither [pipeline.rotor_synchronous] nor [pipeline.bearing] to be "
+                "calibrated; add one"
+            )
+        return self._bearings(recordings, arguments, shared_misuse(arguments, recordings), machine)
+
+    def _bearings(
+        self,
+        recordings: Sequence[str],
+        arguments: argparse.Namespace,
+        wrong: str,
+        machine: MachineFile | None = None,
+    ) -> int:
+        if wrong:
+            self._parser.error(wrong)
+        self._need_directory(arguments)
+        try:
+            return calibrate_bearings(recordings[0], arguments, machine)
+        except ValueError as error:
+            self._parser.error(str(error))
 
     def _from_options(self, recordings: Sequence[str], arguments: argparse.Namespace) -> CalibrationRecord:
         from daqsvc.analysis.calibrating import calibrate_recordings  # noqa: PLC0415

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 MODEL = "bearing-race/1"
 
 _BLOCKS_PER_LOOK = 5
+_LEAST_LAST = 0.5
+"""Part of a look that is worth a last one."""
 _MISSING = 0.01
 """Part of a look's samples that may be missing; single ones are bridged."""
 _LARGE = 10.0
@@ -186,12 +188,13 @@ class BearingDetector:
             t_ns: time of its last sample.
 
         Returns:
-            None if there is nothing that has not been looked at.
+            None if there is too little that has not been looked at.
         """
         if len(rest):
             self._pending.append(rest)
             self._end_index += len(rest)
-        if not self._pending:
+        left = sum(map(len, self._pending))
+        if left == 0 or (self.seen is not None and left < _LEAST_LAST * _BLOCKS_PER_LOOK * self.block):
             return None
         return self._look(t_ns, last=True)
 

@@ -1,0 +1,104 @@
+"""From a recording of a healthy machine to what its bearings' detectors compare with."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.analysis.bearing_machine import present
+from daqsvc.analysis.machine import MachineAnalyst
+from daqsvc.analysis.setup import RefusedError
+from daqsvc.assembly_bearing import orders_of
+from daqsvc.bearing.identify_baseline import learn_baseline
+from daqsvc.bearing.race.judge import race_test
+from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.recording.recording import load_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.analysis.bearing_setup import BearingSetup
+    from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.recording.recording import Recording
+    from daqsvc.settings.models import MachineFile
+
+
+def learn_by_setup(setup: BearingSetup, path: str) -> BearingBaseline:
+    """Learn from a recording what options say about it.
+
+    Raises:
+        RecordingError: it cannot be read.
+        RefusedError: it shows a fault.
+        NotIdentifiableError: it cannot be the healthy machine's.
+    """
+    recording = setup.load(path)
+    _refuse_faults(recording, setup.bearings, setup.speed_rpm)
+    return setup.learn(recording)
+
+
+def learn_by_machine(
+    machine: MachineFile, path: str, channels: Mapping[str, str], rate_hz: float | None
+) -> BearingBaseline:
+    """Learn from a recording of a machine that has a machine file with ``[pipeline.bearing]``.
+
+    Args:
+        machine: the machine file.
+        path: the recording.
+        channels: which variable of it is which sensor or channel.
+        rate_hz: its sampling rate; None: what it says.
+
+    Raises:
+        ValueError: the map names what is no sensor, or a bearing is not known.
+        RecordingError: the recording cannot be read.
+        RefusedError: it lacks an accelerometer, or shows a fault.
+        NotIdentifiableError: it cannot be the healthy machine's.
+    """
+    analyst = MachineAnalyst(machine=str(machine.path), channels=channels, rate_hz=rate_hz)
+    analyst.check_map(machine)
+    given = machine.pipeline.bearing
+    assert given is not None  # noqa: S101 - the command has asked for it
+    columns = analyst.columns(machine, path)
+    if lacking := [name for name in given.sensors if name not in columns]:
+        raise RefusedError(
+            f"{path} has no channel for {', '.join(lacking)} of {machine.path}; name its variable, e.g. "
+            f"--map {lacking[0]}=VARIABLE"
+        )
+    recording = load_recording(path, {name: columns[name] for name in given.sensors}, rate_hz)
+    watched = present(given, recording.names)
+    assert watched is not None  # noqa: S101 - none is lacking
+    bearings = {bearing.sensor: orders_of(bearing, i) for i, bearing in enumerate(watched.bearings)}
+    speed_rpm = abs(machine.machine.speed_rpm)
+    _refuse_faults(recording, bearings, speed_rpm)
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    return learn_baseline(
+        dict(zip(recording.names, samples.T, strict=True)),
+        recording.rate_hz,
+        speed_rpm,
+        bearings,
+        [bearing.sensors for bearing in watched.bearings],
+        source=str(recording.source),
+    )
+
+
+def _refuse_faults(recording: Recording, bearings: Mapping[str, BearingOrders], speed_rpm: float) -> None:
+    """Refuse a machine that is not in good order.
+
+    Raises:
+        RefusedError: a bearing shows a fault, or a channel cannot be judged.
+    """
+    for name, orders in bearings.items():
+        column = recording.samples[:, recording.names.index(name)]
+        try:
+            said = race_test(
+                np.where(np.isfinite(column), column, np.nan), recording.rate_hz, speed_rpm, orders
+            )
+        except RaceInputError as error:
+            raise RefusedError(f"{recording.source}: {name}: {error}") from None
+        if said.verdict != "normal":
+            damage = "ball" if said.verdict == "ball" else f"{said.verdict.replace('_', ' ')} race"
+            raise RefusedError(
+                f"{recording.source}: {name} shows {damage} damage: this is no machine in good order; give a "
+                "recording of one"
+            )
