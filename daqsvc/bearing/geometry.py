@@ -25,7 +25,7 @@ class BearingOrders:
         cage: FTF, revolutions of the cage.
 
     Raises:
-        ValueError: the four contradict each other, or cannot be those of a bearing with its outer ring at rest.
+        ValueError: the four contradict each other, or are not those of a bearing with its outer ring at rest.
     """
 
     inner: float

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,6 +39,7 @@ BALL_TEETH = (
 )
 TEETH: Mapping[Part, tuple[Tooth, ...]] = {"inner": INNER_TEETH, "outer": OUTER_TEETH, "ball": BALL_TEETH}
 CAGE_WEIGHT = 0.5
+CAGE_HARMONICS = (1, 2, 3, 4)
 HIGHEST_ORDER_SHARE = 1.02
 
 
@@ -60,6 +61,18 @@ def fundamental(orders: BearingOrders, part: Part) -> float:
     return orders.ball_pass if part == "ball" else float(getattr(orders, part))
 
 
+def part_lines(part: Part, order: float, orders: BearingOrders) -> list[float]:
+    """All orders at which damage of a part makes lines: harmonics with two sidebands, and mixed ones.
+
+    Args:
+        part: the part.
+        order: its fundamental order as found.
+        orders: the stated orders.
+    """
+    modulation = orders.cage if part == "ball" else 1.0
+    return [h * order + s * modulation for h in range(1, 7) for s in range(-2, 3)]
+
+
 def highest_order(orders: BearingOrders) -> float:
     """The highest order that any comb looks at."""
     tops = [
@@ -69,31 +82,36 @@ def highest_order(orders: BearingOrders) -> float:
     return HIGHEST_ORDER_SHARE * max(tops)
 
 
-def best_comb(evidence: LineEvidence, orders: BearingOrders, part: Part, slip: float) -> Comb:
-    """Search a part's comb over slip.
+def best_comb(views: Sequence[LineEvidence], orders: BearingOrders, part: Part, slip: float) -> Comb:
+    """Search a part's comb over slip, in several views of the same signal at once.
+
+    At every offset the least of the views counts: each is fooled by something that the others are not.
 
     Args:
-        evidence: of the lines, up to `highest_order`.
+        views: evidence of lines, up to `highest_order`, all on the same bins.
         orders: the stated orders.
         part: whose comb.
         slip: how far to search, as a share of the fundamental order.
     """
-    base = fundamental(orders, part)
     teeth = TEETH[part]
-    trials = _trials(base, slip, max(t.harmonic for t in teeth), evidence.bins_per_order)
+    scale = views[0].bins_per_order
+    trials = _trials(fundamental(orders, part), slip, max(t.harmonic for t in teeth), scale)
     modulation = orders.cage if part == "ball" else 1.0
-    score = np.zeros(len(trials))
-    for tooth in teeth:
-        score += tooth.weight * _at(evidence, tooth.harmonic * trials + tooth.sideband * modulation)
+    places = np.array([t.harmonic * trials + t.sideband * modulation for t in teeth])
+    weights = np.array([t.weight for t in teeth])
+    score = np.min([weights @ _at(view, places) for view in views], axis=0)
     best = int(np.argmax(score))
     total = float(score[best])
     if part == "ball":
-        cages = _trials(orders.cage, slip, 4, evidence.bins_per_order)
-        cage = _at(evidence, 1.0 - cages) + _at(evidence, 1.0 + cages)
-        for harmonic in (1, 2, 3, 4):
-            cage += _at(evidence, harmonic * cages)
-        total += CAGE_WEIGHT * float(cage.max())
+        total += CAGE_WEIGHT * _best_cage(views, orders.cage, slip)
     return Comb(total, float(trials[best]))
+
+
+def _best_cage(views: Sequence[LineEvidence], cage: float, slip: float) -> float:
+    """Evidence for the cage's rate and for the shaft modulated by it: a ball passes the load zone with it."""
+    cages = _trials(cage, slip, max(CAGE_HARMONICS), views[0].bins_per_order)
+    places = np.array([h * cages for h in CAGE_HARMONICS] + [1.0 - cages, 1.0 + cages])
+    return float(np.min([_at(view, places).sum(axis=0) for view in views], axis=0).max())
 
 
 def _trials(order: float, slip: float, harmonics: int, bins_per_order: float) -> Real:

@@ -80,12 +80,20 @@ def decide(
     return Decision(best, group, probability, margin)
 
 
+def weight_of(part: Part, e: PartEvidence, rules: RaceRules) -> float:
+    """What a part counts against the others."""
+    return e.severity * (rules.ball_weight if part == "ball" else 1.0)
+
+
 def _passed(part: Part, e: PartEvidence, rules: RaceRules) -> float:
-    """The smallest factor by which a part passes its three limits; at least 1 for a candidate."""
+    """The smallest factor by which a part passes its limits; at least 1 for a candidate."""
     if not e.testable:
         return 0.0
-    depth_limit = rules.ball_depth_limit if part == "ball" else rules.depth_limit
-    return max(0.0, min(e.z / e.z_limit, e.depth / depth_limit, e.severity / e.limit))
+    if part == "ball":
+        return max(0.0, min(e.z / e.z_limit, e.depth / rules.ball_depth_limit, e.severity / e.limit))
+    # Squared: between knocks and strikes this ratio spans far less than the others do.
+    steady = (e.steadiness / rules.steadiness_limit) ** 2
+    return max(0.0, min(e.z / e.z_limit, e.depth / rules.depth_limit, e.severity / e.limit, steady))
 
 
 def _against(

@@ -10,6 +10,8 @@ from daqsvc.bearing.race.lines import noise_floor
 from daqsvc.dsp.envelope import HANN_NOISE_BANDWIDTH
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     Real = NDArray[np.float64]
@@ -34,15 +36,38 @@ class ModulationDepth:
         above = np.where(notched, 0.0, power - self.floor)
         self._summed = np.concatenate(([0.0], np.cumsum(above)))
 
-    def line(self, order: float) -> float:
-        """Squared modulation index of the line at an order, 0 if nothing is above the noise."""
-        centre = order * self._bins_per_order
-        first = int(np.ceil(centre * (1.0 - HALF_WIDTH)))
-        last = int(np.floor(centre * (1.0 + HALF_WIDTH))) + 1
-        if last >= len(self._summed):
-            return 0.0
-        return max(0.0, float(self._summed[last] - self._summed[first])) / HANN_NOISE_BANDWIDTH
+    def line(self, order: Real) -> Real:
+        """Squared modulation indices of the lines at some orders, 0 where nothing is above the noise.
 
-    def comb(self, order: float) -> float:
-        """Root sum of squares of the modulation indices of an order's harmonics."""
-        return float(np.sqrt(sum(self.line(h * order) for h in HARMONICS)))
+        Args:
+            order: ``[n]``.
+        """
+        centre = order * self._bins_per_order
+        last_bin = len(self._summed) - 1
+        first = np.ceil(centre * (1.0 - HALF_WIDTH)).astype(np.int64)
+        last = np.floor(centre * (1.0 + HALF_WIDTH)).astype(np.int64) + 1
+        above = self._summed[np.minimum(last, last_bin)] - self._summed[np.minimum(first, last_bin)]
+        kept = np.where(last <= last_bin, np.maximum(above, 0.0), 0.0)
+        return np.asarray(kept / HANN_NOISE_BANDWIDTH, dtype=np.float64)
+
+    def comb(self, order: Real) -> Real:
+        """Root sums of squares of the modulation indices of some orders' harmonics, ``[n]``."""
+        return np.asarray(np.sqrt(np.sum([self.line(h * order) for h in HARMONICS], axis=0)))
+
+
+def sharpest(views: Sequence[ModulationDepth], order: float, reach: float, bins_per_order: float) -> float:
+    """The order about another at which the lines are deepest.
+
+    Evidence for smeared lines has a broad top; the lines themselves sit somewhere below it.
+
+    Args:
+        views: depths by several views of the same signal; their squares are summed.
+        order: where to look.
+        reach: how far, as a share.
+        bins_per_order: bins per order of the shaft.
+    """
+    step = 0.5 / HARMONICS[-1] / bins_per_order
+    count = int(reach * order / step)
+    trials = np.asarray(order + step * np.arange(-count, count + 1), dtype=np.float64)
+    deepest = np.argmax(np.sum([view.comb(trials) ** 2 for view in views], axis=0))
+    return float(trials[deepest])

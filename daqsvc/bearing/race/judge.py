@@ -7,16 +7,16 @@ very regularly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.fft
 
 from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
-from daqsvc.bearing.race.combs import TEETH, best_comb, fundamental, highest_order
-from daqsvc.bearing.race.decision import decide
-from daqsvc.bearing.race.depth import ModulationDepth
+from daqsvc.bearing.race.combs import TEETH, best_comb, fundamental, highest_order, part_lines
+from daqsvc.bearing.race.decision import decide, weight_of
+from daqsvc.bearing.race.depth import ModulationDepth, sharpest
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS, LineEvidence, line_evidence
 from daqsvc.bearing.race.null import false_alarm_probability, significance
 from daqsvc.bearing.race.quality import checked
@@ -45,6 +45,7 @@ TOP_SHARE = 0.48
 """Of the sample rate: anti-aliasing filters have their edge about here."""
 LOG_OFFSET = 1e-3
 """Keeps the logarithm of the envelope from following its zeros."""
+SHARPEN_SHARE = 0.01
 LEAST_LINE_NATS = 3.0
 
 
@@ -159,7 +160,9 @@ def race_features(
     phases, sizes = squared_envelope(band.phase, len(x)), squared_envelope(band.clipped, len(x))
     square = _view(phases, sizes, bins, revolutions)
     log = _view(np.log(phases + LOG_OFFSET), np.log(sizes + LOG_OFFSET), bins, revolutions)
-    evidence = {part: _weigh(part, square, log, bearing, revolutions, rules) for part in PARTS}
+    # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
+    slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
+    evidence = _weigh_all(square, log, bearing, revolutions, slip, rules)
     return RaceFeatures(
         evidence=evidence,
         lines=_found(evidence, square, bearing, shaft.rate_hz),
@@ -181,33 +184,53 @@ def _view(phases: Real, sizes: Real, bins: int, revolutions: float) -> _Envelope
     return _Envelope(lines, ModulationDepth(power, lines.notched, revolutions), power)
 
 
+def _weigh_all(
+    square: _Envelope,
+    log: _Envelope,
+    bearing: BearingOrders,
+    revolutions: float,
+    slip: float,
+    rules: RaceRules,
+) -> dict[Part, PartEvidence]:
+    """Evidence for all parts; lines that the foremost part explains do not speak for another one."""
+    evidence = {part: _weigh(part, square, log, bearing, revolutions, slip, rules) for part in PARTS}
+    first = max(PARTS, key=lambda part: weight_of(part, evidence[part], rules))
+    explained = part_lines(first, evidence[first].order, bearing)
+    rest_square = replace(square, lines=square.lines.without(explained))
+    rest_log = replace(log, lines=log.lines.without(explained))
+    for part, e in evidence.items():
+        if part != first and e.z >= e.z_limit:
+            evidence[part] = _weigh(part, rest_square, rest_log, bearing, revolutions, slip, rules)
+    return evidence
+
+
 def _weigh(
     part: Part,
     square: _Envelope,
     log: _Envelope,
     bearing: BearingOrders,
     revolutions: float,
+    slip: float,
     rules: RaceRules,
 ) -> PartEvidence:
     """Evidence for a part: the lesser of the two views, as each is fooled by something the other is not."""
-    by_square = best_comb(square.lines, bearing, part, rules.slip)
-    by_log = best_comb(log.lines, bearing, part, rules.slip)
-    comb = min(by_square, by_log, key=lambda c: c.score)
-    z = significance(comb.score, part, revolutions)
-    depth = square.depth.comb(comb.order)
-    if part != "ball":
-        depth = min(depth, log.depth.comb(comb.order))
+    comb = best_comb((square.lines, log.lines), bearing, part, slip)
+    z = significance(comb.score, part, revolutions, slip)
+    found = sharpest((square.depth, log.depth), comb.order, SHARPEN_SHARE, revolutions)
+    by_square, by_log = (float(view.depth.comb(np.array([found]))[0]) for view in (square, log))
+    depth = by_square if part == "ball" else min(by_square, by_log)
     order = fundamental(bearing, part)
     away = abs(order - round(order)) * revolutions
     testable = part != "ball" or away >= rules.ball_testable_bins
     return PartEvidence(
         z=z,
         depth=depth,
+        steadiness=by_log / max(by_square, 1e-9),
         severity=max(z, 0.0) * depth,
         z_limit=rules.z_limit + (rules.z_unresolved if away < rules.unresolved_bins else 0.0),
         limit=rules.ball_severity_limit if part == "ball" else rules.severity_limit,
         false_alarm_probability=false_alarm_probability(z),
-        order=comb.order,
+        order=found,
         testable=testable,
         reason="" if testable else _why_not(order, rules),
     )
@@ -232,7 +255,7 @@ def _found(
             order = tooth.harmonic * e.order + tooth.sideband * modulation
             nats = view.lines.at(order)
             if nats >= LEAST_LINE_NATS:
-                depth = float(np.sqrt(view.depth.line(order)))
+                depth = float(np.sqrt(view.depth.line(np.array([order]))[0]))
                 line = (order * shaft_hz, order, tooth.harmonic, tooth.sideband, nats, depth)
                 lines.append(RaceLine(part, *line))
     return tuple(sorted(lines, key=lambda line: -line.evidence))

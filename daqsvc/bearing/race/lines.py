@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from daqsvc.dsp.envelope import EXP_MEDIAN, running_median
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     Real = NDArray[np.float64]
@@ -22,6 +24,10 @@ SKIRT_BINS = 5
 LOWEST_ORDER = 0.25
 HALF_WIDTHS = (0.004, 0.01)
 """Half widths of smeared lines, as shares of their frequency, beside the single bin: slip smears a ball's."""
+
+EXPLAINED_SHARE = 0.012
+EXPLAINED_BINS = 3.0
+"""How far a line's evidence reaches to either side of it, as a share and in bins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +43,15 @@ class LineEvidence:
     log_ratio: Real
     notched: NDArray[np.bool_]
     bins_per_order: float
+
+    def without(self, orders: Iterable[float]) -> LineEvidence:
+        """The same with no evidence about some orders: what is explained by another part's lines."""
+        left = self.log_ratio.copy()
+        for order in orders:
+            reach = max(EXPLAINED_SHARE * order * self.bins_per_order, EXPLAINED_BINS)
+            centre = order * self.bins_per_order
+            left[max(int(centre - reach), 0) : int(centre + reach) + 2] = 0.0
+        return replace(self, log_ratio=left)
 
     def at(self, order: float) -> float:
         """Log-likelihood ratio in nats for a line at an order; 0 beyond the spectrum."""

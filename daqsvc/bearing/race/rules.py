@@ -21,6 +21,7 @@ class RaceRules:
         ball_severity_limit: of a ball.
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
+        steadiness_limit: least steadiness of a race's lines.
         ball_weight: what a ball's severity counts against a race's.
         group_factor: parts whose weights are within this factor cannot be told apart.
         unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
@@ -45,6 +46,7 @@ class RaceRules:
     ball_severity_limit: float = 2.2
     depth_limit: float = 0.12
     ball_depth_limit: float = 0.20
+    steadiness_limit: float = 0.30
     ball_weight: float = 0.6
     group_factor: float = 1.15
     unresolved_bins: float = 4.0

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.fft
 
 from daqsvc.dsp.envelope import running_median
+from daqsvc.dsp.order_speed import find_speed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,7 +22,9 @@ CAP_NATS = 4.0
 """Most that one harmonic counts: a strong line that is not the shaft's must not decide alone."""
 PRIOR_SHARE = 0.006
 """Spread of the true speed about the stated one. A weaker prior was drawn to the lines of the bearing."""
-SEEN_NATS = 5.0
+LINE_DEVIATION_SHARE = 0.002
+"""Largest deviation of a speed from the lines of 1X to 3X that is taken before the votes of all harmonics."""
+SEEN_NATS = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,26 +34,45 @@ class ShaftRate:
     Attributes:
         rate_hz: revolutions per second.
         seen: whether harmonics of the shaft stand out at that rate.
+        sharp: whether it is known to a fraction of the search.
+        other: what speaks for a wholly different speed; empty if nothing.
     """
 
     rate_hz: float
     seen: bool
+    sharp: bool = False
+    other: str = ""
 
 
 def shaft_rate(signal: Real, rate_hz: float, stated_hz: float, tolerance: float) -> ShaftRate:
     """Refine a stated shaft rate by the harmonics of the shaft in a signal.
 
+    The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
+    with a limited voice.
+
     Args:
-        signal: ``[n]``.
+        signal: ``[n]``, without mean.
         rate_hz: its sample rate.
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
     """
+    voted, votes = _vote(signal, rate_hz, stated_hz, tolerance)
+    try:
+        line = find_speed(signal[:, np.newaxis], rate_hz, stated_hz)
+    except ValueError as error:
+        return ShaftRate(voted, votes > SEEN_NATS, other=str(error))
+    sharp = line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz
+    if sharp and abs(line.hz / stated_hz - 1.0) <= tolerance:
+        return ShaftRate(line.hz, seen=True, sharp=True)
+    return ShaftRate(voted, votes > SEEN_NATS)
+
+
+def _vote(signal: Real, rate_hz: float, stated_hz: float, tolerance: float) -> tuple[float, float]:
+    """The rate that most harmonics speak for, and their votes in nats."""
     n = len(signal)
     window = np.hanning(n + 1)[:n]
     top = min(stated_hz * (1.0 + tolerance) * (HARMONICS[-1] + 2.0), 0.5 * rate_hz)
-    # Only the lowest lines are needed: decimating first saves the transform of the rest.
-    spectrum = scipy.fft.rfft((signal - signal.mean()) * window)[: int(top * n / rate_hz) + 1]
+    spectrum = scipy.fft.rfft(signal * window)[: int(top * n / rate_hz) + 1]
     power = spectrum.real**2 + spectrum.imag**2
     ratio = power / np.maximum(running_median(power, round(2.0 * stated_hz * n / rate_hz)), 1e-300)
     score = np.minimum(np.log(np.maximum(ratio, 1e-12)), CAP_NATS)
@@ -62,4 +84,4 @@ def shaft_rate(signal: Real, rate_hz: float, stated_hz: float, tolerance: float)
     votes = np.where(heard, score[np.minimum(bins, len(score) - 1)], 0.0) @ WEIGHTS
     total = votes - 2.0 * ((candidates / stated_hz - 1.0) / PRIOR_SHARE) ** 2
     best = int(np.argmax(total))
-    return ShaftRate(float(candidates[best]), bool(votes[best] > SEEN_NATS))
+    return float(candidates[best]), float(votes[best])

@@ -41,6 +41,8 @@ class PartEvidence:
         z: significance of its kinematic lines, in standard deviations of the Gaussian-noise null, search
             included.
         depth: size: root sum of squares of the modulation indices of its lines in the whitened envelope.
+        steadiness: depth in the logarithm of the envelope over depth in its square: small if a few hard
+            knocks make the lines, as a rub or a loose part does, and not strike after strike.
         severity: ``z * depth``, what the rule weighs parts by.
         z_limit: the significance from which the part may be named.
         limit: the severity from which the part is named.
@@ -52,6 +54,7 @@ class PartEvidence:
 
     z: float
     depth: float
+    steadiness: float
     severity: float
     z_limit: float
     limit: float
