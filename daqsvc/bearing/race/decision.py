@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 STEEPNESS = 4.0
 """Odds grow with this power of the factor by which a limit is passed: a convention, not a measurement."""
 
+LEAST_FACTOR = 1e-3
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:
@@ -48,36 +50,26 @@ def decide(
     passed: dict[Part, float] = {}
     for part in PARTS:
         passed[part] = _passed(part, evidence[part], rules)
-        if baseline is not None:
-            passed[part] = _against(
-                part, evidence[part], baseline.evidence[part], passed[part], rules, changed
-            )
-    weight = {
-        part: evidence[part].severity * (rules.ball_weight if part == "ball" else 1.0) for part in PARTS
-    }
-    candidates = [part for part in PARTS if passed[part] >= 1.0]
+        if baseline is not None and passed[part] > 0.0:
+            before = baseline.evidence[part]
+            passed[part] = _against(evidence[part], before, rules, passed[part])
+            if changed:
+                passed[part] = max(passed[part], _grown(part, evidence[part], before, rules))
     sure = max(passed.values())
     fault = sure**STEEPNESS / (1.0 + sure**STEEPNESS)
+    candidates = tuple(part for part in PARTS if passed[part] >= 1.0)
+    rest: RaceWord = "changed" if changed else "normal"
     if not candidates:
-        word: RaceWord = "changed" if changed else "normal"
-        probability = {"normal": 1.0 - fault}
-        if changed:
-            probability = {"normal": 0.0, "changed": 1.0 - fault}
-        total = sum(max(p, 1e-9) ** STEEPNESS for p in passed.values())
-        probability |= {part: fault * max(passed[part], 1e-9) ** STEEPNESS / total for part in PARTS}
-        return Decision(word, (word,), probability, 1.0 / max(sure, 1e-3))
+        belief = {rest: 1.0 - fault} | _shares(passed, fault)
+        return Decision(rest, (rest,), belief, 1.0 / max(sure, LEAST_FACTOR))
+    weight = {part: weight_of(part, evidence[part], rules) for part in candidates}
+    belief = {rest: 1.0 - fault} | _shares(weight, fault)
     best = max(candidates, key=weight.__getitem__)
-    others = [part for part in candidates if part != best]
-    rival = max((weight[part] for part in others), default=0.0)
-    margin = passed[best] if rival == 0.0 else min(passed[best], weight[best] / rival)
-    total = sum(weight[part] ** STEEPNESS for part in candidates)
-    probability = {"normal": 1.0 - fault}
-    probability |= {part: fault * weight[part] ** STEEPNESS / total for part in candidates}
-    near = weight[best] / rules.group_factor
-    group = tuple(part for part in PARTS if part in candidates and weight[part] >= near)
-    if "inner" in group and "outer" in group:
-        return Decision("inner_or_outer", group, probability, margin)
-    return Decision(best, group, probability, margin)
+    rivals = [weight[best] / weight[part] for part in candidates if part != best]
+    margin = min([passed[best], *rivals])
+    group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
+    both_races = "inner" in group and "outer" in group
+    return Decision("inner_or_outer" if both_races else best, group, belief, margin)
 
 
 def weight_of(part: Part, e: PartEvidence, rules: RaceRules) -> float:
@@ -85,33 +77,41 @@ def weight_of(part: Part, e: PartEvidence, rules: RaceRules) -> float:
     return e.severity * (rules.ball_weight if part == "ball" else 1.0)
 
 
-def _passed(part: Part, e: PartEvidence, rules: RaceRules) -> float:
-    """The smallest factor by which a part passes its limits; at least 1 for a candidate."""
-    if not e.testable:
-        return 0.0
-    if part == "ball":
-        return max(0.0, min(e.z / e.z_limit, e.depth / rules.ball_depth_limit, e.severity / e.limit))
-    # Squared: between knocks and strikes this ratio spans far less than the others do.
-    steady = (e.steadiness / rules.steadiness_limit) ** 2
-    return max(0.0, min(e.z / e.z_limit, e.depth / rules.depth_limit, e.severity / e.limit, steady))
+def _shares(strength: Mapping[Part, float], whole: float) -> dict[str, float]:
+    """Shares of a belief by strength."""
+    odds = {part: max(value, LEAST_FACTOR) ** STEEPNESS for part, value in strength.items()}
+    total = sum(odds.values())
+    return {part: whole * value / total for part, value in odds.items()}
 
 
-def _against(
-    part: Part,
-    e: PartEvidence,
-    before: PartEvidence,
-    passed: float,
-    rules: RaceRules,
-    changed: bool,  # noqa: FBT001
-) -> float:
-    """The same against a baseline: a line that was there must have grown; a changed level needs less size."""
+def _passed(part: Part, e: PartEvidence, rules: RaceRules, ease: float = 1.0) -> float:
+    """The smallest factor by which a part passes its limits; at least 1 for a candidate.
+
+    Args:
+        part: the part.
+        e: its evidence.
+        rules: the rules of the test.
+        ease: share of the limit of severity that is needed.
+    """
     if not e.testable:
         return 0.0
-    if before.z >= before.z_limit:
-        passed = min(passed, e.depth / max(rules.line_growth * before.depth, 1e-9))
-    if changed:
-        least = rules.changed_ball_depth if part == "ball" else rules.changed_depth
-        depth = max(least, rules.changed_growth * before.depth)
-        grown = (e.z - max(0.0, before.z)) / rules.z_growth
-        passed = max(passed, min(e.z / e.z_limit, grown, e.depth / depth))
-    return max(0.0, passed)
+    depth_limit = rules.ball_depth_limit if part == "ball" else rules.depth_limit
+    least = min(e.z / e.z_limit, e.depth / depth_limit, e.severity / (ease * e.limit))
+    if part != "ball":
+        # Squared: between knocks and strikes this ratio spans far less than the others do.
+        least = min(least, (e.steadiness / rules.steadiness_limit) ** 2)
+    return max(0.0, least)
+
+
+def _against(e: PartEvidence, before: PartEvidence, rules: RaceRules, passed: float) -> float:
+    """The same where the machine had such lines in good order: they must have grown."""
+    if before.z < before.z_limit:
+        return passed
+    return min(passed, e.depth / max(rules.line_growth * before.depth, LEAST_FACTOR))
+
+
+def _grown(part: Part, e: PartEvidence, before: PartEvidence, rules: RaceRules) -> float:
+    """The same where the level has changed: lines that have grown much need less severity."""
+    significance = (e.z - max(0.0, before.z)) / rules.z_growth
+    size = e.depth / max(rules.changed_growth * before.depth, LEAST_FACTOR)
+    return max(0.0, min(_passed(part, e, rules, rules.changed_ease), significance, size))

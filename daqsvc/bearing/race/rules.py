@@ -28,10 +28,10 @@ class RaceRules:
         ball_testable_bins: the same for a ball, below which it is not tested at all.
         changed_db: change of the whole level that makes a record "changed" against a baseline.
         changed_band_db: the same of one octave band.
-        changed_depth: least size of a race's lines where the level has changed.
-        changed_ball_depth: the same for a ball.
-        changed_growth: growth of size over the baseline that is needed there.
-        z_growth: growth of significance over the baseline that is needed there.
+        changed_ease: share of the limit of severity that suffices where the level has changed and the part's
+            lines have grown.
+        changed_growth: growth of size over the baseline that counts as grown.
+        z_growth: growth of significance over the baseline that counts as grown.
         line_growth: growth of size that a line needs which was significant in the baseline already.
     """
 
@@ -53,8 +53,7 @@ class RaceRules:
     ball_testable_bins: float = 2.5
     changed_db: float = 2.0
     changed_band_db: float = 3.0
-    changed_depth: float = 0.08
-    changed_ball_depth: float = 0.15
+    changed_ease: float = 0.5
     changed_growth: float = 1.8
     z_growth: float = 4.0
     line_growth: float = 1.3
