@@ -6,7 +6,7 @@ are those that watch the machine live.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ from daqsvc.bearing.identify_change import compare_residual
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.diagnosis.bearing_finding import find
+from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -54,9 +55,13 @@ def analyse_bearings(
     for name, column in zip(recording.names, samples.T, strict=True):
         before = None if baseline is None else baseline.races[name]
         try:
+            refuse_clipped(column)
             races[name] = race_test(
                 column, recording.rate_hz, setup.speed_rpm, setup.bearings[name], setup.race, before
             )
+        except ClippedError as error:
+            unfit[name] = str(error)
+            quality = replace(quality, clipped={**quality.clipped, name: error.samples})
         except RaceInputError as error:
             unfit[name] = str(error)
 

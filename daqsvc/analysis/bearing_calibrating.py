@@ -13,6 +13,7 @@ from daqsvc.assembly_bearing import orders_of
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
 from daqsvc.recording.recording import load_recording
 
 if TYPE_CHECKING:
@@ -91,10 +92,11 @@ def _refuse_faults(recording: Recording, bearings: Mapping[str, BearingOrders], 
     for name, orders in bearings.items():
         column = recording.samples[:, recording.names.index(name)]
         try:
+            refuse_clipped(column)
             said = race_test(
                 np.where(np.isfinite(column), column, np.nan), recording.rate_hz, speed_rpm, orders
             )
-        except RaceInputError as error:
+        except (ClippedError, RaceInputError) as error:
             raise RefusedError(f"{recording.source}: {name}: {error}") from None
         if said.verdict != "normal":
             damage = "ball" if said.verdict == "ball" else f"{said.verdict.replace('_', ' ')} race"

@@ -6,12 +6,12 @@ import json
 import os
 import tomllib
 from collections.abc import Mapping  # noqa: TC003 - pydantic reads the annotations
-from dataclasses import asdict
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from daqsvc.bearing.identify import InnovationsModel, Whiteness
 from daqsvc.bearing.identify_baseline import BearingBaseline
@@ -70,8 +70,10 @@ class _Residual(_Table):
         """
         m = len(self.channels)
         covariance = np.array(self.covariance, dtype=np.float64)
-        coefficients = np.array(self.coefficients, dtype=np.float64).reshape(-1, m, m)
-        if covariance.shape != (m, m) or len(self.rms) != m or len(coefficients) != len(self.coefficients):
+        coefficients = np.array(self.coefficients, dtype=np.float64)
+        if not self.coefficients:
+            coefficients = np.zeros((0, m, m))
+        if covariance.shape != (m, m) or coefficients.shape[1:] != (m, m) or len(self.rms) != m:
             raise ValueError(f"covariance, coefficients or rms are not those of {m} channels")
         if not (np.linalg.eigvalsh(covariance) > 0.0).all():
             raise ValueError("the covariance is not positive definite")
@@ -87,16 +89,12 @@ class _Residual(_Table):
         )
 
 
-class _Part(_Table):
-    z: float
-    depth: float
-    severity: float
-    z_limit: float
-    limit: float
-    false_alarm_probability: float
-    order: float
-    testable: bool
-    reason: str
+_part_fields: dict[str, Any] = {
+    one.name: (get_type_hints(PartEvidence)[one.name], ... if one.default is MISSING else one.default)
+    for one in fields(PartEvidence)
+}
+_Part = create_model("_Part", __base__=_Table, **_part_fields)
+"""A table with the fields of `PartEvidence`, whatever these are."""
 
 
 class _Race(_Table):

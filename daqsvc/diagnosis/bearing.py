@@ -14,6 +14,7 @@ from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import PARTS, RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
 from daqsvc.diagnosis.bearing_finding import SOUND, BearingFinding, find
+from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
 from daqsvc.diagnosis.bearing_standing import Standing, Steadfast
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 
@@ -137,7 +138,7 @@ class BearingDetector:
         self._machine = machine
         self._rate_hz = rate_hz
         self._speed_rpm = abs(speed_rpm)
-        self._rules = rules or ChangeRules()
+        self.rules = rules or ChangeRules()
         self._race = race or RaceRules()
         self._calibrate_samples = round(calibrate_s * rate_hz)
         self._keep = keep
@@ -229,16 +230,18 @@ class BearingDetector:
                 unfit.append(("missing", f"{bearing.sensor}: {lost}; check the bus and the device"))
                 continue
             try:
+                refuse_clipped(signal)
                 race = self._watches[bearing.name].take(signal)
                 departed = self._departed(bearing, signal)
-            except (RaceInputError, _StandsStillError) as error:
+            except (ClippedError, RaceInputError, _StandsStillError) as error:
+                self._watches[bearing.name].forget()
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
                 continue
             races[bearing.name] = race
             if departed is not None:
                 changes[bearing.name] = departed
         change = max(changes.values(), key=lambda one: one.departure, default=None)
-        finding = find(races, change, self._rules.false_alarm_probability) if races else None
+        finding = find(races, change, self.rules.false_alarm_probability) if races else None
         if unfit and (finding is None or finding.verdict in SOUND):
             # What one bearing does not show says nothing about another that cannot be seen.
             return Look(races, changes, unfit[0][0], "; ".join(why for _, why in unfit), finding)
@@ -256,7 +259,7 @@ class BearingDetector:
         levels = healthy.levels_db(signal[:, np.newaxis])
         if not np.isfinite(levels).any():
             return None
-        change = compare_residual(healthy, levels, self._rules)
+        change = compare_residual(healthy, levels, self.rules)
         if change.quiet:
             raise _StandsStillError(
                 f"{-change.rise_db[0]:.1f} dB quieter than the healthy machine; it stands still, or the "
