@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -260,3 +261,77 @@ def test_speed_slope_is_that_of_the_response():
     step = unbalance_response(1.001, 0.18) / unbalance_response(1.0, 0.18) - 1.0
     assert mean == pytest.approx(complex(step) / 0.001, rel=0.01)
     assert spread < 1e-9
+
+
+@pytest.mark.parametrize("begins", [2, 5, 12, 25, 44])
+@pytest.mark.parametrize("fault", [UNBALANCE, LOAD, with_change(backward=4.0, twice=2.0)])
+def test_a_fault_at_any_time_of_the_calibration_is_refused(begins, fault):
+    vectors = np.vstack([np.tile(HEALTHY, (begins, 1)), np.tile(fault, (50 - begins, 1))])
+    assert "not steady" in refusal(orbits(vectors, NOISE_UM))
+
+
+def test_a_burst_during_a_long_calibration_is_refused():
+    vectors = np.tile(HEALTHY, (230, 1))
+    vectors[100:105] = with_change(backward=4.0, twice=2.0)
+    assert re.search("in revolutions 10[012] to 10[456] of 230", refusal(orbits(vectors, NOISE_UM)))
+
+
+def test_noise_that_grows_during_calibration_is_refused():
+    noisy = orbits(np.tile(HEALTHY, (100, 1)), NOISE_UM)
+    extra = np.random.default_rng(8).standard_normal((40 * PER_REV, 2))
+    noisy.xy[-40 * PER_REV :] += NOISE_UM * extra
+    assert "do not repeat with the shaft" in refusal(noisy)
+
+
+def test_steady_machines_are_calibrated_nearly_always():
+    for seed in range(60):
+        for noise_um in (0.0, 2.8, 20.0):
+            calibrate(synchronous_vectors(orbits(np.tile(HEALTHY, (50, 1)), noise_um, seed)), ROTOR, RATE_HZ)
+
+
+def test_a_keyphasor_that_misses_every_second_revolution_is_told():
+    told = refusal(orbits(np.tile(np.array([0.0, 0.1, 0.0, 20.0, 0.0]), (50, 1)), 0.3))
+    assert "one pulse a revolution" in told
+
+
+def test_a_rotor_that_cannot_whirl_like_that_makes_no_names_by_its_model():
+    """Revolutions a minute typed for Hz: the eccentricity that it takes is beyond the clearance."""
+    watch, _ = life((60, HEALTHY), rotor=replace(ROTOR, natural_frequency_hz=600.0))
+    assert not watch.calibration.laval
+    assert "more than the clearance: check natural frequency" in watch.calibration.describe()
+
+
+@pytest.mark.parametrize("order", [0.38, 0.47, 1.6])
+def test_a_steady_whirl_is_one_alarm_that_is_held_and_no_fault_of_the_shaft(order):
+    """Half a cycle fits five harmonics well: the residual alone does not show it."""
+    turns = np.arange(330 * PER_REV) / PER_REV
+    cut = orbits(np.tile(HEALTHY, (330, 1)), NOISE_UM, 4)
+    whirl = np.where(turns > 100.0, 5.0, 0.0) * np.exp(2j * math.pi * order * turns)
+    cut.xy[:, 0] += whirl.real
+    cut.xy[:, 1] += whirl.imag
+    watch = RotorWatch(ROTOR, RATE_HZ)
+    reports = watch.take(synchronous_vectors(cut), cut)
+    assert sum(report.departed for report in reports) <= 2
+    assert all(report.state == "departed" for report in reports if report.revolution > 105)
+    found = watch.finish()
+    assert found.group == ("unmodelled",)
+    assert levels(found, watch.calibration)["unmodelled"]["nonsynchronous_um"] == pytest.approx(3.5, rel=0.4)
+
+
+def test_a_probe_that_gets_noisier_is_no_rub():
+    for seed in range(4):
+        cut = orbits(np.tile(HEALTHY, (330, 1)), NOISE_UM, seed)
+        extra = np.random.default_rng(seed + 50).standard_normal(230 * PER_REV)
+        cut.xy[100 * PER_REV :, 0] += 1.8 * NOISE_UM * extra
+        watch = RotorWatch(ROTOR, RATE_HZ)
+        watch.take(synchronous_vectors(cut), cut)
+        assert watch.finish().group == ("unmodelled",)
+
+
+def test_the_damping_that_is_left_allows_for_what_is_not_known():
+    less = complex(unbalance_response(1.0, 0.09) / unbalance_response(1.0, 0.18))
+    change = with_change(forward=HEALTHY[1] * (less - 1.0))
+    off = replace(ROTOR, natural_frequency_hz=10.0 * 1.18)
+    watch, _ = life((100, HEALTHY), (60, change), rotor=off)
+    level = levels(watch.finish(), watch.calibration)["damping_loss"]
+    assert level["least"] * 0.9 <= 0.09 <= level["most"] * 1.1

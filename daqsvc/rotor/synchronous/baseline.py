@@ -11,6 +11,15 @@ import numpy as np
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.departure import Spread
 from daqsvc.rotor.synchronous.healthy import Healthy
+from daqsvc.rotor.synchronous.steadiness import (
+    UNREST_NATS,
+    VECTOR_NATS,
+    most_restless_stretch,
+    oddest_stretch,
+    turn_per_revolution,
+    unrest,
+)
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,14 +37,13 @@ _FLOOR = 0.002
 """Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
 _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
-_STATIONARY_NATS = 25.0
-"""Half against half: Gamma(5, 1) passes this once in 5 million calibrations."""
-_TURNING_NATS = 100.0
-_LEAST_TURN_RAD = 0.6
-"""1X may turn by so much over the whole calibration: drift of the speed does it, too."""
-_TURN_PADDING = 16
+_TURNING_LEAVES = 0.1
+"""Part of 1X that may still move where turning is what it is."""
+_LEAST_UNREST = 0.15
+"""Relative change of what does not repeat that is worth a refusal."""
 _LAVAL_ELLIPTICITY = 0.05
 _REVERSED = 2.0
+_DOUBLED = 5.0
 _LEAST_WHIRL = 4.0
 """1X amplitude over its own standard deviation below which there is no orbit to speak of."""
 
@@ -54,7 +62,7 @@ class Calibration:
         revolutions: revolutions that went in.
         baseline: complex128 ``[5]``, mean synchronous vector in um.
         variance: float64 ``[5]``, complex variance of one revolution's vector, as it counts in long means.
-        noise: variance of the complex residual of a sample, um^2.
+        noise: variance of a complex sample that does not repeat with the shaft (`unrest`), um^2.
         noise_variance: relative variance of that from revolution to revolution.
         samples_per_rev: usable samples in a revolution.
         fit_error: what a Laval rotor leaves unexplained of a run-up, relative; None if there was none.
@@ -102,7 +110,13 @@ class Calibration:
     def laval(self) -> bool:
         """Whether the machine behaves like a Laval rotor, as far as was seen."""
         fits = self.fit_error is None or self.fit_error <= _LAVAL_ELLIPTICITY
-        return fits and self.ellipticity <= _LAVAL_ELLIPTICITY
+        return fits and self.ellipticity <= _LAVAL_ELLIPTICITY and not self.implausible
+
+    @property
+    def implausible(self) -> bool:
+        """Whether the stated rotor would need an eccentricity beyond its clearance to whirl as it does."""
+        clearance_um = self.rotor.clearance_um
+        return clearance_um is not None and abs(self.eccentricity_um) > clearance_um
 
     @property
     def snr_db(self) -> float:
@@ -140,6 +154,9 @@ class Calibration:
             why = (
                 f"a run-up fits a Laval rotor only within {100.0 * (self.fit_error or 0.0):.0f} %"
                 if self.fit_error is not None and self.fit_error > _LAVAL_ELLIPTICITY
+                else f"its 1X takes an eccentricity of {abs(self.eccentricity_um):.3g} um, more than the "
+                "clearance: check natural frequency, damping ratio and clearance"
+                if self.implausible
                 else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
             )
             said.append(
@@ -177,13 +194,16 @@ def compensated(
     return moved, deviation
 
 
-def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) -> Calibration:
+def calibrate(
+    vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float, *, angle_assumed: bool = True
+) -> Calibration:
     """Calibrate on revolutions of a healthy machine at steady speed.
 
     Args:
         vectors: synchronous vectors in um.
         rotor: what is known about the rotor.
         rate_hz: sampling rate.
+        angle_assumed: whether the shaft angle rests on a stated speed instead of a keyphasor.
 
     Raises:
         NotCalibratableError: too few revolutions, no orbit, not stationary, not locked to the shaft, or an
@@ -203,11 +223,9 @@ def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) ->
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
-    _, slope = rotor.speed_slope(speed_rad_s)
-    half = count // 2
-    guard = slope * float(deviation[half:].mean() - deviation[:half].mean())
-    _refuse_turning(vectors.vectors[:, 1], white, speed_rad_s * 30.0 / math.pi)
-    _refuse_unsteady(moved, variance, guard)
+    restless = unrest(moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples)
+    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, assumed=angle_assumed)
+    _refuse_restless(restless)
     if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
         raise NotCalibratableError(
             f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of "
@@ -219,7 +237,12 @@ def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) ->
             f"{abs(baseline[1]):.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft "
             "turns clockwise; swap the probes, or give the speed a minus sign"
         )
-    relative = vectors.noise / vectors.noise.mean()
+    if abs(baseline[3]) > _DOUBLED * abs(baseline[1]):
+        raise NotCalibratableError(
+            f"2X is {abs(baseline[3]):.3g} um where 1X is {abs(baseline[1]):.3g} um: the angle turns half as "
+            "fast as the shaft; check that the keyphasor gives one pulse a revolution, and the stated speed"
+        )
+    relative = restless / restless.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
     return Calibration(
         rotor=rotor,
@@ -227,8 +250,8 @@ def calibrate(vectors: SynchronousVectors, rotor: LavalRotor, rate_hz: float) ->
         revolutions=count,
         baseline=baseline,
         variance=variance,
-        noise=noise,
-        noise_variance=max(freedom, float(relative.var(ddof=1))) if vectors.noise.mean() > 0 else freedom,
+        noise=float(restless.mean()),
+        noise_variance=max(freedom, float(relative.var(ddof=1))),
         samples_per_rev=samples,
     )
 
@@ -258,43 +281,54 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
     return np.asarray(white + stirred * (1.0 + memory) / (1.0 - memory))
 
 
-def _refuse_turning(forward: Complexes, white: float, speed_rpm: float) -> None:
-    """Whether 1X turns against the angle: then the angle is not the shaft's."""
-    count = len(forward)
-    size = _TURN_PADDING * 2 ** math.ceil(math.log2(count))
-    power = np.abs(np.fft.fft(forward, size)) ** 2 / (count * max(white, 1e-300))
-    strongest = int(power.argmax())
-    turn = 2.0 * math.pi * ((strongest + size // 2) % size - size // 2) / size
-    if abs(turn) * count < _LEAST_TURN_RAD or power[strongest] - power[0] < _TURNING_NATS:
-        return
-    orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
-    raise NotCalibratableError(
-        f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a revolution "
-        f"against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at {speed_rpm:.1f} rpm "
-        f"({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, or use a keyphasor"
-    )
-
-
-def _refuse_unsteady(moved: Complexes, variance: Floats, guard: float) -> None:
-    """Half against half.
+def _refuse_unsteady(
+    moved: Complexes, white: float, rotor: LavalRotor, speed_rad_s: float, deviation: Floats, *, assumed: bool
+) -> None:
+    """Whether any stretch of the revolutions differs from the others; if so, say how.
 
     Args:
         moved: complex128 ``[R, 5]``, vectors brought to one speed.
-        variance: float64 ``[5]``, of one of them.
-        guard: relative uncertainty of 1X that the difference of the halves' speeds leaves.
+        white: variance of a component that white noise makes.
+        rotor: what is known about the rotor.
+        speed_rad_s: mean speed.
+        deviation: float64 ``[R]``, relative deviation of every revolution's speed.
+        assumed: whether the angle rests on a stated speed.
     """
-    half = len(moved) // 2
-    first, second = moved[:half].mean(axis=0), moved[half:].mean(axis=0)
-    amplitude = float(np.abs(moved[:, 1]).mean())
-    allowed = variance * (1.0 / half + 1.0 / (len(moved) - half)) + (_FLOOR * amplitude) ** 2
-    allowed[1:3] += (amplitude * guard) ** 2
-    nats = float((np.abs(second - first) ** 2 / allowed).sum())
-    if nats <= _STATIONARY_NATS:
+    amplitude = float(np.median(np.abs(moved[:, 1])))
+    memory, floor = _memory(rotor, speed_rad_s), (_FLOOR * amplitude) ** 2
+    _, slope = rotor.speed_slope(speed_rad_s)
+    guard = amplitude * slope * deviation
+    odd = oddest_stretch(moved, white, memory, floor, guard)
+    if odd.nats <= VECTOR_NATS:
         return
-    worst = int(np.argmax(np.abs(second - first) ** 2 / allowed))
-    name = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")[worst]
+    turn = turn_per_revolution(moved[:, 1]) if assumed else 0.0
+    if turn:
+        still = moved * np.exp(-1j * turn * np.outer(np.arange(len(moved)), HARMONICS))
+        left = oddest_stretch(still, white, memory, floor, guard)
+        if left.nats <= VECTOR_NATS or left.by <= _TURNING_LEAVES * amplitude:
+            speed_rpm = speed_rad_s * 30.0 / math.pi
+            orbit_rpm = speed_rpm * (1.0 + turn / (2.0 * math.pi))
+            raise NotCalibratableError(
+                f"the angle is not locked to the shaft: 1X turns by {math.degrees(turn):.2f} degrees a "
+                f"revolution against it, so the shaft turns at {orbit_rpm:.1f} rpm and not at "
+                f"{speed_rpm:.1f} rpm ({100.0 * (orbit_rpm / speed_rpm - 1.0):+.2f} %); correct the speed, "
+                "or use a keyphasor"
+            )
     raise NotCalibratableError(
-        f"not steady: {name} moves by {abs(second[worst] - first[worst]):.3g} um from the first half of the "
-        f"{len(moved)} revolutions to the second ({nats:.0f} nats, at most {_STATIONARY_NATS:.0f} are "
-        "chance); calibrate where the machine runs steadily and is healthy"
+        f"not steady: {odd.what} moves by {odd.by:.3g} um in revolutions {odd.begin + 1} to {odd.end} of "
+        f"{len(moved)} ({odd.nats:.0f} nats, at most {VECTOR_NATS:.0f} are chance); calibrate where the "
+        "machine runs steadily and is healthy"
+    )
+
+
+def _refuse_restless(values: Floats) -> None:
+    """Whether what does not repeat with the shaft comes or goes."""
+    restless = most_restless_stretch(values)
+    usual = math.sqrt(float(np.median(values)) / 2.0)
+    if restless.nats <= UNREST_NATS or abs(restless.by / max(usual, 1e-300) - 1.0) < _LEAST_UNREST:
+        return
+    raise NotCalibratableError(
+        f"not steady: noise and whirl that do not repeat with the shaft are {restless.by:.3g} um in "
+        f"revolutions {restless.begin + 1} to {restless.end} of {len(values)}, else {usual:.3g} um; "
+        "calibrate where the machine runs steadily and is healthy"
     )

@@ -66,7 +66,8 @@ class Identification:
         evidence: nats of every hypothesis over "normal".
         probabilities: posterior of every verdict, hypotheses equally likely before.
         change: complex128 ``[5]``, d in um.
-        severity: modulus of the change over the healthy whirl's amplitude.
+        severity: size of the change, its non-harmonic energy included, over the healthy whirl's amplitude.
+        excess: variance of a complex sample that does not repeat with the shaft, above the healthy one, um^2.
         candidates: verdict and group of this look alone.
     """
 
@@ -78,6 +79,7 @@ class Identification:
     change: Complexes
     severity: float
     candidates: tuple[RotorFault, ...] = field(default=())
+    excess: float = 0.0
 
 
 def identify(
@@ -117,9 +119,11 @@ def identify(
         and energy.excess > (rules.least_severity * amplitude) ** 2
     ):
         square += energy.excess
-        for name in scores:
-            if name not in _RIVALS:
-                scores[name] -= min(energy.nats, _MOST_ENERGY_NATS)
+        unexplained = min(energy.nats, _MOST_ENERGY_NATS)
+        # A rub shakes the rotor besides; but what leaves no mark of a rub on the vector is noise or whirl.
+        explained = {"unmodelled"} if scores["rub"] < rules.margin_nats else {"unmodelled", "rub"}
+        for name in scores.keys() - explained:
+            scores[name] -= unexplained
     size = math.sqrt(square)
     # The typical component: that of the mean position may be drift of the probes, or not there at all.
     deviation = math.sqrt(float(np.median(variance)))
@@ -149,6 +153,7 @@ def identify(
         change=change,
         severity=size / max(amplitude, 1e-12),
         candidates=candidates,
+        excess=energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0,
     )
 
 

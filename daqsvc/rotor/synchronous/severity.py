@@ -18,18 +18,22 @@ if TYPE_CHECKING:
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.signatures import RotorFault
 
+_DAMPING_LEFT = (0.01, 1.0, 400)
+
 
 def levels(identification: Identification, calibration: Calibration) -> dict[RotorFault, dict[str, float]]:
     """Level of every fault in the group, by name, in the unit that ends each figure's name.
 
     * ``unbalance``: ``ratio`` of the 1X vectors after and before, ``change_um`` and ``change_deg`` of the 1X
       vector (from the mark, with the rotation), ``eccentricity_change_um`` that makes it.
-    * ``damping_loss``: ``damping_ratio`` left, and ``left`` as a part of the healthy one.
+    * ``damping_loss``: ``damping_ratio`` left, ``least`` and ``most`` that the rotor's tolerances allow, and
+      ``left`` as a part of the healthy one; nothing where no damping explains the change.
     * ``static_load``: ``shift_um`` and ``shift_deg`` of the mean position, ``of_sag`` relative to the sag.
     * ``stiffness_loss``: ``stiffness`` left, as a part of the healthy one.
     * ``rub``: ``backward_1x_um``, ``force_um`` (contact force per revolution over the shaft's stiffness)
       and ``contact_deg``, the shaft angle where it touches.
-    * ``unmodelled``, ``small_change``: ``change_um``.
+    * ``unmodelled``, ``small_change``: ``change_um`` of the synchronous vector, and ``nonsynchronous_um``,
+      what does not repeat with the shaft, rms of one probe above the healthy one.
 
     Without a Laval rotor, figures that need its model are left out.
     """
@@ -62,14 +66,25 @@ def _unbalance(identification: Identification, calibration: Calibration) -> dict
 def _damping_loss(identification: Identification, calibration: Calibration) -> dict[str, float]:
     if not calibration.laval:
         return {}
-    rotor = calibration.rotor
-    speed = calibration.speed_rad_s / rotor.natural_frequency_rad_s
-    left_over = np.linspace(0.01, 1.0, 400)
-    after = unbalance_response(speed, rotor.damping_ratio * left_over)
-    ratio = np.abs(after / unbalance_response(speed, rotor.damping_ratio))
-    now = abs(calibration.baseline[1] + identification.change[1]) / max(calibration.amplitude_um, 1e-12)
-    left = float(left_over[np.argmin(np.abs(ratio - now))])
-    return {"damping_ratio": left * calibration.rotor.damping_ratio, "left": left}
+    omega, zeta = calibration.rotor.box
+    left_over = np.linspace(*_DAMPING_LEFT)
+    speed = calibration.speed_rad_s / omega[:, np.newaxis]
+    before = unbalance_response(speed, zeta[:, np.newaxis])
+    ratio = unbalance_response(speed, zeta[:, np.newaxis] * left_over) / before
+    misfit = np.abs(identification.change[1] - calibration.baseline[1] * (ratio - 1.0))
+    # Every rotor of the box has its own best figure; those that explain the change as well as any count.
+    best = misfit.min(axis=1)
+    good = best <= best.min() + 0.05 * abs(calibration.baseline[1] + identification.change[1])
+    left = left_over[misfit.argmin(axis=1)[good]]
+    damping = left * zeta[good]
+    if left.min() <= _DAMPING_LEFT[0] or left.min() >= _DAMPING_LEFT[1]:
+        return {}
+    return {
+        "damping_ratio": float(np.median(damping)),
+        "least": float(damping.min()),
+        "most": float(damping.max()),
+        "left": float(np.median(left)),
+    }
 
 
 def _static_load(identification: Identification, calibration: Calibration) -> dict[str, float]:
@@ -104,4 +119,7 @@ def _rub(identification: Identification, calibration: Calibration) -> dict[str, 
 
 def _size(identification: Identification, calibration: Calibration) -> dict[str, float]:
     del calibration
-    return {"change_um": float(np.sqrt(np.sum(np.abs(identification.change) ** 2)))}
+    return {
+        "change_um": float(np.sqrt(np.sum(np.abs(identification.change) ** 2))),
+        "nonsynchronous_um": math.sqrt(identification.excess / 2.0),
+    }

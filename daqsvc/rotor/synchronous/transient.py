@@ -11,16 +11,19 @@ d_1 follows from them. This needs poles that are known well, hence a calibration
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
+from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.healthy import Healthy
 
     Complexes = NDArray[np.complex128]
@@ -146,3 +149,43 @@ def _against(
     product = (response.conj() * deviation).sum(axis=1)
     energy = np.maximum((np.abs(response) ** 2).sum(axis=1), 1e-12)
     return np.asarray(product), np.asarray(energy)
+
+
+@dataclass(frozen=True, slots=True)
+class _Orbit:
+    revolution: int
+    turns: Floats
+    position: Complexes
+
+
+class LastOrbits:
+    """The samples of the last revolutions, as far back as a comparison reaches.
+
+    Args:
+        abrupt: revolutions in the window of a departure that a comparison is made for, at most.
+    """
+
+    def __init__(self, abrupt: int) -> None:
+        self._orbits: deque[_Orbit] = deque(maxlen=REVOLUTIONS + BEFORE + abrupt + 2)
+
+    def add(self, revolution: int, turns: Floats, position: Complexes) -> None:
+        """Keep a revolution.
+
+        Args:
+            revolution: its number.
+            turns: float64 ``[n]``, shaft angle in revolutions from its beginning.
+            position: complex128 ``[n]``, um; NaN where missing.
+        """
+        self._orbits.append(_Orbit(revolution, turns, position))
+
+    def compare(self, onset: int, healthy: Calibration) -> Comparison | None:
+        """The transient about an onset, unbalance against loss of damping; None if too little was kept."""
+        orbits = [orbit for orbit in self._orbits if orbit.revolution >= onset - BEFORE]
+        if len(orbits) < REVOLUTIONS + BEFORE:
+            return None
+        turns = np.concatenate([orbit.turns + (orbit.revolution - onset) for orbit in orbits])
+        position = np.concatenate([orbit.position for orbit in orbits])
+        whirl = np.exp(2j * math.pi * np.outer(turns, HARMONICS)) @ healthy.baseline
+        there = np.isfinite(position)
+        transient = Transient(turns[there], (position - whirl)[there], healthy.noise)
+        return compare(transient, healthy.healthy)

@@ -24,15 +24,9 @@ from daqsvc.rotor.synchronous.baseline import (
 )
 from daqsvc.rotor.synchronous.departure import DepartureTest, Evidence, Spread, threshold_for
 from daqsvc.rotor.synchronous.identify import Energy, Identification, NamingRules, identify
-from daqsvc.rotor.synchronous.transient import (
-    BEFORE,
-    KNOWN_WITHIN,
-    REVOLUTIONS,
-    Comparison,
-    Transient,
-    compare,
-)
-from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors
+from daqsvc.rotor.synchronous.steadiness import unrest
+from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
+from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,6 +44,8 @@ LOOKS = (3, 5, 8, 12, 20, 30, 50, 80, 120, 220)
 """Revolutions since the onset after which a change is looked at; then every 110 more."""
 _NAMED_FROM = 8
 """Revolutions since the onset before which no look gives a name: the rotor is still on its way."""
+_TRUSTED_FROM = 12
+"""Revolutions since the onset from which on two looks that see nothing end the alarm."""
 _LATER_LOOKS = 110
 _SETTLING = 8
 """Revolutions after an onset before the new segment's own reference begins."""
@@ -60,7 +56,6 @@ _KEPT = 512
 """Revolutions that identification can reach back."""
 _ABRUPT = 4
 """Revolutions in the window of a departure up to which its transient is looked at."""
-_ORBITS_KEPT = REVOLUTIONS + BEFORE + _ABRUPT + 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +69,7 @@ class WatchRules:
         naming: how a change gets its name.
         probe_drift_um: standard deviation of the mean position that is drift of the probes.
         speed_uncertainty: relative standard deviation of a stated speed that stands in for a keyphasor.
+        angle_assumed: whether the angle rests on a stated speed at all.
         retry: whether to try again after data that cannot be the baseline.
     """
 
@@ -83,6 +79,7 @@ class WatchRules:
     naming: NamingRules = field(default_factory=NamingRules)
     probe_drift_um: float = 0.0
     speed_uncertainty: float = 0.0
+    angle_assumed: bool = True
     retry: bool = True
 
 
@@ -121,13 +118,6 @@ class _Row:
     speed: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Orbit:
-    revolution: int
-    turns: NDArray[np.float64]
-    position: Complexes
-
-
 class RotorWatch:
     """Watches one rotor by its synchronous vectors.
 
@@ -153,6 +143,7 @@ class RotorWatch:
         self.refused = ""
         self.revolutions = 0
         self._waiting: list[SynchronousVectors] = []
+        self._previous: Complexes | None = None
         self._rows: deque[_Row] = deque(maxlen=_KEPT)
         self._segment: list[_Row] = []
         self._test: DepartureTest | None = None
@@ -161,7 +152,7 @@ class RotorWatch:
         self._onset: int | None = None
         self._look = 0
         self._identification: Identification | None = None
-        self._orbits: deque[_Orbit] = deque(maxlen=_ORBITS_KEPT)
+        self._orbits = LastOrbits(_ABRUPT)
         self._alarm: tuple[int, int] | None = None
         self._comparison: Comparison | None = None
         if calibration is not None:
@@ -190,7 +181,7 @@ class RotorWatch:
             if orbits is not None:
                 part = slice(int(orbits.starts[i]), ends[i])
                 z = orbits.xy[part, 0] + 1j * orbits.xy[part, 1]
-                self._orbits.append(_Orbit(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z))
+                self._orbits.add(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z)
             if one.usable[0]:
                 said.append(self._take(one))
         return said
@@ -199,9 +190,9 @@ class RotorWatch:
         if self.calibration is None:
             return self._calibrate(one)
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
-        row = _Row(
-            self.revolutions, moved[0] - self.calibration.baseline, float(one.noise[0]), float(speed[0])
-        )
+        restless = float(unrest(moved, one.noise, one.samples, self._previous)[0])
+        self._previous = moved[0]
+        row = _Row(self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0]))
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
         evidence = (
@@ -216,7 +207,7 @@ class RotorWatch:
             self._comparison = None
         elif self._onset is not None:
             if self._alarm is not None and row.revolution == self._alarm[0] + REVOLUTIONS:
-                self._comparison = self._compare()
+                self._comparison = self._orbits.compare(self._onset, self._healthy or self.calibration)
                 if self._comparison is not None:
                     self._identify(row.revolution, may_name=True)
                     looked = True
@@ -227,7 +218,12 @@ class RotorWatch:
         self._waiting.append(one)
         if len(self._waiting) >= self.rules.calibrate_revolutions and (self.rules.retry or not self.refused):
             try:
-                made = calibrate(SynchronousVectors.joined(self._waiting), self.rotor, self.rate_hz)
+                made = calibrate(
+                    SynchronousVectors.joined(self._waiting),
+                    self.rotor,
+                    self.rate_hz,
+                    angle_assumed=self.rules.angle_assumed,
+                )
             except NotCalibratableError as error:
                 self.refused = str(error)
                 del self._waiting[: max(1, self.rules.calibrate_revolutions // 2)]
@@ -303,8 +299,11 @@ class RotorWatch:
             return False
         while self._next_look() <= since:
             self._look += 1
+        before = self._identification
         self._identify(revolution, may_name=since >= _NAMED_FROM)
-        if self._identification is not None and self._identification.verdict == "normal":
+        looks = (before, self._identification)
+        if since >= _TRUSTED_FROM and all(one is not None and "normal" in one.candidates for one in looks):
+            # One look that sees nothing may be chance; what comes and goes is one alarm.
             self._return_to_health()
         return True
 
@@ -314,20 +313,6 @@ class RotorWatch:
         known = max(self.rotor.natural_frequency_tolerance, self.rotor.damping_tolerance) <= KNOWN_WITHIN
         assert self.calibration is not None  # noqa: S101
         return known and self.calibration.laval
-
-    def _compare(self) -> Comparison | None:
-        """The transient of the last departure, unbalance against loss of damping."""
-        assert self._healthy is not None  # noqa: S101
-        assert self._onset is not None  # noqa: S101
-        orbits = [orbit for orbit in self._orbits if orbit.revolution >= self._onset - BEFORE]
-        if len(orbits) < REVOLUTIONS + BEFORE:
-            return None
-        turns = np.concatenate([orbit.turns + (orbit.revolution - self._onset) for orbit in orbits])
-        position = np.concatenate([orbit.position for orbit in orbits])
-        healthy = np.exp(2j * math.pi * np.outer(turns, HARMONICS)) @ self._healthy.baseline
-        there = np.isfinite(position)
-        transient = Transient(turns[there], (position - healthy)[there], self._healthy.noise)
-        return compare(transient, self._healthy.healthy)
 
     def _next_look(self) -> int:
         if self._look < len(LOOKS):
@@ -365,7 +350,8 @@ class RotorWatch:
             rules=self.rules.naming,
             may_name=may_name,
             comparison=self._comparison,
-            energy=self._energy(rows[len(rows) // 2 :]),
+            # While the rotor settles its vector moves by itself.
+            energy=self._energy(rows[len(rows) // 2 :]) if since >= _NAMED_FROM else None,
         )
 
     def _energy(self, rows: Sequence[_Row]) -> Energy:

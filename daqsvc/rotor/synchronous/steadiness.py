@@ -1,0 +1,151 @@
+"""Are these revolutions of one and the same machine? What is not steady is no baseline.
+
+Every stretch of revolutions is held against all others, in its mean vector and in its unrest. The scatter
+that this is judged by comes from neighbouring revolutions, by medians: a step, a burst or a drift hardly
+widens it, so that none of them hides behind itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+VECTOR_NATS = 30.0
+"""Gamma(5, 1) passes this once in 300 million stretches; a calibration has some thousands."""
+UNREST_NATS = 20.0
+_LENGTHS = np.unique(np.round(np.geomspace(1, 1000, 25)).astype(np.int64))
+_STARTS = 400
+_NAMES = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")
+_MEDIAN = math.log(2.0)
+_TURN_PADDING = 16
+_LEAST_TURN_RAD = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A stretch of revolutions that is not like the others.
+
+    Attributes:
+        begin: its first revolution, from 0.
+        end: one past its last.
+        nats: how much it differs.
+        what: what differs.
+        by: difference, um.
+    """
+
+    begin: int
+    end: int
+    nats: float
+    what: str
+    by: float
+
+
+def unrest(vectors: Complexes, noise: Floats, samples: Floats, previous: Complexes | None = None) -> Floats:
+    """Variance of a sample that does not repeat with the shaft, float64 ``[R]``.
+
+    The residual within the revolution and the step from the one before: a whirl at half the speed leaves
+    little in the residual, as five harmonics fit half a cycle well, but is another one every time. For
+    white noise it equals the noise.
+
+    Args:
+        vectors: complex128 ``[R, 5]``.
+        noise: float64 ``[R]``, variance of the residual of a sample.
+        samples: float64 ``[R]``.
+        previous: complex128 ``[5]``, vector of the revolution before; None: there is none.
+    """
+    before = np.vstack((vectors[:1] if previous is None else previous[np.newaxis], vectors[:-1]))
+    steps = np.sum(np.abs(vectors - before) ** 2, axis=1) / 2.0
+    if previous is None and len(steps) > 1:
+        steps[0] = steps[1]
+    return np.asarray((noise * np.maximum(samples - 5.0, 1.0) + samples * steps) / samples)
+
+
+def oddest_stretch(vectors: Complexes, white: float, memory: float, floor: float, guard: Floats) -> Stretch:
+    """The stretch whose mean vector differs most from that of the others.
+
+    Args:
+        vectors: complex128 ``[R, 5]``, brought to one speed.
+        white: variance of a vector's component that white noise makes.
+        memory: correlation of the stirred orbit from one revolution to the next.
+        floor: um^2 that no difference counts below.
+        guard: float64 ``[R]``, um of 1X that each revolution's speed leaves uncertain, with its sign.
+    """
+    neighbours = np.median(np.abs(np.diff(vectors, axis=0)) ** 2, axis=0) / (2.0 * _MEDIAN)
+    stirred = np.maximum(neighbours - white, 0.0) / (1.0 - memory)
+    variance = white + stirred * (1.0 + memory) / (1.0 - memory)
+    columns = np.column_stack((vectors, guard.astype(np.complex128)))
+    best = Stretch(0, 0, 0.0, "", 0.0)
+    for length, starts, inside, outside, share in _stretches(columns):
+        change = inside[:, :5] - outside[:, :5]
+        allowed = np.tile(variance * share + floor, (len(starts), 1))
+        allowed[:, 1:3] += (np.abs(inside[:, 5] - outside[:, 5]) ** 2)[:, np.newaxis]
+        terms = np.abs(change) ** 2 / allowed
+        nats = terms.sum(axis=1)
+        at = int(nats.argmax())
+        if nats[at] > best.nats:
+            worst = int(terms[at].argmax())
+            begin = int(starts[at])
+            by = float(abs(change[at, worst]))
+            best = Stretch(begin, begin + length, float(nats[at]), _NAMES[worst], by)
+    return best
+
+
+def most_restless_stretch(values: Floats) -> Stretch:
+    """The stretch whose unrest differs most from that of the others.
+
+    Args:
+        values: float64 ``[R]``, unrest of every revolution.
+    """
+    typical = float(np.median(values))
+    scatter = float(np.median(np.abs(np.diff(values)))) / (0.6745 * math.sqrt(2.0))
+    scatter = max(scatter, 1e-3 * typical, 1e-300)
+    best = Stretch(0, 0, 0.0, "", 0.0)
+    for length, starts, inside, outside, share in _stretches(values[:, np.newaxis]):
+        nats = (inside[:, 0] - outside[:, 0]) ** 2 / (2.0 * share * scatter**2)
+        at = int(nats.argmax())
+        if nats[at] > best.nats:
+            begin = int(starts[at])
+            by = math.sqrt(max(float(inside[at, 0]), 0.0) / 2.0)
+            best = Stretch(begin, begin + length, float(nats[at]), "what does not repeat", by)
+    return best
+
+
+def turn_per_revolution(forward: Complexes) -> float:
+    """What 1X turns against the angle in a revolution, in rad; 0 if hardly anything in all of them."""
+    size = _TURN_PADDING * 2 ** math.ceil(math.log2(len(forward)))
+    strongest = int(np.abs(np.fft.fft(forward, size)).argmax())
+    turn = 2.0 * math.pi * ((strongest + size // 2) % size - size // 2) / size
+    time = np.arange(len(forward)) - (len(forward) - 1) / 2.0
+    for _ in range(3):
+        still = forward * np.exp(-1j * turn * time)
+        mean = still.mean()
+        # What is left turns slowly: its slope is that of the part at right angles to the mean.
+        turn += float(
+            (time * (still * mean.conjugate()).imag).sum() / (time @ time) / max(abs(mean) ** 2, 1e-300)
+        )
+    return turn if abs(turn) * len(forward) > _LEAST_TURN_RAD else 0.0
+
+
+def _stretches(
+    columns: NDArray[np.generic],
+) -> list[tuple[int, NDArray[np.int64], NDArray[np.complex128], NDArray[np.complex128], float]]:
+    """Stretches of every length up to half: length, starts, means inside and outside, 1/m + 1/(n - m)."""
+    count = len(columns)
+    sums = np.vstack((np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)))
+    found = []
+    for length in _LENGTHS[count // 2 >= _LENGTHS].tolist():
+        stride = max(1, (count - length) // _STARTS)
+        starts = np.unique(np.append(np.arange(0, count - length + 1, stride), count - length))
+        total = sums[starts + length] - sums[starts]
+        inside, outside = total / length, (sums[-1] - total) / (count - length)
+        found.append((length, starts, inside, outside, 1.0 / length + 1.0 / (count - length)))
+    return found
