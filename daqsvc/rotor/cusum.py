@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from numba import njit
 
 from daqsvc.rotor.kernels import UNDETERMINED
-from daqsvc.rotor.lanes import DUEL, THRESHOLD, WIDTH
+from daqsvc.rotor.lanes import WIDTH
 
 if TYPE_CHECKING:
     from typing import Any
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Floats = NDArray[np.float64]
     Lanes = NDArray[np.void]
+    Pairs = NDArray[np.void]
     Group = Any  # one element of Lanes: numba makes a record of it
     Desk = Any
 
@@ -55,15 +55,15 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_verdict(lanes: Lanes, pairs: Floats, threshold: float) -> int:
+def first_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> int:
     """One sample's evidence of every mode against every other; a mode that leads all unlike it, or -1.
 
     Args:
         lanes: memory of the bank; ages go on.
-        pairs: float64 ``[2, M, M]``; the duels go on.
-        threshold: nats to lead by.
+        pairs: ``[M M]`` of `lanes.PAIR`; the duels go on.
+        desk: of `lanes.DESK`.
     """
-    count = pairs.shape[1]
+    count = desk.modes
     winner = UNDETERMINED
     for i in range(count):
         group, lane = lanes[i // WIDTH], i % WIDTH
@@ -71,19 +71,19 @@ def first_verdict(lanes: Lanes, pairs: Floats, threshold: float) -> int:
         narrowest = math.inf
         for j in range(count):
             if i != j:
-                ratio = group.score[lane] - lanes[j // WIDTH].score[j % WIDTH]
-                pairs[DUEL, i, j] = max(0.0, pairs[DUEL, i, j] + ratio)
-                if pairs[THRESHOLD, i, j] < math.inf:
-                    narrowest = min(narrowest, pairs[DUEL, i, j])
-        if narrowest >= threshold and (
-            winner == UNDETERMINED or pairs[DUEL, i, winner] > pairs[DUEL, winner, i]
+                pair = pairs[i * count + j]
+                pair.duel = max(0.0, pair.duel + group.score[lane] - lanes[j // WIDTH].score[j % WIDTH])
+                if pair.threshold < math.inf:
+                    narrowest = min(narrowest, pair.duel)
+        if narrowest >= desk.first_threshold and (
+            winner == UNDETERMINED or pairs[i * count + winner].duel > pairs[winner * count + i].duel
         ):
             winner = i
     return winner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def next_verdict(lanes: Lanes, pairs: Floats, desk: Desk) -> tuple[int, int]:
+def next_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> tuple[int, int]:
     """The mode with a threshold of evidence against the declared one, and the one that takes over, or -1.
 
     A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
@@ -94,45 +94,51 @@ def next_verdict(lanes: Lanes, pairs: Floats, desk: Desk) -> tuple[int, int]:
 
     Args:
         lanes: memory of the bank.
-        pairs: float64 ``[2, M, M]``.
+        pairs: ``[M M]`` of `lanes.PAIR`.
         desk: of `lanes.DESK`.
     """
-    count = pairs.shape[1]
-    thresholds = pairs[THRESHOLD, desk.decision]
+    count = desk.modes
+    row = desk.decision * count
     winner, best = UNDETERMINED, 0.0
     for j in range(count):
         evidence = lanes[j // WIDTH].cusum[j % WIDTH]
-        if evidence > best and thresholds[j] < math.inf:
+        if evidence > best and pairs[row + j].threshold < math.inf:
             winner, best = j, evidence
-    if winner == UNDETERMINED or best < thresholds[winner]:
+    if winner == UNDETERMINED or best < pairs[row + winner].threshold:
         return UNDETERMINED, UNDETERMINED
+    threshold = pairs[row + winner].threshold
     second = 0.0
     for j in range(count):
-        if j != winner and pairs[THRESHOLD, winner, j] < math.inf and thresholds[j] < math.inf:
+        if (
+            j != winner
+            and pairs[winner * count + j].threshold < math.inf
+            and pairs[row + j].threshold < math.inf
+        ):
             second = max(second, lanes[j // WIDTH].cusum[j % WIDTH])
     if lanes[winner // WIDTH].age[winner % WIDTH] < desk.settling_wait:
         return winner, UNDETERMINED
-    if best - second < desk.identity_nats and best < _PATIENCE * thresholds[winner]:
+    if best - second < desk.identity_nats and best < _PATIENCE * threshold:
         return winner, UNDETERMINED
     return winner, winner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stand_by(mode: int, lanes: Lanes, pairs: Floats, desk: Desk) -> None:
+def stand_by(mode: int, lanes: Lanes, pairs: Pairs, desk: Desk) -> None:
     """Make a mode the decision: its lead is what it won by, and the evidence starts anew.
 
     Args:
         mode: index of the mode.
         lanes: memory of the bank.
-        pairs: float64 ``[2, M, M]``.
+        pairs: ``[M M]`` of `lanes.PAIR`.
         desk: of `lanes.DESK`.
     """
     won = lanes[mode // WIDTH].cusum[mode % WIDTH]
-    for j in range(pairs.shape[1]):
+    for j in range(desk.modes):
         group, lane = lanes[j // WIDTH], j % WIDTH
-        lead = pairs[DUEL, mode, j] if desk.decision == UNDETERMINED else won - group.cusum[lane]
+        pair = pairs[mode * desk.modes + j]
+        lead = pair.duel if desk.decision == UNDETERMINED else won - group.cusum[lane]
         group.lead[lane] = min(desk.lead_limit, lead)
-        group.threshold[lane] = pairs[THRESHOLD, mode, j]
+        group.threshold[lane] = pair.threshold
     for g in range(len(lanes)):
         lanes[g].cusum[:] = 0.0
         lanes[g].age[:] = 0

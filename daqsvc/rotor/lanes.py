@@ -1,10 +1,10 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
 All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a desk
-(`DESK`), groups of lanes (`LANES`), constants of the observers, indices of those with rub, and evidence of
-pairs of modes. A group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is
-lane m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a
-loop over lanes into vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
+(`DESK`), groups of lanes (`LANES`), constants of the observers, and evidence of pairs of modes (`PAIR`). A
+group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane m % WIDTH of
+group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop over lanes into
+vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from daqsvc.rotor.discretise import OBSERVER
 from daqsvc.rotor.kernels import ESCAPE_RADIUS, UNDETERMINED
 
 if TYPE_CHECKING:
-    from typing import Self
+    from typing import Any, Self
 
     from numpy.typing import NDArray
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
     Bytes = NDArray[np.uint8]
     Floats = NDArray[np.float64]
-    Ints = NDArray[np.int64]
     Observers = NDArray[np.void]
     Lanes = NDArray[np.void]
     Desks = NDArray[np.void]
+    Pairs = NDArray[np.void]
 
 WIDTH = 8
 """Lanes in a group: two or one vector registers of float64."""
@@ -55,7 +55,15 @@ _FLOATS = (
     "log_odds", "log_prior",
 )  # fmt: skip
 
-LANES = np.dtype([*((name, np.float64, (WIDTH,)) for name in _FLOATS), ("age", np.int64, (WIDTH,))])
+LANES = np.dtype(
+    [
+        *((name, np.float64, (WIDTH,)) for name in _FLOATS),
+        # samples since the onset of the CUSUM
+        ("age", np.int64, (WIDTH,)),
+        # not of the lane's own mode: the modes with rub, one after the other
+        ("rub", np.int64, (WIDTH,)),
+    ]
+)
 """A group of observers and the evidence for their modes."""
 
 DESK = np.dtype(
@@ -76,39 +84,35 @@ DESK = np.dtype(
 )  # fmt: skip
 """What a bank knows besides its modes: an array of one."""
 
-THRESHOLD = 0
-"""Of the pairs of modes: nats that change the decision from row to column, infinite where they look alike."""
-DUEL = 1
-"""Of the pairs of modes: evidence of row over column, as long as there is no decision."""
+PAIR = np.dtype([("threshold", np.float64), ("duel", np.float64)])
+"""Of one mode against another: nats that change the decision to the other, infinite where they look alike;
+and the one's evidence over the other, as long as there is no decision."""
 
 _DESK_BYTES = DESK.itemsize
 _LANES_BYTES = LANES.itemsize
 _OBSERVER_BYTES = OBSERVER.itemsize
-_WORD = 8
+_PAIR_BYTES = PAIR.itemsize
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sections(memory: Bytes) -> tuple[Desks, Lanes, Observers, Ints, Floats]:
+def sections(memory: Bytes) -> tuple[Desks, Lanes, Observers, Pairs]:
     """The parts of a bank's memory.
 
     Args:
         memory: uint8 ``[n]``.
 
     Returns:
-        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER`, int64 ``[R]``, indices
-        of the rub observers, and float64 ``[2, M, M]``, `THRESHOLD` and `DUEL` of pairs of modes.
+        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER` and, row by row,
+        ``[M M]`` of `PAIR`.
     """
     desks = memory[:_DESK_BYTES].view(DESK)
-    modes = desks[0]["modes"]
     lanes = _DESK_BYTES + desks[0]["groups"] * _LANES_BYTES
-    observers = lanes + modes * _OBSERVER_BYTES
-    rubs = observers + desks[0]["rubs"] * _WORD
+    observers = lanes + desks[0]["modes"] * _OBSERVER_BYTES
     return (
         desks,
         memory[_DESK_BYTES:lanes].view(LANES),
         memory[lanes:observers].view(OBSERVER),
-        memory[observers:rubs].view(np.int64),
-        memory[rubs:].view(np.float64).reshape((2, modes, modes)),
+        memory[observers:].view(PAIR),
     )
 
 
@@ -137,13 +141,13 @@ class BankMemory:
         """
         count = len(observers)
         groups = math.ceil(count / WIDTH)
-        rubs = np.flatnonzero(observers["substeps"]).astype(np.int64)
-        size = _DESK_BYTES + groups * _LANES_BYTES + count * _OBSERVER_BYTES
-        memory = np.zeros(size + (len(rubs) + 2 * count**2) * _WORD, dtype=np.uint8)
+        rubs = np.flatnonzero(observers["substeps"])
+        size = _DESK_BYTES + groups * _LANES_BYTES + count * _OBSERVER_BYTES + count**2 * _PAIR_BYTES
+        memory = np.zeros(size, dtype=np.uint8)
         desk = memory[:_DESK_BYTES].view(DESK)
         desk["modes"], desk["groups"], desk["rubs"] = count, groups, len(rubs)
         subject = cls(memory)
-        sections(memory)[3][:] = rubs
+        subject.put("rub", rubs)
         subject.lanes["threshold"] = math.inf
         subject.put("log_prior", log_prior, -math.inf)
         subject.put("log_odds", log_prior, -math.inf)
@@ -170,7 +174,7 @@ class BankMemory:
         """A figure of each mode, float64 ``[M]`` (int64 for ``age``), copied."""
         return np.array(self.lanes[name].reshape(-1)[: int(self.desk["modes"])])
 
-    def put(self, name: str, values: Floats, rest: float = 0.0) -> None:
+    def put(self, name: str, values: NDArray[Any], rest: float = 0.0) -> None:
         """Set a figure of each mode, float64 ``[M]``; lanes without a mode get ``rest``."""
         lanes = self.lanes
         padded = np.full(len(lanes) * WIDTH, rest)
@@ -234,8 +238,7 @@ class BankMemory:
 
     def set_thresholds(self, thresholds: Floats) -> None:
         """Set what it takes to change the decision, float64 ``[M, M]``, infinite where modes look alike."""
-        pairs = sections(self.memory)[4]
-        pairs[THRESHOLD] = thresholds
+        sections(self.memory)[3]["threshold"] = thresholds.ravel()
         decision = int(self.desk["decision"])
         if decision != UNDETERMINED:
             self.put("threshold", thresholds[decision], math.inf)

@@ -14,7 +14,7 @@ from numba import njit
 
 from daqsvc.rotor.cusum import first_verdict, gather, next_verdict, stand_by
 from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
-from daqsvc.rotor.lanes import DUEL, WIDTH, sections
+from daqsvc.rotor.lanes import WIDTH, sections
 
 if TYPE_CHECKING:
     from typing import Any
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
     Floats = NDArray[np.float64]
     Observers = NDArray[np.void]
+    Pairs = NDArray[np.void]
     Lanes = NDArray[np.void]
     Observer = Any  # one element of Observers: numba makes a record of it
     Group = Any
@@ -64,7 +65,7 @@ def _width(group: int, count: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _forget(observers: Observers, lanes: Lanes, pairs: Floats, desk: Desk) -> None:
+def _forget(observers: Observers, lanes: Lanes, pairs: Pairs, desk: Desk) -> None:
     """Forget estimates and evidence; the decision is held.
 
     Linear observers start on their own orbits, rub observers on the healthy one. The revolution that
@@ -79,7 +80,8 @@ def _forget(observers: Observers, lanes: Lanes, pairs: Floats, desk: Desk) -> No
         lanes[g].cusum[:] = 0.0
         lanes[g].age[:] = 0
         lanes[g].log_odds[:] = lanes[g].log_prior
-    pairs[DUEL] = 0.0
+    for p in range(len(pairs)):
+        pairs[p].duel = 0.0
     desk.departed = 0
     desk.paper_age = 0
     desk.settling = desk.samples_per_rev
@@ -92,7 +94,7 @@ def start_anew(memory: Bytes) -> None:
     Args:
         memory: uint8 ``[n]``, see `lanes.sections`; changed in place.
     """
-    desks, lanes, observers, _, pairs = sections(memory)
+    desks, lanes, observers, pairs = sections(memory)
     _forget(observers, lanes, pairs, desks[0])
     desks[0].unusable = desks[0].samples_per_rev + 1
 
@@ -167,11 +169,11 @@ def _coast(observers: Observers, lanes: Lanes, cos: float, sin: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(lanes: Lanes, pairs: Floats, desk: Desk) -> int:
+def _weigh(lanes: Lanes, pairs: Pairs, desk: Desk) -> int:
     """What the CUSUM makes of evidence that is enough; the mode that it changes its decision to, or -1."""
     if desk.decision == UNDETERMINED:
         desk.departed = 0
-        return first_verdict(lanes, pairs, desk.first_threshold)
+        return first_verdict(lanes, pairs, desk)
     suspect, winner = next_verdict(lanes, pairs, desk)
     departs = suspect != UNDETERMINED and winner == UNDETERMINED
     desk.departed = desk.departed + 1 if departs else 0
@@ -246,7 +248,7 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
     Returns:
         ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
     """
-    desks, lanes, observers, rubs, pairs = sections(memory)
+    desks, lanes, observers, pairs = sections(memory)
     desk, count = desks[0], len(observers)
     if begin == 0:
         desk.paper_declarations = 0
@@ -259,8 +261,8 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
             desk.unusable = 0
             for g in range(len(lanes)):
                 _observe(lanes[g], x, y, c, s, _width(g, count))
-            for r in range(len(rubs)):
-                m = rubs[r]
+            for r in range(desk.rubs):
+                m = lanes[r // WIDTH].rub[r % WIDTH]
                 _observe_rub(observers[m], observers[0], lanes[m // WIDTH], m % WIDTH, c, s)
         else:
             desk.unusable += 1
@@ -307,9 +309,10 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
         elif usable:
             for g in range(len(lanes)):
                 _step_paper(lanes[g], _width(g, count))
-            for r in range(len(rubs)):
-                group, lane = lanes[rubs[r] // WIDTH], rubs[r] % WIDTH
-                _set_paper(group, lane, predict_rub(observers[rubs[r]], c, s, _paper(group, lane)))
+            for r in range(desk.rubs):
+                m = lanes[r // WIDTH].rub[r % WIDTH]
+                group, lane = lanes[m // WIDTH], m % WIDTH
+                _set_paper(group, lane, predict_rub(observers[m], c, s, _paper(group, lane)))
 
         if desk.by_paper and declared not in (UNDETERMINED, paper_previous):
             desk.changed_from, desk.changed_onset = paper_previous, paper_onset
