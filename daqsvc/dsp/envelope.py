@@ -8,6 +8,7 @@ the modulation is found without choosing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,9 +19,17 @@ if TYPE_CHECKING:
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
+    # Whitened, there is no range of amplitudes left that would need more than single precision.
+    Envelope = NDArray[np.float32]
+    Band = NDArray[np.complex64]
 
 EXP_MEDIAN = np.log(2.0)
 """Median over mean of an exponential distribution: a periodogram's bins of noise."""
+
+OVERSAMPLING = 1.5
+"""Samples of an envelope per bin of its band. One is enough for its square; its logarithm is broader."""
+
+CLIP_MEDIANS = 3.0
 
 HANN_NOISE_BANDWIDTH = 1.5
 """Bins over which a line of a Hann-windowed spectrum spreads its power."""
@@ -31,16 +40,12 @@ class WhitenedBand:
     """A band of a real signal's spectrum in two whitened forms.
 
     Attributes:
-        phase: unit amplitude in every bin (cepstrum pre-whitening): only the phases are left, `[bins]`.
-        clipped: divided by the local median amplitude, lines clipped to three medians, `[bins]`.
-        first_bin: the bin of the spectrum at which the band begins.
-        samples: length of the signal.
+        phase: unit amplitude in every bin (cepstrum pre-whitening): only the phases are left, ``[bins]``.
+        clipped: divided by the local median amplitude, lines clipped to `CLIP_MEDIANS`, ``[bins]``.
     """
 
-    phase: Complex
-    clipped: Complex
-    first_bin: int
-    samples: int
+    phase: Band
+    clipped: Band
 
 
 def running_median(values: Real, width: int) -> Real:
@@ -48,14 +53,14 @@ def running_median(values: Real, width: int) -> Real:
 
     Args:
         values: ``[n]``.
-        width: in bins; no less than 3 are used.
+        width: in bins; no less than 2 are used.
 
     Returns:
         ``[n]``, constant beyond the centres of the first and last block.
     """
     n = len(values)
-    hop = max(min(width, n) // 4, 1)
-    width = 4 * hop
+    hop = max(min(width, n) // 2, 1)
+    width = 2 * hop
     if n <= 2 * width:
         return np.full(n, float(np.median(values)))
     blocks = np.lib.stride_tricks.sliding_window_view(values, width)[::hop]
@@ -63,43 +68,53 @@ def running_median(values: Real, width: int) -> Real:
     return np.interp(np.arange(n), centres, np.median(blocks, axis=1))
 
 
-def whiten(signal: Real, rate_hz: float, low_hz: float, high_hz: float, median_hz: float) -> WhitenedBand:
+def whiten(
+    spectrum: Complex, samples: int, rate_hz: float, low_hz: float, high_hz: float, median_hz: float
+) -> WhitenedBand:
     """Whiten a band of a signal.
 
     Args:
-        signal: ``[n]``, any unit.
+        spectrum: one-sided spectrum of the signal, unwindowed.
+        samples: length of the signal.
         rate_hz: its sample rate.
         low_hz: where the band begins.
         high_hz: where it ends.
         median_hz: width of the local median amplitude.
     """
-    n = len(signal)
-    first, last = round(low_hz * n / rate_hz), round(high_hz * n / rate_hz)
-    spectrum = scipy.fft.rfft(signal)[first:last]
-    amplitude = np.abs(spectrum)
-    np.maximum(amplitude, np.finfo(np.float64).tiny, out=amplitude)
-    median = running_median(amplitude, round(median_hz * n / rate_hz))
-    phase = spectrum / amplitude
-    clipped = phase * np.minimum(amplitude / np.maximum(median, np.finfo(np.float64).tiny), 3.0)
-    return WhitenedBand(phase, clipped, first, n)
+    per_hz = samples / rate_hz
+    part = spectrum[round(low_hz * per_hz) : round(high_hz * per_hz)]
+    amplitude = np.maximum(np.abs(part), np.finfo(np.float64).tiny)
+    median = running_median(amplitude, round(median_hz * per_hz))
+    phase = part / amplitude
+    clipped = phase * np.minimum(amplitude / median, CLIP_MEDIANS)
+    return WhitenedBand(phase.astype(np.complex64), clipped.astype(np.complex64))
 
 
-def squared_envelope(band: Complex, samples: int) -> Real:
-    """Squared envelope of a band, over its mean, ``[samples]``: 1 on average.
+def squared_envelope(band: Band, bins: int) -> Envelope:
+    """Squared envelope of a band over its mean, 1 on average, on no more samples than it takes.
 
     Args:
-        band: one-sided spectrum of the band, ``[bins]``; where it lies does not matter.
-        samples: length of the signal that it was taken from.
+        band: one-sided spectrum of the band; where it lies does not matter.
+        bins: how many bins of the envelope's own spectrum will be looked at: those are free of aliasing.
+
+    Returns:
+        ``[samples]`` at a rate of its own, over the signal's whole duration.
     """
-    analytic = scipy.fft.ifft(band, samples)
+    analytic = scipy.fft.ifft(band, scipy.fft.next_fast_len(int(OVERSAMPLING * len(band)) + bins))
     envelope = analytic.real**2 + analytic.imag**2
-    return np.asarray(envelope / envelope.mean(), dtype=np.float64)
+    return np.asarray(envelope / envelope.mean(), dtype=np.float32)
 
 
-def line_power(envelope: Real, bins: int) -> Real:
+def line_power(envelope: Envelope, bins: int) -> Real:
     """Squared peak amplitudes of the lines in an envelope, ``[bins]``, by a Hann-windowed spectrum."""
-    n = len(envelope)
-    window = np.hanning(n + 1)[:n]
-    spectrum = scipy.fft.rfft((envelope - envelope.mean()) * window)[:bins]
-    power = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
-    return np.asarray(power, dtype=np.float64)
+    window = hann(len(envelope))
+    spectrum = scipy.fft.rfft((envelope - envelope.mean()) * window)[:bins].astype(np.complex128)
+    return np.asarray((spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum(dtype=np.float64)) ** 2)
+
+
+@lru_cache(maxsize=8)
+def hann(samples: int) -> Envelope:
+    """The periodic Hann window, ``[samples]``; kept, as the same lengths come again and again."""
+    window = np.hanning(samples + 1)[:samples].astype(np.float32)
+    window.setflags(write=False)
+    return window

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.signal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.race.verdict import Part, PartEvidence
 
-    Real = NDArray[np.float64]
+    Complex = NDArray[np.complex128]
 
 FIRST_EDGE_HZ = 400.0
-RESOLUTION_HZ = 50.0
+TOP_SHARE = 0.48
+"""Of the sample rate: anti-aliasing filters have their edge about here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +61,20 @@ class RaceBaseline:
     speed_rpm: float
 
 
-def band_levels(samples: Real, rate_hz: float) -> BandLevels:
+def band_levels(spectrum: Complex, samples: int, rate_hz: float) -> BandLevels:
     """Mean square in the octave bands above 400 Hz that end below 0.48 of the sample rate.
 
     Args:
-        samples: ``[n]``.
-        rate_hz: their sample rate.
+        spectrum: one-sided spectrum of the signal, unwindowed.
+        samples: length of the signal.
+        rate_hz: its sample rate.
     """
     edges = [FIRST_EDGE_HZ]
-    while 2.0 * edges[-1] <= 0.48 * rate_hz:
+    while 2.0 * edges[-1] <= TOP_SHARE * rate_hz:
         edges.append(2.0 * edges[-1])
-    length = min(len(samples), scipy.fft.next_fast_len(int(rate_hz / RESOLUTION_HZ)))
-    frequency, density = scipy.signal.welch(samples, rate_hz, nperseg=length)
-    width = frequency[1]
-    band = np.searchsorted(edges, frequency, side="right") - 1
-    power = tuple(float(density[band == k].sum() * width) for k in range(len(edges) - 1))
-    return BandLevels(tuple(edges), power)
+    places = [round(edge * samples / rate_hz) for edge in edges]
+    power = [
+        2.0 * float(np.vdot(spectrum[low:high], spectrum[low:high]).real) / samples**2
+        for low, high in pairwise(places)
+    ]
+    return BandLevels(tuple(edges), tuple(power))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
-from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
+from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, best_comb, fundamental, highest_order, part_lines
 from daqsvc.bearing.race.decision import decide, weight_of
 from daqsvc.bearing.race.depth import ModulationDepth, sharpest
@@ -40,10 +40,9 @@ if TYPE_CHECKING:
     from daqsvc.bearing.geometry import BearingOrders
 
     Real = NDArray[np.float64]
+    Envelope = NDArray[np.float32]
 
-TOP_SHARE = 0.48
-"""Of the sample rate: anti-aliasing filters have their edge about here."""
-LOG_OFFSET = 1e-3
+LOG_OFFSET = np.float32(1e-3)
 """Keeps the logarithm of the envelope from following its zeros."""
 SHARPEN_SHARE = 0.01
 LEAST_LINE_NATS = 3.0
@@ -150,14 +149,15 @@ def race_features(
     """Measure what the decision rests on; arguments and errors as of `race_test`."""
     x = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
     x = x[: scipy.fft.prev_fast_len(len(x), real=True)]
-    x = x - x.mean()
-    shaft = shaft_rate(x, rate_hz, speed_rpm / 60.0, rules.speed_tolerance)
-    revolutions = len(x) / rate_hz * shaft.rate_hz
+    length = len(x)
+    spectrum = scipy.fft.rfft(x - x.mean())
+    shaft = shaft_rate(spectrum, rate_hz / length, speed_rpm / 60.0, rules.speed_tolerance)
+    revolutions = length / rate_hz * shaft.rate_hz
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
-    band = whiten(x, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
+    band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
-    bins = min(int(top_order * revolutions) + 10, len(x) // 2)
-    phases, sizes = squared_envelope(band.phase, len(x)), squared_envelope(band.clipped, len(x))
+    bins = min(int(top_order * revolutions) + 10, len(band.phase) // 2)
+    phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
     square = _view(phases, sizes, bins, revolutions)
     log = _view(np.log(phases + LOG_OFFSET), np.log(sizes + LOG_OFFSET), bins, revolutions)
     # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
@@ -166,7 +166,7 @@ def race_features(
     return RaceFeatures(
         evidence=evidence,
         lines=_found(evidence, square, bearing, shaft.rate_hz),
-        levels=band_levels(x, rate_hz),
+        levels=band_levels(spectrum, length, rate_hz),
         speed_rpm=60.0 * shaft.rate_hz,
         speed_seen=shaft.seen,
         revolutions=revolutions,
@@ -178,7 +178,7 @@ def race_features(
     )
 
 
-def _view(phases: Real, sizes: Real, bins: int, revolutions: float) -> _Envelope:
+def _view(phases: Envelope, sizes: Envelope, bins: int, revolutions: float) -> _Envelope:
     lines = line_evidence(line_power(phases, bins), revolutions)
     power = line_power(sizes, bins)
     return _Envelope(lines, ModulationDepth(power, lines.notched, revolutions), power)
@@ -216,11 +216,14 @@ def _weigh(
     """Evidence for a part: the lesser of the two views, as each is fooled by something the other is not."""
     comb = best_comb((square.lines, log.lines), bearing, part, slip)
     z = significance(comb.score, part, revolutions, slip)
-    found = sharpest((square.depth, log.depth), comb.order, SHARPEN_SHARE, revolutions)
+    order = fundamental(bearing, part)
+    gap = abs(order - round(order))
+    # Never across a harmonic of the shaft: what lies beyond it is not this part.
+    reach = min(SHARPEN_SHARE, 0.5 * gap / order)
+    found = sharpest((square.depth, log.depth), comb.order, reach, revolutions)
     by_square, by_log = (float(view.depth.comb(np.array([found]))[0]) for view in (square, log))
     depth = by_square if part == "ball" else min(by_square, by_log)
-    order = fundamental(bearing, part)
-    away = abs(order - round(order)) * revolutions
+    away = gap * revolutions
     testable = part != "ball" or away >= rules.ball_testable_bins
     return PartEvidence(
         z=z,

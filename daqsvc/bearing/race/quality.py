@@ -94,8 +94,9 @@ def _clipped_share(x: Real) -> float:
     """Share of samples in runs at an extreme value."""
     clipped = 0
     for extreme in (x.min(), x.max()):
-        at = np.concatenate(([0], (x == extreme).astype(np.int8), [0]))
-        edges = np.flatnonzero(np.diff(at))
-        runs = edges[1::2] - edges[::2]
-        clipped += int(runs[runs >= CLIPPED_RUN].sum())
+        at = np.flatnonzero(x == extreme)
+        if len(at) >= CLIPPED_RUN:
+            starts = np.flatnonzero(np.diff(at, prepend=at[0] - 2) > 1)
+            runs = np.diff(starts, append=len(at))
+            clipped += int(runs[runs >= CLIPPED_RUN].sum())
     return clipped / len(x)

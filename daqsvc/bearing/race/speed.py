@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
-from daqsvc.dsp.envelope import running_median
+from daqsvc.dsp.envelope import hann, running_median
 from daqsvc.dsp.order_speed import find_speed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Real = NDArray[np.float64]
+    Complex = NDArray[np.complex128]
 
 HARMONICS = np.arange(1, 9)
 WEIGHTS = np.where(HARMONICS < 4, 1.0, 0.5)
@@ -22,6 +23,7 @@ CAP_NATS = 4.0
 """Most that one harmonic counts: a strong line that is not the shaft's must not decide alone."""
 PRIOR_SHARE = 0.006
 """Spread of the true speed about the stated one. A weaker prior was drawn to the lines of the bearing."""
+HIGHEST_ORDER = 16.0
 LINE_DEVIATION_SHARE = 0.002
 """Largest deviation of a speed from the lines of 1X to 3X that is taken before the votes of all harmonics."""
 SEEN_NATS = 8.0
@@ -44,18 +46,25 @@ class ShaftRate:
     other: str = ""
 
 
-def shaft_rate(signal: Real, rate_hz: float, stated_hz: float, tolerance: float) -> ShaftRate:
+def shaft_rate(spectrum: Complex, step_hz: float, stated_hz: float, tolerance: float) -> ShaftRate:
     """Refine a stated shaft rate by the harmonics of the shaft in a signal.
 
     The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
     with a limited voice.
 
     Args:
-        signal: ``[n]``, without mean.
-        rate_hz: its sample rate.
+        spectrum: one-sided spectrum of the signal, unwindowed.
+        step_hz: between its bins.
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
     """
+    # All that matters lies at low frequencies: as a slower series it is found in no time.
+    bins = min(int(HIGHEST_ORDER * stated_hz / step_hz), len(spectrum) - 1)
+    low = spectrum[:bins].copy()
+    low[0] = 0.0
+    samples = scipy.fft.next_fast_len(2 * bins, real=True)
+    signal = scipy.fft.irfft(low, samples)
+    rate_hz = samples * step_hz
     voted, votes = _vote(signal, rate_hz, stated_hz, tolerance)
     try:
         line = find_speed(signal[:, np.newaxis], rate_hz, stated_hz)
@@ -70,9 +79,8 @@ def shaft_rate(signal: Real, rate_hz: float, stated_hz: float, tolerance: float)
 def _vote(signal: Real, rate_hz: float, stated_hz: float, tolerance: float) -> tuple[float, float]:
     """The rate that most harmonics speak for, and their votes in nats."""
     n = len(signal)
-    window = np.hanning(n + 1)[:n]
     top = min(stated_hz * (1.0 + tolerance) * (HARMONICS[-1] + 2.0), 0.5 * rate_hz)
-    spectrum = scipy.fft.rfft(signal * window)[: int(top * n / rate_hz) + 1]
+    spectrum = scipy.fft.rfft(signal * hann(n))[: int(top * n / rate_hz) + 1]
     power = spectrum.real**2 + spectrum.imag**2
     ratio = power / np.maximum(running_median(power, round(2.0 * stated_hz * n / rate_hz)), 1e-300)
     score = np.minimum(np.log(np.maximum(ratio, 1e-12)), CAP_NATS)
