@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,17 +36,20 @@ class Orbit:
     Args:
         revolutions: whole revolutions.
         change: complex change of the forward 1X vector from `ONSET` on, in healthy amplitudes.
+        until: revolution at which it goes away again.
         seed: of the noise.
     """
 
     revolutions: int = 120
     change: complex = 0.0
+    until: float = math.inf
     seed: int = 1
 
     def __post_init__(self) -> None:
         index = np.arange(self.revolutions * SAMPLES_PER_REV)
         angle = 2.0 * np.pi * index / SAMPLES_PER_REV
-        forward = AMPLITUDE_UM * np.where(index < ONSET * SAMPLES_PER_REV, 1.0, 1.0 + self.change)
+        changed = (index >= ONSET * SAMPLES_PER_REV) & (index < self.until * SAMPLES_PER_REV)
+        forward = AMPLITUDE_UM * np.where(changed, 1.0 + self.change, 1.0)
         z = forward * np.exp(1j * (angle - 0.7)) + 0.01 * AMPLITUDE_UM * np.exp(-1j * angle) - 1j * SAG_UM
         rng = np.random.default_rng(self.seed)
         self.x: NDArray[np.float64] = z.real + NOISE_UM * rng.standard_normal(len(z))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -15,6 +15,7 @@ from daqsvc.rotor.synchronous.vectors import HARMONICS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from daqsvc.analysis.alarms import RotorAlarm
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors
@@ -103,9 +104,11 @@ class RotorAnalysis:
         onset: estimated begin of the change.
         departure: where the alarm is raised.
         declaration: where the final group was first named.
+        alarms: every alarm that was raised, those that went away again included.
         false_alarms_per_1000_rev: the rate that the threshold is set for.
         threshold_nats: of the departure test.
         calibration: the healthy baseline; None if there is none.
+        reference_revolutions: healthy revolutions that the baseline has grown to.
         speed_rpm: mean shaft speed, negative if clockwise; None if not known.
         revolutions: whole revolutions in the recording.
         history: every change of what was said.
@@ -126,9 +129,11 @@ class RotorAnalysis:
     onset: Instant | None = None
     departure: Instant | None = None
     declaration: Instant | None = None
+    alarms: tuple[RotorAlarm, ...] = ()
     false_alarms_per_1000_rev: float | None = None
     threshold_nats: float | None = None
     calibration: Calibration | None = None
+    reference_revolutions: int | None = None
     speed_rpm: float | None = None
     revolutions: int = 0
     history: tuple[Step, ...] = ()
@@ -163,9 +168,12 @@ class RotorAnalysis:
                 "onset": _json_of(self.onset),
                 "departure": _json_of(self.departure),
                 "declaration": _json_of(self.declaration),
+                "alarms": [alarm.as_json() for alarm in self.alarms],
                 "false_alarms_per_1000_rev": self.false_alarms_per_1000_rev,
                 "threshold_nats": self.threshold_nats,
-                "calibration": None if self.calibration is None else calibration_json(self.calibration),
+                "calibration": None
+                if self.calibration is None
+                else calibration_json(self.calibration, self.reference_revolutions),
                 "speed_rpm": self.speed_rpm,
                 "revolutions": self.revolutions,
                 "data_quality": self.quality.as_json(),
@@ -179,11 +187,13 @@ class RotorAnalysis:
         """A few lines for a person."""
         lines = [f"{self.recording}: {self._headline()}"]
         if self.departure is not None and self.onset is not None:
-            lines.append(f"changed at {_told(self.onset)}; alarm at {_told(self.departure)}" + self._named())
+            lines.append(f"changed at {told(self.onset)}; alarm at {told(self.departure)}" + self._named())
+        if len(self.alarms) > 1 or any(alarm.returned is not None for alarm in self.alarms):
+            lines += [alarm.describe() for alarm in self.alarms]
         if self.identification is not None and self.calibration is not None:
             lines.append(self._change())
             lines += [
-                f"{_words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
+                f"{words(fault)}: {', '.join(_figure(key, value) for key, value in level.items())}"
                 for fault, level in self.level.items()
                 if level
             ]
@@ -194,7 +204,7 @@ class RotorAnalysis:
                 f"{was.revolutions} revolutions at {abs(was.speed_rpm):.1f} rpm, noise {was.noise_um:.3g} um "
                 f"({was.snr_db:.0f} dB)"
             )
-            lines.append(f"the machine {was.describe()}")
+            lines.append(f"the machine {_grown(was, self.reference_revolutions).describe()}")
         bad = [
             f"{count} {what} samples of {name}"
             for what, counts in (("missing", self.quality.missing), ("infinite", self.quality.infinite))
@@ -215,20 +225,26 @@ class RotorAnalysis:
             return "no detector of a rotor fault in the machine file"
         if self.verdict is None:
             return "changed, but no revolution after the change can be judged"
-        said = " or ".join(_words(name) for name in self.group)
+        said = " or ".join(words(name) for name in self.group)
         chance = self.probabilities.get(self.verdict, 0.0)
+        if self.verdict == "normal" and self.alarms:
+            count = len(self.alarms)
+            raised = "an alarm was" if count == 1 else f"{count} alarms were"
+            return (
+                f"normal at the end of {self.revolutions} revolutions, but {raised} raised and cleared before"
+            )
         if self.verdict == "normal":
             return f"normal through {self.revolutions} revolutions"
         if not self.named:
             said += " (not yet settled)"
         elif len(self.group) > 1:
-            said += f" (cannot be told apart; {_words(self.verdict)} {_percent(chance)})"
+            said += f" (cannot be told apart; {words(self.verdict)} {_percent(chance)})"
         else:
             said += f" ({_percent(chance)})"
         return said
 
     def _named(self) -> str:
-        return f"; named at {_told(self.declaration)}" if self.declaration is not None else "; not named"
+        return f"; named at {told(self.declaration)}" if self.declaration is not None else "; not named"
 
     def _change(self) -> str:
         assert self.identification is not None  # noqa: S101 - asked before
@@ -241,8 +257,14 @@ class RotorAnalysis:
         )
 
 
-def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """A calibration for the output."""
+def calibration_json(calibration: Calibration, reference_revolutions: int | None = None) -> dict[str, Any]:
+    """A calibration for the output.
+
+    Args:
+        calibration: the calibration.
+        reference_revolutions: healthy revolutions that its baseline has grown to; None: it has not.
+    """
+    grown = _grown(calibration, reference_revolutions)
     return {
         "revolutions": calibration.revolutions,
         "speed_rpm": calibration.speed_rpm,
@@ -252,8 +274,13 @@ def calibration_json(calibration: Calibration) -> dict[str, Any]:
         "noise_um": calibration.noise_um,
         "snr_db": calibration.snr_db,
         "laval": calibration.laval,
-        "verdict": calibration.describe(),
+        "reference_revolutions": grown.revolutions,
+        "verdict": grown.describe(),
     }
+
+
+def _grown(calibration: Calibration, revolutions: int | None) -> Calibration:
+    return calibration if revolutions is None else replace(calibration, revolutions=revolutions)
 
 
 def finite(value: Any) -> Any:
@@ -273,7 +300,8 @@ def _json_of(instant: Instant | None) -> dict[str, Any] | None:
     return None if instant is None else instant.as_json()
 
 
-def _told(instant: Instant) -> str:
+def told(instant: Instant) -> str:
+    """A place in words."""
     return f"revolution {instant.revolution} (sample {instant.sample}, {instant.seconds:.3f} s)"
 
 
@@ -281,7 +309,8 @@ def _degrees(vector: complex) -> float:
     return math.degrees(math.atan2(vector.imag, vector.real))
 
 
-def _words(name: str) -> str:
+def words(name: str) -> str:
+    """A verdict in words."""
     return name.replace("_", " ")
 
 
@@ -296,5 +325,5 @@ def _figure(key: str, value: float) -> str:
     """A figure whose name ends in its unit, in words: ``change_um`` 3.0 is ``change 3 um``."""
     for ending, unit in _UNITS.items():
         if key.endswith(ending):
-            return f"{_words(key.removesuffix(ending))} {value:.3g}{unit}"
-    return f"{_words(key)} {value:.3g}"
+            return f"{words(key.removesuffix(ending))} {value:.3g}{unit}"
+    return f"{words(key)} {value:.3g}"

@@ -6,7 +6,6 @@ the one that watches the machine live.
 
 from __future__ import annotations
 
-import bisect
 import math
 import re
 from dataclasses import dataclass, field, replace
@@ -16,8 +15,9 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.analysis import quality as checks
+from daqsvc.analysis.alarms import Places, declared_at, rotor_alarms
 from daqsvc.analysis.quality import ClippedError, DataQuality
-from daqsvc.analysis.result import Instant, RotorAnalysis, Step, Trace
+from daqsvc.analysis.result import RotorAnalysis, Step, Trace
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed import LEAST_JUDGED, speed_of, too_short
 from daqsvc.diagnosis.detector import Window
@@ -51,6 +51,8 @@ _NO_MEAN = (
     "seen"
 )
 _FIGURES = re.compile(r"[\d.]+")
+_MOST_REFERENCE = 2000
+"""Revolutions that the baseline grows to (`daqsvc.rotor.synchronous.departure`)."""
 _SEEN = 128
 """Revolutions that say what a healthy machine looks like at the end."""
 
@@ -220,6 +222,7 @@ class _Reading:
         last = self._last_look()
         steps = history(self.reports, last)
         departed = self._departed()
+        places = Places(self.reports, self.vectors.period_samples, self.recording.rate_hz)
         threshold = threshold_for(self.setup.rules.false_alarms_per_1000_rev)
         analysis = RotorAnalysis(
             recording=str(self.recording.source),
@@ -229,7 +232,9 @@ class _Reading:
             named=True,
             false_alarms_per_1000_rev=self.setup.rules.false_alarms_per_1000_rev,
             threshold_nats=threshold,
+            alarms=rotor_alarms(places, last),
             calibration=calibration,
+            reference_revolutions=self._reference_revolutions(calibration, departed),
             speed_rpm=math.copysign(
                 60.0 * self.recording.rate_hz / float(self.vectors.period_samples.mean()),
                 self.setup.speed_rpm or 1.0,
@@ -244,7 +249,7 @@ class _Reading:
                 {name: nats - threshold * (name != "normal") for name, nats in evidence.items()}
             )
             return replace(analysis, evidence=evidence, probabilities=chances)
-        analysis = replace(analysis, onset=self._onset(departed), departure=self._end_of(departed))
+        analysis = replace(analysis, onset=places.onset(departed), departure=places.end_of(departed))
         if last is None:
             return replace(analysis, verdict=None, group=(), named=False)
         return replace(
@@ -257,7 +262,7 @@ class _Reading:
             severity=last.severity,
             level=levels(last, calibration),
             identification=last,
-            declaration=self._declared(departed, last),
+            declaration=declared_at(places, self.reports[self.reports.index(departed) :], last),
         )
 
     def _departed(self) -> WatchReport | None:
@@ -278,30 +283,17 @@ class _Reading:
             return self.reports[-1].identification
         return self.detector.watch.finish()
 
-    def _declared(self, departed: WatchReport, last: Identification) -> Instant | None:
-        if not last.named:
-            return None
+    def _reference_revolutions(self, calibration: Calibration, departed: WatchReport | None) -> int:
+        """Healthy revolutions that the baseline has grown to, before the change if there is one."""
+        watched, before = 0, "watching" if self.setup.calibrations else "calibrating"
         for report in self.reports:
-            said = report.identification
-            if report.revolution < departed.revolution or said is None or not report.looked:
-                continue
-            if said.named and set(said.group) == set(last.group):
-                return self._end_of(report)
-        return self._end_of(self.reports[-1])
-
-    def _onset(self, departed: WatchReport) -> Instant:
-        """Where the revolution begins that the change is estimated to begin with."""
-        first = departed.onset_revolution or departed.revolution
-        numbers = [report.revolution for report in self.reports]
-        place = min(bisect.bisect_left(numbers, first), len(numbers) - 1)
-        begin = self.reports[place].end_index - round(float(self.vectors.period_samples[place]))
-        return self._instant(max(0, begin), first - 1)
-
-    def _end_of(self, report: WatchReport) -> Instant:
-        return self._instant(report.end_index, report.revolution)
-
-    def _instant(self, sample: int, revolution: int) -> Instant:
-        return Instant(sample, sample / self.recording.rate_hz, revolution)
+            if report is departed:
+                watched -= report.revolution - (report.onset_revolution or report.revolution)
+                break
+            # What begins anew begins with the revolutions of its calibration.
+            watched = watched + 1 if report.state == before == "watching" else 0
+            before = report.state
+        return min(_MOST_REFERENCE, calibration.revolutions + max(0, watched))
 
     def _healthy_evidence(self, calibration: Calibration, calibrated: int) -> Mapping[RotorFault, float]:
         """What the last revolutions of a machine that has not departed say for every hypothesis."""

@@ -96,7 +96,8 @@ def test_a_growing_unbalance_is_found_and_placed(analyze: Callable[..., Any], tm
 def test_every_key_is_documented(analyze: Callable[..., Any], machine: Path, tmp_path: Path) -> None:
     told = (CONFIG.parents[1] / "docs" / "analyze.md").read_text()
     _, (found,), _ = analyze(machine, Orbit(change=UNBALANCE).save(tmp_path / "a.npz"))
-    for keys in (found, found["calibration"], found["data_quality"], found["history"][0], found["onset"]):
+    parts = (found["calibration"], found["data_quality"], found["history"][0], found["onset"])
+    for keys in (found, found["alarms"][0], *parts):
         assert [key for key in keys if f"`{key}`" not in told] == []
     assert [name for name in VERDICTS if f"`{name}`" not in told] == []
 
@@ -492,6 +493,11 @@ def test_a_calibration_stands_in_for_the_first_revolutions(
     )
     assert (code, err) == (0, "")
     assert [one["verdict"] for one in found] == ["normal", "unbalance"]
+    # The baseline grows with the healthy recording; what it grows from is the file's in both.
+    grown = [one["calibration"].pop("reference_revolutions") for one in found]
+    said = [one["calibration"].pop("verdict") for one in found]
+    assert grown[0] > grown[1]
+    assert said[0] != said[1]
     assert found[0]["calibration"] == found[1]["calibration"]
     assert found[1]["departure"]["revolution"] <= 2
     code, found, err = analyze(tmp_path / "f.npz", *options, "--damping-ratio", "0.1")
