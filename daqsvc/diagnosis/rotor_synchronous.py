@@ -43,8 +43,6 @@ _ORBIT_LOCK_REVOLUTIONS = 20.0
 """The same of the orbit cutter, which has to find the speed first."""
 _OVERSPEED = 2.0
 """No machine turns at so many times its stated speed; pulses that say so are noise."""
-_RELOCK_REVOLUTIONS = 16.0
-"""After so long without a shaft angle the keyphasor is looked at as if for the first time."""
 _NO_MEAN_UM = 1e6
 """A drift of the probes beside which no mean position is evidence of anything."""
 _DOUBTED = 2
@@ -144,7 +142,6 @@ class RotorSynchronousDetector:
         self._watch = self._new_watch(rotor, calibration)
         self._report: WatchReport | None = None
         self._refused = ""
-        self._untrusted = 0
         self._t_end_ns = 0
         self._period_ns = 0.0
         self._verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
@@ -178,10 +175,6 @@ class RotorSynchronousDetector:
             self._judge.reset()
             self._checks.reset()
         said = [self._turn(turn) for turn in self._turns.process(window.samples, window.first_index)]
-        if self._untrusted > _RELOCK_REVOLUTIONS * self._turns.period:
-            # Whatever the pulses seem to be locked to is not the shaft.
-            self._turns.restart()
-            self._untrusted = 0
         said.append(self._blind())
         return [diagnosis for diagnosis in said if diagnosis is not None]
 
@@ -203,7 +196,7 @@ class RotorSynchronousDetector:
             baseline = calibration.baseline.copy()
             baseline[0] = 0.0
             calibration = replace(calibration, baseline=baseline)
-        rules = self._rules
+        rules = replace(self._rules, angle_assumed=self._reference == "fixed")
         if self.ac_coupled:
             # Where the shaft touches is told from where it runs: without that a crack can look like a rub.
             naming = replace(rules.naming, rub_margin_nats=math.inf)
@@ -239,7 +232,6 @@ class RotorSynchronousDetector:
         least_um = 0.0
         if self._refused and not self._rules.retry:
             return Verdict("not_ok", self._refused)
-        self._untrusted = 0 if turn.trusted else self._untrusted + len(turn.raw)
         if not turn.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
             return Verdict("missing", self._angle_unknown())
         if calibration is not None:

@@ -156,10 +156,6 @@ class Turns:
         self.end_index = first_index + len(values)
         return list(self._cut(values))
 
-    def restart(self) -> None:
-        """Look for the shaft anew from the next sample on."""
-        self._begin_cutting(self.end_index)
-
     def _new_cutter(self) -> RevolutionCutter:
         if self._reference == "fixed":
             return FixedSpeedCutter(self.period)

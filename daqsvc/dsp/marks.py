@@ -38,6 +38,8 @@ _BEND_EDGES = 1.5
 """The curvature is taken from so many times the edges that the line goes through."""
 _BEND_DOUBT = 3.0
 """A curvature of so many standard deviations is half believed."""
+_CONTRADICTED = 4.0
+"""A parabola whose speed is so many times that of the last revolution, or negative, goes through noise."""
 _QUARTILE = 1.15
 """Upper quartile of the absolute deviation from the mean, in standard deviations."""
 _FOLLOWED_REVOLUTIONS = 4.0
@@ -324,6 +326,10 @@ class MarkLine:
         self._bend = _believable_bend(since, turns)
         near = slice(-self._line_edges, None)
         self._offset, self._rate = _line(since[near], (turns - self._bend * since**2)[near])
+        before = self.marks[-2]
+        lasted = before.samples_before(last) / (last.revolution - before.revolution)
+        if not 1.0 / _CONTRADICTED < self._rate * lasted < _CONTRADICTED:
+            self._bend, self._offset, self._rate = 0.0, 0.0, 1.0 / lasted
         self.period = 1.0 / self._rate
         self._hold = _FOLLOWED_REVOLUTIONS * self.period
         if self._bend < 0.0:

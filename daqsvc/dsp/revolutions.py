@@ -157,9 +157,9 @@ class KeyphasorCutter:
             accepted = self._line.judge(begin + sample, fraction)
             if self._line.number != self._number:
                 self._number = self._line.number
-                self._marks.restart(self._line.marks)
+                self._marks.restart(self._line.marks, self._line.period)
             elif accepted and self._line.locked:
-                self._marks.add(self._line.marks[-1])
+                self._marks.add(self._line.marks[-1], self._line.period)
         self._marks.wait(self._shaft.position)
         return self._shaft.take()
 

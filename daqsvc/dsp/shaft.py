@@ -145,20 +145,28 @@ class Between:
         self._marks: list[Mark] = []
         """Marks of the line from ``_edge`` on."""
 
-    def add(self, mark: Mark) -> None:
-        """The next mark of the line."""
+    def add(self, mark: Mark, period_samples: float) -> None:
+        """The next mark of the line.
+
+        Args:
+            mark: the mark.
+            period_samples: samples per revolution by the line.
+        """
         if not self._marks:
             self._fill(mark)
+        # By this the next mark is waited for, whatever the revolutions before it lasted: those of noise can
+        # be so short that every mark of the shaft would come too late.
+        self._period = period_samples
         self._marks.append(mark)
         if len(self._marks) > 2:
             self._cut(self._marks[2])
 
-    def restart(self, marks: Iterable[Mark]) -> None:
-        """A new line of marks, numbered anew."""
+    def restart(self, marks: Iterable[Mark], period_samples: float) -> None:
+        """A new line of marks, numbered anew; see `add`."""
         self._finish()
         for mark in marks:
             if self._edge is None or mark.index > self._edge.index:
-                self.add(mark)
+                self.add(mark, period_samples)
 
     def wait(self, position: int) -> None:
         """Settle what is overdue when all samples before ``position`` are there."""

@@ -254,6 +254,42 @@ def test_double_pulses_change_nothing(period, ratio, extra):
     assert subject.counts.rejected == len(extra)
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    period=st.floats(16.0, 120.0),
+    expected=st.sampled_from([0.5, 0.8, 1.0, 1.25, 2.0]),
+    before=st.floats(0.0, 30.0),
+    lost=st.floats(1.0, 60.0),
+    hum_per_turn=st.floats(0.15, 12.0),
+    hum=st.sampled_from([0.0, 1.5]),
+    noise=st.sampled_from([0.0, 0.3, 1.0, 7.0]),
+    seed=st.integers(0, 1000),
+    cuts=cuts_anywhere,
+)
+def test_pulses_that_come_back_are_believed_again(
+    period, expected, before, lost, hum_per_turn, hum, noise, seed, cuts
+):
+    turns = 0.3 + np.arange(round((before + lost + 40) * period)) / period
+    marker = pulses(turns)
+    begin, end = round(before * period), round((before + lost) * period)
+    rng = np.random.default_rng(seed)
+    marker[begin:end] = hum * np.sin(2 * math.pi * (hum_per_turn * turns[begin:end] + rng.uniform()))
+    marker[begin:end] += noise * rng.standard_normal(end - begin)
+    xy = orbit(turns)
+    got = keyphasor_cutter(expected * period).process(xy, marker)
+    assert_sound(got)
+    assert_same(process_in_pieces(keyphasor_cutter(expected * period), xy, marker, cuts), got)
+    # Whatever the line was locked to, eight edges in step unmask it, and eight more fill it.
+    begins = turns[got.first_index + got.starts]
+    back = begins > turns[end] + 20.0
+    assert back.sum() >= 15
+    assert got.trusted[back].all()
+    np.testing.assert_allclose(got.period_samples[back], period, rtol=1e-3)
+    error, _ = errors(got, turns)
+    late = np.repeat(back, np.diff(np.append(got.starts, len(got.xy))))
+    assert np.abs(error[late]).max() < 0.02
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     cutter=st.sampled_from(["fixed", "keyphasor", "orbit"]),
