@@ -52,21 +52,25 @@ class Stretch:
 def unrest(vectors: Complexes, noise: Floats, samples: Floats, previous: Complexes | None = None) -> Floats:
     """Variance of a sample that does not repeat with the shaft, float64 ``[R]``.
 
-    The residual within the revolution and the step from the one before: a whirl at half the speed leaves
-    little in the residual, as five harmonics fit half a cycle well, but is another one every time. For
-    white noise it equals the noise.
+    The residual within the revolution, and the bend of the vector over three revolutions: a whirl at half
+    the speed leaves little in the residual, as five harmonics fit half a cycle well, but is another one
+    every time. A vector that creeps or settles hardly bends. For white noise it equals the noise.
 
     Args:
         vectors: complex128 ``[R, 5]``.
         noise: float64 ``[R]``, variance of the residual of a sample.
         samples: float64 ``[R]``.
-        previous: complex128 ``[5]``, vector of the revolution before; None: there is none.
+        previous: complex128 ``[P, 5]``, vectors of the revolutions before, the last two of them count.
     """
-    before = np.vstack((vectors[:1] if previous is None else previous[np.newaxis], vectors[:-1]))
-    steps = np.sum(np.abs(vectors - before) ** 2, axis=1) / 2.0
-    if previous is None and len(steps) > 1:
-        steps[0] = steps[1]
-    return np.asarray((noise * np.maximum(samples - 5.0, 1.0) + samples * steps) / samples)
+    known = vectors if previous is None else np.vstack((previous[-2:], vectors))
+    bends = np.full(len(known), np.nan)
+    if len(known) > 2:
+        bends[2:] = np.sum(np.abs(known[2:] - 2.0 * known[1:-1] + known[:-2]) ** 2, axis=1) / 6.0
+        bends[:2] = bends[2]
+    else:
+        bends[:] = 5.0 * noise.mean() / samples.mean()
+    bends = bends[len(known) - len(vectors) :]
+    return np.asarray((noise * np.maximum(samples - 5.0, 1.0) + samples * bends) / samples)
 
 
 def oddest_stretch(vectors: Complexes, white: float, memory: float, floor: float, guard: Floats) -> Stretch:

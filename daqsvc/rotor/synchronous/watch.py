@@ -23,14 +23,13 @@ from daqsvc.rotor.synchronous.baseline import (
     with_more,
 )
 from daqsvc.rotor.synchronous.departure import DepartureTest, Evidence, Spread, threshold_for
-from daqsvc.rotor.synchronous.identify import Energy, Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.identify import Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.segments import Row, lasting_energy, noise_scatter, scatter
 from daqsvc.rotor.synchronous.steadiness import unrest
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from daqsvc.dsp.revolutions import Revolutions
@@ -110,14 +109,6 @@ class WatchReport:
     refused: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    revolution: int
-    vector: Complexes
-    noise: float
-    speed: float
-
-
 class RotorWatch:
     """Watches one rotor by its synchronous vectors.
 
@@ -143,9 +134,9 @@ class RotorWatch:
         self.refused = ""
         self.revolutions = 0
         self._waiting: list[SynchronousVectors] = []
-        self._previous: Complexes | None = None
-        self._rows: deque[_Row] = deque(maxlen=_KEPT)
-        self._segment: list[_Row] = []
+        self._previous: Complexes = np.empty((0, 5), dtype=np.complex128)
+        self._rows: deque[Row] = deque(maxlen=_KEPT)
+        self._segment: list[Row] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
         self._begun, self._middle = 0, 0.0
@@ -191,8 +182,8 @@ class RotorWatch:
             return self._calibrate(one)
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
         restless = float(unrest(moved, one.noise, one.samples, self._previous)[0])
-        self._previous = moved[0]
-        row = _Row(self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0]))
+        self._previous = np.vstack((self._previous[-1:], moved))
+        row = Row(self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0]))
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
         evidence = (
@@ -250,8 +241,8 @@ class RotorWatch:
         if self._onset is not None:
             spread = replace(
                 spread,
-                variance=np.maximum(spread.variance, self._scatter(self._segment)),
-                noise_variance=max(spread.noise_variance, self._noise_scatter()),
+                variance=np.maximum(spread.variance, scatter(self._segment)),
+                noise_variance=max(spread.noise_variance, noise_scatter(self._segment)),
             )
         return DepartureTest(
             spread,
@@ -265,7 +256,7 @@ class RotorWatch:
         turn_rad = 2.0 * math.pi * self.rules.speed_uncertainty
         return replace(healthy.spread, drift=self.rules.probe_drift_um**2, turn_rad=turn_rad)
 
-    def _tests(self, row: _Row) -> bool:
+    def _tests(self, row: Row) -> bool:
         """Whether a revolution goes into a departure test: not while a new segment settles."""
         if self._onset is None:
             return True
@@ -339,7 +330,7 @@ class RotorWatch:
         shift = self._healthy.baseline - self.calibration.baseline
         change = vectors.mean(axis=0) - shift
         spread = self._spread(self._healthy)
-        spread = replace(spread, variance=np.maximum(spread.variance, self._scatter(rows)))
+        spread = replace(spread, variance=np.maximum(spread.variance, scatter(rows)))
         apart = float(np.mean([row.revolution for row in rows])) - self._middle
         variance = spread.of_means(float(len(rows)), float(self._healthy.revolutions), speed, apart)
         self._identification = identify(
@@ -350,18 +341,8 @@ class RotorWatch:
             rules=self.rules.naming,
             may_name=may_name,
             comparison=self._comparison,
-            # While the rotor settles its vector moves by itself.
-            energy=self._energy(rows[len(rows) // 2 :]) if since >= _NAMED_FROM else None,
+            energy=lasting_energy(rows, self._healthy) if since >= _NAMED_FROM else None,
         )
-
-    def _energy(self, rows: Sequence[_Row]) -> Energy:
-        """The non-harmonic energy of some revolutions against the healthy one."""
-        assert self._healthy is not None  # noqa: S101
-        noise = float(np.mean([row.noise for row in rows]))
-        excess = max(0.0, noise - self._healthy.noise)
-        share = 1.0 / len(rows) + 1.0 / self._healthy.revolutions
-        scale = 2.0 * self._healthy.noise_variance * share * self._healthy.noise**2
-        return Energy(excess, excess**2 / scale)
 
     def _return_to_health(self) -> None:
         assert self._healthy is not None  # noqa: S101
@@ -371,20 +352,6 @@ class RotorWatch:
     def _floored(self, noise: float) -> float:
         assert self.calibration is not None  # noqa: S101
         return max(noise, 1e-6 * self.calibration.amplitude_um**2)
-
-    @staticmethod
-    def _scatter(rows: Sequence[_Row]) -> NDArray[np.float64]:
-        """Variance of the vectors of a segment, or zero of too few to tell."""
-        if len(rows) < 8:
-            return np.zeros(5)
-        vectors = np.array([row.vector for row in rows])
-        squares = np.abs(vectors - vectors.mean(axis=0)) ** 2
-        return np.asarray(squares.sum(axis=0) / (len(rows) - 1))
-
-    def _noise_scatter(self) -> float:
-        noise = np.array([row.noise for row in self._segment])
-        mean = float(noise.mean())
-        return float(noise.var(ddof=1)) / mean**2 if mean > 0.0 else 0.0
 
     def _report(
         self, one: SynchronousVectors, evidence: Evidence | None, *, departed: bool, looked: bool
