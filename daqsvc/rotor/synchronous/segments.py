@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _LEAST_ROWS = 8
 _LASTING = 0.7
-"""Part of the earlier energy that must be left in the later half: a rotor that settles shakes less and less."""
+"""Part of the earlier energy that must be left in the later half: a settling rotor shakes less and less."""
 
 
 @dataclass(frozen=True, slots=True)
