@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.bearing.race.verdict import RaceInputError
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
 
     Complex = NDArray[np.complex128]
 
+UNIT_DB = 15.0
+SAME_DB = 1.5
+LEAST_POWER = 1e-300
 FIRST_EDGE_HZ = 400.0
 TOP_SHARE = 0.48
 """Of the sample rate: anti-aliasing filters have their edge about here."""
@@ -38,12 +43,22 @@ class BandLevels:
         """Change since ``before`` of the whole and of the band that changed most, in dB.
 
         Only bands that both have are compared, so the two may differ in sample rate.
+
+        Raises:
+            RaceInputError: all bands changed alike and much, as by another unit.
         """
         common = min(len(self.power), len(before.power))
-        now, then = np.array(self.power[:common]), np.array(before.power[:common])
-        bands = 10.0 * np.log10(np.maximum(now, 1e-300) / np.maximum(then, 1e-300))
-        whole = 10.0 * np.log10(max(now.sum(), 1e-300) / max(then.sum(), 1e-300))
-        return float(whole), float(bands[np.argmax(np.abs(bands))])
+        now = np.maximum(self.power[:common], LEAST_POWER)
+        then = np.maximum(before.power[:common], LEAST_POWER)
+        bands = 10.0 * np.log10(now / then)
+        whole = float(10.0 * np.log10(now.sum() / then.sum()))
+        if common > 1 and abs(whole) > UNIT_DB and np.ptp(bands) < SAME_DB:
+            raise RaceInputError(
+                "unit",
+                f"differs from the baseline's: all bands changed by {whole:+.1f} dB alike",
+                "give both recordings in the same unit",
+            )
+        return whole, float(bands[np.argmax(np.abs(bands))])
 
 
 @dataclass(frozen=True, slots=True)

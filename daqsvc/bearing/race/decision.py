@@ -97,9 +97,9 @@ def _passed(part: Part, e: PartEvidence, rules: RaceRules, ease: float = 1.0) ->
         return 0.0
     depth_limit = rules.ball_depth_limit if part == "ball" else rules.depth_limit
     least = min(e.z / e.z_limit, e.depth / depth_limit, e.severity / (ease * e.limit))
-    if part != "ball":
+    if e.steadiness_limit > 0.0:
         # Squared: between knocks and strikes this ratio spans far less than the others do.
-        least = min(least, (e.steadiness / rules.steadiness_limit) ** 2)
+        least = min(least, (e.steadiness / e.steadiness_limit) ** 2)
     return max(0.0, least)
 
 

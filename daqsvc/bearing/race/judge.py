@@ -7,18 +7,17 @@ very regularly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.fft
 
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
-from daqsvc.bearing.race.combs import TEETH, best_comb, fundamental, highest_order, part_lines
-from daqsvc.bearing.race.decision import decide, weight_of
-from daqsvc.bearing.race.depth import ModulationDepth, sharpest
-from daqsvc.bearing.race.lines import NOTCHED_HARMONICS, LineEvidence, line_evidence
-from daqsvc.bearing.race.null import false_alarm_probability, significance
+from daqsvc.bearing.race.combs import TEETH, highest_order
+from daqsvc.bearing.race.decision import decide
+from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
+from daqsvc.bearing.race.null import false_alarm_probability
 from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.speed import shaft_rate
@@ -30,7 +29,8 @@ from daqsvc.bearing.race.verdict import (
     RaceLine,
     RaceVerdict,
 )
-from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
+from daqsvc.bearing.race.weigh import EnvelopeView, Scales, view_of
+from daqsvc.dsp.envelope import squared_envelope, whiten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,12 +39,9 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
 
-    Real = NDArray[np.float64]
-    Envelope = NDArray[np.float32]
 
 LOG_OFFSET = np.float32(1e-3)
 """Keeps the logarithm of the envelope from following its zeros."""
-SHARPEN_SHARE = 0.01
 LEAST_LINE_NATS = 3.0
 
 
@@ -59,6 +56,7 @@ class RaceFeatures:
         speed_rpm: of the shaft, as its harmonics show it.
         speed_seen: whether they stood out.
         revolutions: of the shaft in the record.
+        notes: what is odd about the samples.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -68,16 +66,8 @@ class RaceFeatures:
     speed_rpm: float
     speed_seen: bool
     revolutions: float
+    notes: tuple[str, ...]
     spectrum: EnvelopeSpectrum
-
-
-@dataclass(frozen=True, slots=True)
-class _Envelope:
-    """One non-linearity's view: evidence by the phases alone, sizes by clipped amplitudes."""
-
-    lines: LineEvidence
-    depth: ModulationDepth
-    power: Real
 
 
 def race_test(
@@ -123,7 +113,8 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     change_db = None if baseline is None else features.levels.change_db(baseline.levels)
     decision = decide(features.evidence, rules, baseline, change_db)
     evidence = features.evidence
-    notes = [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
+    notes = [*features.notes]
+    notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
     if not features.speed_seen:
         notes.append("no harmonics of the shaft stand out; the stated speed was taken as it is")
     return RaceVerdict(
@@ -147,10 +138,9 @@ def race_features(
     samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
 ) -> RaceFeatures:
     """Measure what the decision rests on; arguments and errors as of `race_test`."""
-    x = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
-    x = x[: scipy.fft.prev_fast_len(len(x), real=True)]
-    length = len(x)
-    spectrum = scipy.fft.rfft(x - x.mean())
+    sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
+    length = scipy.fft.prev_fast_len(len(sound.values), real=True)
+    spectrum = scipy.fft.rfft(sound.values[:length])
     shaft = shaft_rate(spectrum, rate_hz / length, speed_rpm / 60.0, rules.speed_tolerance)
     revolutions = length / rate_hz * shaft.rate_hz
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
@@ -158,11 +148,9 @@ def race_features(
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
     bins = min(int(top_order * revolutions) + 10, len(band.phase) // 2)
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
-    square = _view(phases, sizes, bins, revolutions)
-    log = _view(np.log(phases + LOG_OFFSET), np.log(sizes + LOG_OFFSET), bins, revolutions)
-    # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
-    slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
-    evidence = _weigh_all(square, log, bearing, revolutions, slip, rules)
+    square = view_of(phases, sizes, bins, revolutions)
+    log = view_of(np.log(phases + LOG_OFFSET), np.log(sizes + LOG_OFFSET), bins, revolutions)
+    evidence = Scales(square, log, bearing, shaft, revolutions, rules).weigh()
     return RaceFeatures(
         evidence=evidence,
         lines=_found(evidence, square, bearing, shaft.rate_hz),
@@ -170,6 +158,7 @@ def race_features(
         speed_rpm=60.0 * shaft.rate_hz,
         speed_seen=shaft.seen,
         revolutions=revolutions,
+        notes=sound.notes,
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),
@@ -178,78 +167,8 @@ def race_features(
     )
 
 
-def _view(phases: Envelope, sizes: Envelope, bins: int, revolutions: float) -> _Envelope:
-    lines = line_evidence(line_power(phases, bins), revolutions)
-    power = line_power(sizes, bins)
-    return _Envelope(lines, ModulationDepth(power, lines.notched, revolutions), power)
-
-
-def _weigh_all(
-    square: _Envelope,
-    log: _Envelope,
-    bearing: BearingOrders,
-    revolutions: float,
-    slip: float,
-    rules: RaceRules,
-) -> dict[Part, PartEvidence]:
-    """Evidence for all parts; lines that the foremost part explains do not speak for another one."""
-    evidence = {part: _weigh(part, square, log, bearing, revolutions, slip, rules) for part in PARTS}
-    first = max(PARTS, key=lambda part: weight_of(part, evidence[part], rules))
-    explained = part_lines(first, evidence[first].order, bearing)
-    rest_square = replace(square, lines=square.lines.without(explained))
-    rest_log = replace(log, lines=log.lines.without(explained))
-    for part, e in evidence.items():
-        if part != first and e.z >= e.z_limit:
-            evidence[part] = _weigh(part, rest_square, rest_log, bearing, revolutions, slip, rules)
-    return evidence
-
-
-def _weigh(
-    part: Part,
-    square: _Envelope,
-    log: _Envelope,
-    bearing: BearingOrders,
-    revolutions: float,
-    slip: float,
-    rules: RaceRules,
-) -> PartEvidence:
-    """Evidence for a part: the lesser of the two views, as each is fooled by something the other is not."""
-    comb = best_comb((square.lines, log.lines), bearing, part, slip)
-    z = significance(comb.score, part, revolutions, slip)
-    order = fundamental(bearing, part)
-    gap = abs(order - round(order))
-    # Never across a harmonic of the shaft: what lies beyond it is not this part.
-    reach = min(SHARPEN_SHARE, 0.5 * gap / order)
-    found = sharpest((square.depth, log.depth), comb.order, reach, revolutions)
-    by_square, by_log = (float(view.depth.comb(np.array([found]))[0]) for view in (square, log))
-    depth = by_square if part == "ball" else min(by_square, by_log)
-    away = gap * revolutions
-    testable = part != "ball" or away >= rules.ball_testable_bins
-    return PartEvidence(
-        z=z,
-        depth=depth,
-        steadiness=by_log / max(by_square, 1e-9),
-        severity=max(z, 0.0) * depth,
-        z_limit=rules.z_limit + (rules.z_unresolved if away < rules.unresolved_bins else 0.0),
-        limit=rules.ball_severity_limit if part == "ball" else rules.severity_limit,
-        false_alarm_probability=false_alarm_probability(z),
-        order=found,
-        testable=testable,
-        reason="" if testable else _why_not(order, rules),
-    )
-
-
-def _why_not(order: float, rules: RaceRules) -> str:
-    """Why a ball is not testable."""
-    needed = rules.ball_testable_bins / max(abs(order - round(order)), 1e-6)
-    return (
-        f"2 BSF = {order:.3f} is too close to {round(order)}X; a record of {needed:.0f} revolutions "
-        "or more would tell them apart"
-    )
-
-
 def _found(
-    evidence: Mapping[Part, PartEvidence], view: _Envelope, bearing: BearingOrders, shaft_hz: float
+    evidence: Mapping[Part, PartEvidence], view: EnvelopeView, bearing: BearingOrders, shaft_hz: float
 ) -> tuple[RaceLine, ...]:
     lines = []
     for part, e in evidence.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,19 +17,33 @@ if TYPE_CHECKING:
     Real = NDArray[np.float64]
 
 MISSING_SHARE = 0.01
-CLIPPED_SHARE = 2e-3
+CLIPPED_SHARE = 0.01
+CLIPPED_NOTE_SHARE = 1e-4
 CLIPPED_RUN = 3
 """Least run of samples at the same extreme value that only a limit makes."""
 DEAD_SHARE = 0.5
+OFFSET_DEVIATIONS = 5.0
+SHIFT_DEVIATIONS = 1.0
 LEAST_REVOLUTIONS = 25.0
 LEAST_BAND = 3.0
 """Top of the analysed band over its bottom, at least."""
 
 
-def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -> Real:
-    """The samples as float64, fit for the test.
+@dataclass(frozen=True, slots=True)
+class CheckedSamples:
+    """Samples fit for the test.
 
-    Single missing samples are replaced by their neighbours' line.
+    Attributes:
+        values: ``[n]``, without mean; single missing samples lie on their neighbours' line.
+        notes: what is odd about them without spoiling the test.
+    """
+
+    values: Real
+    notes: tuple[str, ...]
+
+
+def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -> CheckedSamples:
+    """The samples as float64, fit for the test.
 
     Args:
         samples: ``[n]``, any unit proportional to acceleration.
@@ -62,10 +77,26 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
             f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
-    return _clean(x)
+    x = _clean(x)
+    mean, deviation = float(x.mean()), float(x.std())
+    thirds = [float(part.mean()) for part in np.array_split(x, 3)]
+    notes = []
+    clipped = _clipped_share(x)
+    if clipped > CLIPPED_NOTE_SHARE:
+        notes.append(f"{clipped:.2%} of the samples are clipped: sizes are too small")
+    if max(thirds) - min(thirds) > SHIFT_DEVIATIONS * deviation:
+        notes.append(
+            f"the channel's mean moves from {thirds[0]:.4g} to {thirds[2]:.4g}: check the sensor's supply"
+        )
+    elif abs(mean) > OFFSET_DEVIATIONS * deviation:
+        notes.append(
+            f"the channel has an offset of {mean:.4g}, {abs(mean) / deviation:.0f} times what it measures"
+        )
+    return CheckedSamples(x - mean, tuple(notes))
 
 
 def _clean(x: Real) -> Real:
+    """Fill single missing samples; refuse what is dead or clipped."""
     good = np.isfinite(x)
     missing = 1.0 - float(good.mean())
     if missing > MISSING_SHARE:

@@ -19,9 +19,12 @@ class RaceRules:
         z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
         severity_limit: of a race; ``z`` times ``depth``.
         ball_severity_limit: of a ball.
+        unseen_caution: factor on both limits of severity where no harmonic of the shaft confirms its speed.
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
         steadiness_limit: least steadiness of a race's lines.
+        steady_z: significance in 75 revolutions that many strikes reach and some knocks do not; beyond it the
+            limit of steadiness falls in proportion.
         ball_weight: what a ball's severity counts against a race's.
         group_factor: parts whose weights are within this factor cannot be told apart.
         unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
@@ -44,9 +47,11 @@ class RaceRules:
     z_unresolved: float = 1.5
     severity_limit: float = 3.0
     ball_severity_limit: float = 2.2
+    unseen_caution: float = 2.0
     depth_limit: float = 0.12
     ball_depth_limit: float = 0.20
     steadiness_limit: float = 0.30
+    steady_z: float = 20.0
     ball_weight: float = 0.6
     group_factor: float = 1.15
     unresolved_bins: float = 4.0

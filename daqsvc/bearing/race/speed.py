@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
+from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.dsp.envelope import hann, running_median
 from daqsvc.dsp.order_speed import find_speed
 
@@ -24,6 +25,9 @@ CAP_NATS = 4.0
 PRIOR_SHARE = 0.006
 """Spread of the true speed about the stated one. A weaker prior was drawn to the lines of the bearing."""
 HIGHEST_ORDER = 16.0
+"""Highest multiple of the stated rate that the slower series keeps."""
+LINE_REVOLUTIONS = 160.0
+"""As many are enough to see 1X to 3X sharply; more cost more than they give."""
 LINE_DEVIATION_SHARE = 0.002
 """Largest deviation of a speed from the lines of 1X to 3X that is taken before the votes of all harmonics."""
 SEEN_NATS = 8.0
@@ -37,13 +41,11 @@ class ShaftRate:
         rate_hz: revolutions per second.
         seen: whether harmonics of the shaft stand out at that rate.
         sharp: whether it is known to a fraction of the search.
-        other: what speaks for a wholly different speed; empty if nothing.
     """
 
     rate_hz: float
     seen: bool
     sharp: bool = False
-    other: str = ""
 
 
 def shaft_rate(spectrum: Complex, step_hz: float, stated_hz: float, tolerance: float) -> ShaftRate:
@@ -57,6 +59,9 @@ def shaft_rate(spectrum: Complex, step_hz: float, stated_hz: float, tolerance: f
         step_hz: between its bins.
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
+
+    Raises:
+        RaceInputError: the harmonics of a wholly different speed are far stronger.
     """
     # All that matters lies at low frequencies: as a slower series it is found in no time.
     bins = min(int(HIGHEST_ORDER * stated_hz / step_hz), len(spectrum) - 1)
@@ -67,9 +72,14 @@ def shaft_rate(spectrum: Complex, step_hz: float, stated_hz: float, tolerance: f
     rate_hz = samples * step_hz
     voted, votes = _vote(signal, rate_hz, stated_hz, tolerance)
     try:
-        line = find_speed(signal[:, np.newaxis], rate_hz, stated_hz)
+        enough = signal[: int(LINE_REVOLUTIONS * rate_hz / stated_hz)]
+        line = find_speed(enough[:, np.newaxis], rate_hz, stated_hz)
     except ValueError as error:
-        return ShaftRate(voted, votes > SEEN_NATS, other=str(error))
+        raise RaceInputError(
+            "shaft speed or sample rate",
+            f"is wrong: {error}",
+            "give the speed of this recording and the rate it was sampled with",
+        ) from error
     sharp = line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz
     if sharp and abs(line.hz / stated_hz - 1.0) <= tolerance:
         return ShaftRate(line.hz, seen=True, sharp=True)

@@ -45,6 +45,7 @@ class PartEvidence:
             knocks make the lines, as a rub or a loose part does, and not strike after strike.
         severity: ``z * depth``, what the rule weighs parts by.
         z_limit: the significance from which the part may be named.
+        steadiness_limit: the steadiness from which a race may be named; 0 for a ball.
         limit: the severity from which the part is named.
         false_alarm_probability: probability of such a ``z`` or a larger one in Gaussian noise.
         order: its fundamental order as found (the stated one, up to slip).
@@ -57,6 +58,7 @@ class PartEvidence:
     steadiness: float
     severity: float
     z_limit: float
+    steadiness_limit: float
     limit: float
     false_alarm_probability: float
     order: float

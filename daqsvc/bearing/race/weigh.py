@@ -1,0 +1,150 @@
+"""What speaks for damage of each part: its comb's significance and its lines' size, in two envelopes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.bearing.race.combs import best_comb, fundamental, part_lines
+from daqsvc.bearing.race.decision import weight_of
+from daqsvc.bearing.race.depth import ModulationDepth, sharpest
+from daqsvc.bearing.race.lines import LineEvidence, line_evidence
+from daqsvc.bearing.race.null import REVOLUTIONS, false_alarm_probability, significance
+from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
+from daqsvc.dsp.envelope import line_power
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.bearing.race.rules import RaceRules
+    from daqsvc.bearing.race.speed import ShaftRate
+
+    Real = NDArray[np.float64]
+    Envelope = NDArray[np.float32]
+
+SHARPEN_SHARE = 0.01
+"""How far the deepest lines may be from the most significant comb, as a share."""
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeView:
+    """One non-linearity of the envelope: evidence by the phases alone, sizes by clipped amplitudes.
+
+    Attributes:
+        lines: evidence for lines.
+        depth: their modulation depth.
+        power: squared modulation indices, ``[bins]``.
+    """
+
+    lines: LineEvidence
+    depth: ModulationDepth
+    power: Real
+
+
+def view_of(phases: Envelope, sizes: Envelope, bins: int, revolutions: float) -> EnvelopeView:
+    """Look at an envelope.
+
+    Args:
+        phases: of the band with unit amplitudes, ``[samples]``.
+        sizes: of the band with clipped amplitudes, ``[samples]``.
+        bins: how many bins of their spectra to look at.
+        revolutions: of the shaft in the record: bins per order.
+    """
+    lines = line_evidence(line_power(phases, bins), revolutions)
+    power = line_power(sizes, bins)
+    return EnvelopeView(lines, ModulationDepth(power, lines.notched, revolutions), power)
+
+
+class Scales:
+    """Weighs the parts of a bearing.
+
+    Args:
+        square: view of the squared envelope.
+        log: view of its logarithm. What fools the one does not fool the other: a few hard knocks are nothing
+            to the logarithm, a faint steady modulation nothing to the square.
+        bearing: fault orders.
+        shaft: rate of the shaft.
+        revolutions: of the shaft in the record.
+        rules: settings of the test.
+    """
+
+    def __init__(
+        self,
+        square: EnvelopeView,
+        log: EnvelopeView,
+        bearing: BearingOrders,
+        shaft: ShaftRate,
+        revolutions: float,
+        rules: RaceRules,
+    ) -> None:
+        self._square = square
+        self._log = log
+        self._bearing = bearing
+        self._revolutions = revolutions
+        self._rules = rules
+        # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
+        self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
+        self._seen = shaft.seen
+        self._caution = 1.0 if shaft.seen else rules.unseen_caution
+
+    def weigh(self) -> dict[Part, PartEvidence]:
+        """Evidence for all parts; lines that the foremost part explains do not speak for another one."""
+        views = (self._square.lines, self._log.lines)
+        evidence = {part: self._part(part, views) for part in PARTS}
+        first = max(PARTS, key=lambda part: weight_of(part, evidence[part], self._rules))
+        explained = part_lines(first, evidence[first].order, self._bearing)
+        rest = tuple(view.without(explained) for view in views)
+        for part, e in evidence.items():
+            if part != first and e.z >= e.z_limit:
+                evidence[part] = self._part(part, rest)
+        return evidence
+
+    def _part(self, part: Part, views: tuple[LineEvidence, ...]) -> PartEvidence:
+        rules = self._rules
+        order = fundamental(self._bearing, part)
+        gap = abs(order - round(order))
+        comb = best_comb(views, self._bearing, part, self._slip)
+        z = significance(comb.score, part, self._revolutions, self._slip)
+        # Never across a harmonic of the shaft: what lies beyond it is not this part.
+        reach = min(SHARPEN_SHARE, 0.5 * gap / order)
+        depths = (self._square.depth, self._log.depth)
+        found = sharpest(depths, comb.order, reach, self._revolutions)
+        by_square, by_log = (float(depth.comb(np.array([found]))[0]) for depth in depths)
+        steady_z = rules.steady_z * math.sqrt(self._revolutions / REVOLUTIONS)
+        e = PartEvidence(
+            z=z,
+            depth=min(by_square, by_log),
+            steadiness=by_log / max(by_square, 1e-9),
+            severity=max(z, 0.0) * min(by_square, by_log),
+            z_limit=rules.z_limit,
+            steadiness_limit=rules.steadiness_limit * min(1.0, steady_z / max(z, 1.0)),
+            limit=self._caution * rules.severity_limit,
+            false_alarm_probability=false_alarm_probability(z),
+            order=found,
+        )
+        away = gap * self._revolutions
+        if away < rules.unresolved_bins:
+            e = replace(e, z_limit=rules.z_limit + rules.z_unresolved)
+        if part == "ball":
+            # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
+            e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
+            e = replace(e, limit=self._caution * rules.ball_severity_limit, steadiness_limit=0.0)
+            if away < rules.ball_testable_bins:
+                e = replace(e, testable=False, reason=_why_not(order, gap, rules))
+            elif not self._seen:
+                reason = "no harmonic of the shaft confirms its speed, and a ball's lines are weak"
+                e = replace(e, testable=False, reason=reason)
+        return e
+
+
+def _why_not(order: float, gap: float, rules: RaceRules) -> str:
+    """Why a ball is not testable."""
+    needed = rules.ball_testable_bins / max(gap, 1e-6)
+    return (
+        f"2 BSF = {order:.3f} is too close to {round(order)}X; a record of {needed:.0f} revolutions "
+        "or more would tell them apart"
+    )

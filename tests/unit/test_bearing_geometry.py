@@ -1,0 +1,103 @@
+"""The kinematics of a bearing, and its catalogue."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daqsvc.bearing.catalogue import bearing_orders, catalogue
+from daqsvc.bearing.geometry import BearingGeometry, BearingOrders
+
+
+def test_the_drive_end_bearing_of_the_cwru_rig() -> None:
+    orders = bearing_orders("6205-2RS")
+    assert orders.inner == pytest.approx(5.4152, abs=1.5e-3)
+    assert orders.outer == pytest.approx(3.5848, abs=1.5e-3)
+    assert orders.ball == pytest.approx(2.3567, abs=1.5e-3)
+    assert orders.cage == pytest.approx(0.39828, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "inner", "outer", "ball", "cage"),
+    [
+        ("6203-2RS", 4.9469, 3.0530, 1.9940, 0.3817),
+        ("NICE", 4.755, 3.245, 2.5595, 0.4056),
+        ("ER16K", 5.43, 3.572, 2.322, 0.397),
+    ],
+)
+def test_published_orders(name: str, inner: float, outer: float, ball: float, cage: float) -> None:
+    orders = bearing_orders(name)
+    assert orders.inner == pytest.approx(inner, rel=1e-3)
+    assert orders.outer == pytest.approx(outer, rel=1e-3)
+    assert orders.ball == pytest.approx(ball, rel=2e-3)
+    assert orders.cage == pytest.approx(cage, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", ["6205", "6205-2RS", "6205-ZZ", "6205 2rs", "6205-2z"])
+def test_seals_case_and_blanks_do_not_matter(name: str) -> None:
+    assert bearing_orders(name) == catalogue()["6205"]
+
+
+def test_an_unknown_bearing_is_named_with_near_ones() -> None:
+    with pytest.raises(KeyError, match=r"'6209-2RS'.*near names: 620.*BPFI="):
+        bearing_orders("6209-2RS")
+
+
+geometries = st.builds(
+    lambda balls, share, angle: BearingGeometry(balls, share * 60.0, 60.0, angle),
+    st.integers(6, 20),
+    st.floats(0.05, 0.14),
+    st.floats(0.0, 40.0),
+)
+
+
+@given(geometries, st.floats(0.0, 0.03))
+def test_every_ball_passes_either_race(geometry: BearingGeometry, slip: float) -> None:
+    orders = geometry.orders().slipped(slip)
+    assert orders.inner + orders.outer == pytest.approx(geometry.balls)
+    assert orders.outer == pytest.approx(geometry.balls * orders.cage)
+    assert orders.ball_pass == 2.0 * orders.ball
+
+
+def test_slip_slows_the_cage_and_quickens_the_inner_race() -> None:
+    still, slipped = bearing_orders("6205"), bearing_orders("6205").slipped(0.01)
+    assert slipped.cage == pytest.approx(0.99 * still.cage)
+    assert slipped.outer < still.outer
+    assert slipped.inner > still.inner
+
+
+@pytest.mark.parametrize("slip", [-0.1, 1.0])
+def test_slip_is_a_share(slip: float) -> None:
+    with pytest.raises(ValueError, match="cage slip"):
+        bearing_orders("6205").slipped(slip)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((2, 8.0, 40.0), "2 rolling elements"),
+        ((9, 0.0, 40.0), "ball diameter"),
+        ((9, 41.0, 40.0), "ball diameter"),
+        ((9, 8.0, 40.0, 90.0), "contact angle"),
+        ((20, 8.0, 40.0), "do not fit"),
+    ],
+)
+def test_impossible_dimensions_are_refused(arguments: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BearingGeometry(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("orders", "message"),
+    [
+        ((0.0, 3.58, 2.36, 0.398), "inner"),
+        ((5.4, float("nan"), 2.36, 0.398), "outer"),
+        ((162.0, 107.0, 70.0, 11.9), "not in Hz"),
+        ((3.58, 5.42, 2.36, 0.398), "exchanged"),
+        ((5.42, 3.58, 2.36, 0.30), "does not fit"),
+    ],
+)
+def test_contradicting_orders_are_refused(orders: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        BearingOrders(*orders)
