@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
 import shutil
 from typing import TYPE_CHECKING, Any
 
-import can
 import numpy as np
 from brokers import Consumer, eventually, free_port
+from live_service import play, running
 
-from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.store import Outbox
 from daqsvc.recording.recording import Recording
-from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording
-from sim_hw.nodes.can_node import CanNode
-from sim_hw.nodes.pacing import RealTimePacer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
+    from daqsvc.service import Service
     from daqsvc.settings import MachineFile
 
 RATE_HZ = 2000.0
@@ -43,26 +37,9 @@ def machine(port: int, **alarm: Any) -> MachineFile:
     return made.model_copy(update={"alarms": [made.alarms[0].model_copy(update=alarm)]})
 
 
-@contextlib.asynccontextmanager
-async def running(file: MachineFile, store: Path) -> AsyncIterator[Service]:
-    service = Service(file, store)
-    stop = asyncio.Event()
-    task = asyncio.create_task(service.run(stop))
-    try:
-        await service.ready.wait()
-        yield service
-    finally:
-        stop.set()
-        await task
-
-
 async def shake(service: Service, rms: float) -> None:
-    """Play a second of noise on the virtual bus that the service reads."""
-    layout = assembly.frame_layout(service.machine, "recording")
-    channel = service.machine.buses["can0"].model_dump()["channel"]
-    await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-    with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-        await CanNode(bus, layout, noise(rms), RATE_HZ).play(RealTimePacer(SystemClock()))
+    """Play a second of noise."""
+    await play(service, noise(rms), RATE_HZ)
 
 
 async def heard(service: Service, alarm: str, state: str) -> None:

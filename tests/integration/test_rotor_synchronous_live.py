@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING
 
-import can
 import numpy as np
 import pytest
 from brokers import eventually
+from live_service import play, running
 from machine_files import MACHINES
 
-from daqsvc import assembly
-from daqsvc.acquisition.clock import SystemClock
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.session import Script, Session
 from sim_hw.link_faults import LinkFaults
-from sim_hw.nodes.can_node import CanNode
-from sim_hw.nodes.pacing import RealTimePacer
 from sim_hw.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -112,17 +107,8 @@ async def test_a_change_is_one_alarm_refined_from_departure_to_name(rebalanced) 
 async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
     machine = scenario((60.0, {"eccentricity": 0.25}), revolutions=90.0).simulate(5)
     async with EmbeddedBroker() as broker:
-        service = Service(machine_file(broker.url), tmp_path)
-        stop = asyncio.Event()
-        task = asyncio.create_task(service.run(stop))
-        try:
-            await service.ready.wait()
-            await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-            channel = service.machine.buses["can0"].model_dump()["channel"]
-            layout = assembly.frame_layout(service.machine, "shaft")
-            with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-                node = CanNode(bus, layout, samples_of(machine), machine.rate_hz)
-                await node.play(RealTimePacer(SystemClock()))
+        async with running(machine_file(broker.url), tmp_path) as service:
+            await play(service, samples_of(machine), machine.rate_hz)
             await eventually(
                 lambda: "unbalance" in service.alarms.alarms["rotor-changed"].message, "the change is named"
             )
@@ -134,9 +120,6 @@ async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
             assert "no samples of shaft" in alarms["detector-ok/rotor-synchronous"].message
             assert alarms["rotor-changed"].level.label == "danger"
             assert alarms["rotor-changed"].state.is_active
-        finally:
-            stop.set()
-            await task
         # A restart knows what healthy was: it does not take the faulty machine for it.
         again = Service(machine_file(broker.url), tmp_path)
         (detector,) = (d for d in again.pipeline.detectors if d.name == "rotor-synchronous")

@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 from typing import TYPE_CHECKING
 
-import can
 import numpy as np
 import pytest
 from brokers import Consumer, eventually, free_port
+from live_service import play, running
 
-from daqsvc import assembly
-from daqsvc.acquisition.clock import SystemClock
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
 from sim_hw.demo.session import Script, Session
-from sim_hw.nodes.can_node import CanNode
-from sim_hw.nodes.pacing import RealTimePacer
 from sim_hw.scenario import load_scenario
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from daqsvc.settings import MachineFile
     from sim_hw.demo.listener import Received
 
 RATE_HZ = 2000.0
@@ -39,27 +32,8 @@ def shaking(seconds: float) -> Recording:
     return Recording(("accel",), samples, RATE_HZ, __file__, 0)  # type: ignore[arg-type]
 
 
-@contextlib.asynccontextmanager
-async def running(machine: MachineFile, store: Path) -> AsyncIterator[Service]:
-    service = Service(machine, store)
-    stop = asyncio.Event()
-    task = asyncio.create_task(service.run(stop))
-    try:
-        await service.ready.wait()
-        yield service
-    finally:
-        stop.set()
-        await task
-
-
 async def shake(service: Service, seconds: float) -> None:
-    """Play on the virtual bus that the service reads."""
-    layout = assembly.frame_layout(service.machine, "recording")
-    channel = service.machine.buses["can0"].model_dump()["channel"]
-    await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-    with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-        node = CanNode(bus, layout, shaking(seconds).samples, RATE_HZ)
-        await node.play(RealTimePacer(SystemClock()))
+    await play(service, shaking(seconds).samples, RATE_HZ)
 
 
 async def test_alarms_raised_without_a_broker_go_out_after_a_restart(tmp_path: Path) -> None:
