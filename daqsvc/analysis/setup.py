@@ -86,8 +86,8 @@ class RotorSetup:
             )
         if self.keyphasor is not None and self.follow_orbit:
             raise ValueError(
-                "speed and angle come either from the keyphasor or from the orbit: leave out --keyphasor or "
-                "--follow-orbit"
+                "speed and angle come either from the keyphasor or from the orbit: leave out --keyphasor, or "
+                "follow the orbit no more"
             )
         named = [*self.probes, *([self.keyphasor.name] if self.keyphasor is not None else [])]
         if len({self.channels.get(name, name) for name in named}) < len(named):

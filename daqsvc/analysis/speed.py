@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.analysis.setup import RefusedError
+from daqsvc.analysis.speed_trend import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe
 from daqsvc.dsp.marks import EdgeFinder
 from daqsvc.dsp.orbit_speed import estimate_speed
+from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,6 +37,13 @@ _HYSTERESIS = 0.2
 """Of the keyphasor's range from low to high."""
 _LEAST_PULSES = 4
 _OFF_NOMINAL = 0.05
+_AT_THE_EDGE = 0.08
+"""A line so far from the stated speed, of the tenth that is searched, may be the flank of another one."""
+_LEAST_TURNS = 10.0
+_ROUNDING = 0.5
+"""Part of a revolution that the interpolation of the first and the last pulse may cost."""
+_STRONGER = 4.0
+"""So many times the 1X amplitude another line may have and still be a whirl or a harmonic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +87,9 @@ def speed_of(
     if revolutions < needed:
         raise RefusedError(too_short(revolutions, needed, setup))
     if setup.follow_orbit:
+        trend = trend_of_orbit(_calibrating(recording, setup, samples), recording.rate_hz)
+        if trend is not None:
+            _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz) or trend)
         return Speed(setup.speed_rpm), quality
     if setup.calibrations:
         quality = quality.with_problem(
@@ -94,10 +106,28 @@ def too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:
         if setup.calibrations
         else f"{setup.rules.calibrate_revolutions} to calibrate and {LEAST_JUDGED} to judge"
     )
+    fewer = setup.rules.calibrate_revolutions > LEAST_REVOLUTIONS and not setup.calibrations
     return (
         f"the recording is too short: {revolutions:.1f} revolutions, at least {needed} are needed "
-        f"({made_of}); give a longer one, or fewer --calibrate-revs"
+        f"({made_of}); give a longer one" + (", or calibrate on fewer" if fewer else "")
     )
+
+
+def _refuse_trend(trend: Trend | None) -> None:
+    """Refuse a run-up or coast-down."""
+    if trend is not None:
+        raise RefusedError(
+            f"{trend.describe()}: a run-up cannot be judged; learn the rotor from it with daqsvc calibrate "
+            "(--keyphasor or --sweep-rpm), or give a recording at steady speed"
+        )
+
+
+def _calibrating(recording: Recording, setup: RotorSetup, samples: Floats) -> Floats:
+    """The samples whose speed must be steady: of calibration, or all where that was before."""
+    assert setup.speed_rpm is not None  # noqa: S101 - asked by those who follow no keyphasor
+    turns = math.inf if setup.calibrations else setup.rules.calibrate_revolutions
+    end = min(float(len(samples)), math.ceil(turns * 60.0 * recording.rate_hz / abs(setup.speed_rpm)))
+    return samples[: int(end), :2]
 
 
 def _fixed_speed(
@@ -106,17 +136,26 @@ def _fixed_speed(
     """The stated speed if the orbit of the first revolutions has it, made exact where that is significant."""
     calibrating = setup.rules.calibrate_revolutions
     begin = math.ceil(calibrating * 60.0 * recording.rate_hz / abs(stated_rpm))
+    first = samples[:begin, :2]
     try:
-        found = estimate_speed(samples[:begin, :2], recording.rate_hz, stated_rpm)
+        found = estimate_speed(first, recording.rate_hz, stated_rpm)
     except ValueError as error:
+        _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
+        _refuse_elsewhere(first, recording.rate_hz, stated_rpm, None)
         raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
     off = found.speed_rpm / stated_rpm - 1.0
     significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
-    if significant and abs(off) * calibrating > _FIXED_SPEED_TURN:
+    wrong = significant and abs(off) * calibrating > _FIXED_SPEED_TURN
+    if wrong:
+        _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
+    _refuse_elsewhere(
+        first, recording.rate_hz, stated_rpm, None if abs(off) > _AT_THE_EDGE else found.speed_rpm
+    )
+    if wrong:
         raise RefusedError(
             f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
-            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct --speed-rpm, use a "
-            "keyphasor, or --follow-orbit"
+            f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct the speed, use a keyphasor, or "
+            "follow the orbit (--speed-rpm orbit:N)"
         )
     revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
     if significant and abs(off) * revolutions > _RELEVANT_TURN:
@@ -130,6 +169,47 @@ def _fixed_speed(
     weight = stated / (stated + found.uncertainty_rpm**2) if stated > 0.0 else 0.0
     rpm = stated_rpm + weight * (found.speed_rpm - stated_rpm)
     return Speed(rpm, uncertainty=math.sqrt((1.0 - weight) * stated) / abs(rpm)), quality
+
+
+def _refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm: float | None) -> None:
+    """Refuse a stated speed where the orbit is that of another one.
+
+    Args:
+        first: float64 ``[n, 2]``, the first revolutions.
+        rate_hz: sampling rate.
+        stated_rpm: what was stated.
+        found_rpm: the line near it; None if there is none to speak of.
+    """
+    try:
+        strongest_rpm = estimate_speed(first, rate_hz).speed_rpm
+        # So many revolutions at the true speed: beyond, the machine need not be healthy any more.
+        turns = max(_LEAST_TURNS, len(first) * abs(stated_rpm) / 60.0 / rate_hz)
+        healthy = first[: math.ceil(turns * 60.0 * rate_hz / strongest_rpm)]
+        strongest_rpm = estimate_speed(healthy, rate_hz, strongest_rpm).speed_rpm
+    except ValueError:
+        return  # no line anywhere: the search near the stated speed has said so
+    if abs(strongest_rpm / abs(stated_rpm) - 1.0) <= _AT_THE_EDGE:
+        return
+    if found_rpm is None:
+        near = f"there is no 1X line near {abs(stated_rpm):.6g} rpm"
+    else:
+        ratio = _line_um(first, rate_hz, strongest_rpm) / _line_um(first, rate_hz, found_rpm)
+        if ratio < _STRONGER:
+            return
+        near = f"the line at {abs(found_rpm):.1f} rpm has a {ratio:.2g}th of its amplitude"
+    raise RefusedError(
+        f"the orbit turns at {strongest_rpm:.1f} rpm: {near}; correct the speed, or use a keyphasor if the "
+        "shaft does turn as stated"
+    )
+
+
+def _line_um(orbit: Floats, rate_hz: float, rpm: float) -> float:
+    """Amplitude of the line of a speed, both senses together."""
+    z = orbit[:, 0] + 1j * orbit[:, 1]
+    there = np.isfinite(z)
+    turn = np.exp(2j * math.pi * rpm / 60.0 / rate_hz * np.flatnonzero(there))
+    z = z[there] - z[there].mean()
+    return math.hypot(abs(np.mean(z * turn.conj())), abs(np.mean(z * turn)))
 
 
 def _keyphasor_speed(
@@ -147,9 +227,18 @@ def _keyphasor_speed(
     places = np.array([sample + fraction for sample, fraction in edges])
     found_rpm = 60.0 * recording.rate_hz / float(np.median(np.diff(places)))
     rpm = found_rpm if setup.speed_rpm is None else math.copysign(found_rpm, setup.speed_rpm)
-    needed = LEAST_JUDGED + (0 if setup.calibrations else setup.rules.calibrate_revolutions)
-    if len(edges) - 1 < needed:
-        raise RefusedError(too_short(len(edges) - 1, needed, setup))
+    calibrating = setup.rules.calibrate_revolutions
+    needed = LEAST_JUDGED + (0 if setup.calibrations else calibrating)
+    # Pulses may be missing, whose revolutions are there all the same.
+    revolutions = (places[-1] - places[0]) * found_rpm / 60.0 / recording.rate_hz
+    if revolutions < needed - _ROUNDING:
+        raise RefusedError(too_short(revolutions, needed, setup))
+    if calibrating:
+        trend = trend_of_pulses(
+            places if setup.calibrations else places[: calibrating + 1], recording.rate_hz
+        )
+        if trend is not None:
+            _refuse_trend(trend_of_pulses(places, recording.rate_hz) or trend)
     if setup.speed_rpm is not None and abs(rpm / setup.speed_rpm - 1.0) > _OFF_NOMINAL:
         quality = quality.with_problem(
             f"keyphasor {keyphasor.name} says {abs(rpm):.1f} rpm, not {abs(setup.speed_rpm):.1f} rpm; "
