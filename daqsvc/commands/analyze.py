@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.commands.analyze_arguments import (
-    SpeedOption,
     add_machine_arguments,
     add_output_arguments,
     add_rotor_arguments,
@@ -18,6 +17,7 @@ from daqsvc.commands.analyze_arguments import (
 )
 from daqsvc.commands.analyze_bearing import add_bearing_arguments, bearing_analyst, bearing_misuse, by_bearing
 from daqsvc.commands.analyze_orders import add_order_arguments, by_orders, order_analyst, order_misuse
+from daqsvc.commands.option_types import SpeedOption
 
 if TYPE_CHECKING:
     import argparse

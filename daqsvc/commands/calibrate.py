@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.analyze_arguments import SpeedOption
 from daqsvc.commands.calibrate_arguments import add_calibrate_arguments, misuse
 from daqsvc.commands.calibrate_bearing import (
     add_bearing_arguments,
@@ -19,6 +18,7 @@ from daqsvc.commands.calibrate_bearing import (
     calibrate_bearings,
     shared_misuse,
 )
+from daqsvc.commands.option_types import SpeedOption
 
 if TYPE_CHECKING:
     import argparse

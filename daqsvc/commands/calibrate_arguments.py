@@ -6,17 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.analyze_arguments import (
-    TOLERANCE_PERCENT,
-    calibration_length,
-    not_negative,
-    number,
-    percent,
-    positive,
-    probe_pair,
-    speed,
-)
-from daqsvc.recording.channels import LENGTH_UNITS, channel_map, sampling_rate_hz
+from daqsvc.commands.option_types import calibration_length, positive
+from daqsvc.commands.shared_arguments import add_channel_map, add_rotor
+from daqsvc.recording.channels import LENGTH_UNITS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,80 +45,23 @@ def add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
         help="how long to wait for them (default: three times what they take, and 10 s)",
     )
     _add_recording_arguments(parser)
-    _add_rotor_arguments(parser)
+    add_rotor(
+        parser.add_argument_group("without a machine file").add_argument,
+        speed_help="speed of the steady recordings, negative if clockwise; exact if there is no keyphasor",
+        told="; a run-up tells it",
+    )
 
 
 def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     about = parser.add_argument_group("about the recordings")
-    about.add_argument(
-        "--map",
-        type=channel_map,
-        default={},
-        metavar="NAME=VARIABLE,...",
-        help="which variable of the recordings is which channel or sensor (default: the one of its name)",
-    )
+    add_channel_map(about.add_argument)
     about.add_argument("--unit", choices=LENGTH_UNITS, help="unit of the probes' samples (default: um)")
-    about.add_argument(
-        "--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it"
-    )
     about.add_argument(
         "--sweep-rpm",
         type=_sweep,
         metavar="FROM,TO",
         help="the first recording is a run-up without a keyphasor: the speed goes evenly from FROM at its "
         "first sample to TO at its last, angle zero at the first",
-    )
-
-
-def _add_rotor_arguments(parser: argparse.ArgumentParser) -> None:
-    rotor = parser.add_argument_group("without a machine file")
-    rotor.add_argument("--probes", type=probe_pair, metavar="X,Y", help="channels, y 90 degrees after x")
-    rotor.add_argument(
-        "--speed-rpm",
-        type=speed,
-        metavar="N",
-        help="speed of the steady recordings, negative if clockwise; exact if there is no keyphasor; "
-        "orbit:N follows the orbit's own 1X about N",
-    )
-    rotor.add_argument("--keyphasor", metavar="CH", help="channel of the keyphasor, one pulse a revolution")
-    rotor.add_argument(
-        "--keyphasor-threshold",
-        type=number,
-        metavar="V",
-        help="level that marks its edge (default: half way)",
-    )
-    rotor.add_argument(
-        "--natural-frequency-hz",
-        type=positive,
-        metavar="F",
-        help="natural frequency of the healthy shaft; a run-up tells it",
-    )
-    rotor.add_argument(
-        "--natural-frequency-tolerance",
-        type=percent,
-        default=TOLERANCE_PERCENT,
-        metavar="PERCENT",
-        help=f"how far that may be off (default: {TOLERANCE_PERCENT:g})",
-    )
-    rotor.add_argument(
-        "--damping-ratio", type=positive, metavar="Z", help="its damping ratio; a run-up tells it"
-    )
-    rotor.add_argument(
-        "--damping-tolerance",
-        type=percent,
-        default=TOLERANCE_PERCENT,
-        metavar="PERCENT",
-        help=f"how far that may be off (default: {TOLERANCE_PERCENT:g})",
-    )
-    rotor.add_argument("--clearance-um", type=positive, metavar="C", help="radial clearance to the stator")
-    rotor.add_argument(
-        "--static-sag-um",
-        type=not_negative,
-        metavar="S",
-        help="sag of the shaft under its weight (default: g / omega^2; 0 if it stands upright)",
-    )
-    rotor.add_argument(
-        "--ac-coupled", action="store_true", help="the probes have no mean position: do not look at it"
     )
 
 

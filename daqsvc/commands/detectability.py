@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.option_types import positive
+
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Callable
 
     from daqsvc.rotor.detectability.foretell import Detectability
@@ -45,19 +47,19 @@ class DetectabilityCommand:
         parser.add_argument("file", type=Path, metavar="MACHINE", help="the machine file (TOML)")
         parser.add_argument(
             "--speed-rpm",
-            type=_positive,
+            type=positive,
             metavar="N",
             help="another speed than the machine file's, in the same direction",
         )
         parser.add_argument(
             "--false-alarms-per-1000-rev",
-            type=_positive,
+            type=positive,
             metavar="R",
             help="set the threshold by the false alarms to accept on a healthy machine, not by the file",
         )
         parser.add_argument(
             "--process-noise",
-            type=_positive,
+            type=positive,
             metavar="Q",
             help="how much the machine itself shakes at random: power spectral density of the acceleration, "
             "normalised (default: process_noise of the file, mostly more than a machine has)",
@@ -124,16 +126,6 @@ def _varied(
         pipeline = machine.pipeline.model_copy(update={"rotor_bank": bank})
         machine = machine.model_copy(update={"pipeline": pipeline})
     return machine
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
 
 
 def _complain(message: str) -> None:

@@ -286,6 +286,19 @@ def test_a_recording_that_is_not_there(tmp_path: Path, capsys) -> None:
     assert "no.npz" in error
 
 
+def test_channels_may_be_mapped_one_by_one(tmp_path: Path, capsys) -> None:
+    x, y, keyphasor = steady(30.0).T
+    recording = tmp_path / "logger.npz"
+    np.savez(recording, a=x, b=y, c=keyphasor, fs=RATE_HZ)
+    maps = ["--map", "x=a,y=b", "--map", "kph=c"]
+    code, said, _ = calibrate(capsys, recording, *OPTIONS, *ROTOR, *maps, "--json")
+    assert code == 0
+    assert json.loads(said)["steady"][0]["speed_rpm"] == pytest.approx(1800.0, rel=1e-3)
+    code, _, error = calibrate(capsys, recording, *OPTIONS, *ROTOR, *maps, "--map", "x=b", "--json")
+    assert code == 2
+    assert "--map names 'x' twice" in error
+
+
 def test_a_machine_file_says_probes_units_and_speed(tmp_path: Path, capsys) -> None:
     out = tmp_path / "pump.toml"
     recording = save(tmp_path / "pump.npz", pump())

@@ -22,7 +22,7 @@ from daqsvc.analysis.progress import Patience
 from daqsvc.analysis.result import finite
 from daqsvc.analysis.rotor import analyse, posterior
 from daqsvc.analysis.setup import RefusedError, RotorSetup
-from daqsvc.commands.analyze_arguments import SpeedOption, speed
+from daqsvc.commands.option_types import SpeedOption, speed
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 

@@ -1,0 +1,112 @@
+"""What the values of options can be; argparse says the message of what is not one."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import dataclass
+from decimal import Decimal
+
+_ORBIT = "orbit:"
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedOption:
+    """What ``--speed-rpm`` says.
+
+    Attributes:
+        rpm: the speed, negative if clockwise.
+        orbit: whether the orbit's own 1X is followed about it.
+        step_rpm: the step of its last digit: 5111 is not 5111.000.
+    """
+
+    rpm: float | None
+    orbit: bool = False
+    step_rpm: float = 0.0
+
+
+def probe_pair(text: str) -> tuple[str, str]:
+    """``X,Y``: two channels."""
+    names = tuple(name.strip() for name in text.split(","))
+    if len(names) != 2 or not all(names) or names[0] == names[1]:
+        raise argparse.ArgumentTypeError(f"{text!r} does not name two probes; write X,Y")
+    return names[0], names[1]
+
+
+def speed(text: str) -> SpeedOption:
+    """``N``, ``-N`` or ``orbit:N``."""
+    orbit = text.startswith(_ORBIT)
+    value = _float(text.removeprefix(_ORBIT))
+    if not math.isfinite(value) or not 0.0 < abs(value) <= 1e6:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a speed; write revolutions per minute, negative if clockwise, or orbit:N"
+        )
+    exponent = Decimal(text.removeprefix(_ORBIT)).as_tuple().exponent
+    return SpeedOption(value, orbit, step_rpm=10.0**exponent if isinstance(exponent, int) else 0.0)
+
+
+def number(text: str) -> float:
+    """A finite number."""
+    value = _float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return value
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    value = _float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """A finite number from 0 on."""
+    value = _float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 on")
+    return value
+
+
+def percent(text: str) -> float:
+    """A part in percent, from 0 to below 100."""
+    value = _float(text)
+    if not 0.0 <= value < 100.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a percentage from 0 to below 100")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on."""
+    value = _whole(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+    return value
+
+
+def calibration_length(text: str) -> int:
+    """Revolutions that make a baseline."""
+    from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy
+
+    value = _whole(text)
+    if not LEAST_REVOLUTIONS <= value <= 100_000:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} revolutions do not make a baseline; "
+            f"give a whole number from {LEAST_REVOLUTIONS} to 100000"
+        )
+    return value
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        return -1
