@@ -7,13 +7,12 @@ import argparse
 import numpy as np
 import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem
+from shaft_channels import channels_of, feed
 
 from daqsvc import assembly
 from daqsvc.commands.detectability import DetectabilityCommand
-from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import describe, parse_machine_file
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
 
 PUMP = MACHINES / "rotor-synchronous.toml"
 PER_REV = 64
@@ -40,20 +39,14 @@ def samples(*, clockwise):
         revolutions=REVOLUTIONS,
         samples_per_rev=PER_REV,
     )
-    x, y = motion.in_um(100.0)
-    xy = np.column_stack((x, y)) + 2.0 * np.random.default_rng(3).standard_normal((len(x), 2))
+    taken = channels_of(motion, 2.0, seed=3)
     if clockwise:
-        xy[:, 0] *= -1.0
-    return np.column_stack((xy, keyphasor_voltage(motion.revolution))).astype(np.float32)
+        taken[:, 0] *= -1.0
+    return taken
 
 
 def course(detector, taken):
-    period_ns = 1e9 / RATE_HZ
-    decisions = []
-    for begin in range(0, len(taken), PER_REV):
-        part = taken[begin : begin + PER_REV]
-        window = Window(begin, part, round((begin + len(part) - 1) * period_ns), period_ns)
-        decisions += [(said.decision, said.group) for said in detector.process(window)]
+    decisions = [(said.decision, said.group) for said in feed(detector, taken, RATE_HZ, block=PER_REV)]
     return [one for one, before in zip(decisions, [None, *decisions], strict=False) if one != before]
 
 

@@ -6,19 +6,18 @@ import math
 
 import numpy as np
 import pytest
+from shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
 
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.rotor_bank import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
 
 PER_REV = 64
 RATE_HZ = 640.0
 PERIOD_NS = 1e9 / RATE_HZ
 NOISE_UM = 19.6
-FIRST = 10_000_000_000
 ROTOR = RotorParameters(
     natural_frequency_hz=10.0,
     damping_ratio=0.18,
@@ -55,23 +54,11 @@ def channels(changes=(), *, revolutions=20.0, w=1.0, angles=(0.0, 90.0), seed=0,
     motion = plant.simulate(
         plant.RotorParameters(speed_ratio=w), steps, revolutions=revolutions, samples_per_rev=PER_REV / w
     )
-    rng = np.random.default_rng(seed)
-    x, y = motion.in_um(100.0)
-    probes = [x * math.cos(math.radians(a)) + y * math.sin(math.radians(a)) for a in angles]
-    noisy = [p + noise_um * rng.standard_normal(len(p)) for p in probes]
-    voltage = keyphasor_voltage(motion.revolution) + 0.02 * rng.standard_normal(len(x))
-    return np.column_stack((*noisy, voltage)).astype(np.float32)
+    return channels_of(motion, noise_um, seed, angles)
 
 
-def windows(samples, *, first_index=FIRST, block=16):
-    for begin in range(0, len(samples), block):
-        part = samples[begin : begin + block]
-        last = first_index + begin + len(part) - 1
-        yield Window(first_index + begin, part, round(last * PERIOD_NS), PERIOD_NS)
-
-
-def run(subject, samples, **where):
-    return [said for window in windows(samples, **where) for said in subject.process(window)]
+def run(subject, samples, *, block=16, first_index=FIRST):
+    return feed(subject, samples, RATE_HZ, block=block, first_index=first_index)
 
 
 def decisions(diagnoses):
@@ -192,10 +179,6 @@ def spoilt(worn, spoil, begin_rev=8.0, end_rev=30.0):
     return samples
 
 
-def dead(part):
-    part[:, 0] = 12.5
-
-
 def nearly_dead(part):
     part[:, 1] *= 0.01
 
@@ -206,22 +189,6 @@ def clipped(part):
 
 def at_the_rail(part):
     np.minimum(part[:, 1], 5.0, out=part[:, 1])
-
-
-def gone(part):
-    part[:, 0] = np.nan
-
-
-def infinite(part):
-    part[:, 1] = -np.inf
-
-
-def half_gone(part):
-    part[np.arange(len(part)) % 3 > 0] = np.nan
-
-
-def no_keyphasor(part):
-    part[:, 2] = -10.0
 
 
 def keyphasor_gone(part):

@@ -7,15 +7,14 @@ import math
 import numpy as np
 import pytest
 import rotor_runs as runs
+from shaft_channels import feed
 
-from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.rotor_bank import DEPARTURE, KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.rotor.decision import DecisionRules
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.sensors import keyphasor_voltage
 
 RATE_HZ = 640.0
-PERIOD_NS = 1e9 / RATE_HZ
 
 
 def detector(
@@ -36,11 +35,7 @@ def detector(
 
 
 def diagnoses(subject, samples):
-    said = []
-    for begin in range(0, len(samples), 16):
-        part = samples[begin : begin + 16]
-        said += subject.process(Window(begin, part, round((begin + len(part) - 1) * PERIOD_NS), PERIOD_NS))
-    return said
+    return feed(subject, samples, RATE_HZ, block=16, first_index=0)
 
 
 def healthy(revolutions=30.0, *, snr_db=0.0, seed=0):

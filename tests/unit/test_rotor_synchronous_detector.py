@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
 
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
@@ -14,14 +15,12 @@ from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.watch import WatchRules
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
 
 PER_REV = 64
 RATE_HZ = 1600.0
 RPM = 1500.0
 PERIOD_NS = 1e9 / RATE_HZ
 NOISE_UM = 2.0
-FIRST = 10_000_000_000
 W = 0.8
 HEALTHY = {"speed_ratio": W, "damping_ratio": 0.11}
 ROTOR = LavalRotor(natural_frequency_hz=31.0, damping_ratio=0.10, clearance_um=100.0, static_sag_um=10.0)
@@ -51,23 +50,11 @@ def channels(*changes, revolutions=110.0, seed=0, noise_um=NOISE_UM, w=W, angles
         revolutions=revolutions,
         samples_per_rev=PER_REV * W / w,
     )
-    rng = np.random.default_rng(seed)
-    x, y = motion.in_um(100.0)
-    probes = [x * math.cos(math.radians(a)) + y * math.sin(math.radians(a)) for a in angles]
-    noisy = [p + noise_um * rng.standard_normal(len(p)) for p in probes]
-    voltage = keyphasor_voltage(motion.revolution) + 0.02 * rng.standard_normal(len(x))
-    return np.column_stack((*noisy, voltage)).astype(np.float32)
+    return channels_of(motion, noise_um, seed, angles)
 
 
-def windows(samples, *, first_index=FIRST, block=PER_REV):
-    for begin in range(0, len(samples), block):
-        part = samples[begin : begin + block]
-        last = first_index + begin + len(part) - 1
-        yield Window(first_index + begin, part, round(last * PERIOD_NS), PERIOD_NS)
-
-
-def run(subject, samples, **where):
-    return [said for window in windows(samples, **where) for said in subject.process(window)]
+def run(subject, samples, *, block=PER_REV, first_index=FIRST):
+    return feed(subject, samples, RATE_HZ, block=block, first_index=first_index)
 
 
 def course(diagnoses):
@@ -250,10 +237,6 @@ def test_figures_that_cannot_be_are_refused(options, words):
 # Bad input. Healthy to revolution 60, spoilt to 80, healthy again.
 
 
-def dead(part):
-    part[:, 0] = 12.5
-
-
 def unplugged(part):
     part[:, 1] = NOISE_UM * np.random.default_rng(9).standard_normal(len(part))
 
@@ -264,22 +247,6 @@ def clipped(part):
 
 def at_the_rail(part):
     np.minimum(part[:, 1], -8.0, out=part[:, 1])
-
-
-def gone(part):
-    part[:, 0] = np.nan
-
-
-def infinite(part):
-    part[:, 1] = -np.inf
-
-
-def half_gone(part):
-    part[np.arange(len(part)) % 3 > 0, :2] = np.nan
-
-
-def no_keyphasor(part):
-    part[:, 2] = -10.0
 
 
 def noise_for_keyphasor(part):

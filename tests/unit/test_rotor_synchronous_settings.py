@@ -31,6 +31,20 @@ def detector(given):
     return made
 
 
+def healthy(rotor, revolutions):
+    """The healthy state of the example at its speed."""
+    return Calibration(
+        rotor=rotor,
+        speed_rpm=1500.0,
+        revolutions=revolutions,
+        baseline=np.array([-10j, 16.0 - 3j, 0.1, 0.05j, 0.0]),
+        variance=np.full(5, 0.01),
+        noise=0.5,
+        noise_variance=0.02,
+        samples_per_rev=64.0,
+    )
+
+
 def test_the_detector_is_what_the_machine_file_says():
     made = detector(
         machine(
@@ -128,17 +142,7 @@ def test_a_keyphasor_that_nobody_looks_at_is_a_warning():
 
 
 def test_a_calibration_is_read_beside_the_machine_file(tmp_path):
-    rotor = LavalRotor(natural_frequency_hz=30.0, damping_ratio=0.1)
-    calibration = Calibration(
-        rotor=rotor,
-        speed_rpm=1500.0,
-        revolutions=200,
-        baseline=np.array([-10j, 16.0 - 3j, 0.1, 0.05j, 0.0]),
-        variance=np.full(5, 0.01),
-        noise=0.5,
-        noise_variance=0.02,
-        samples_per_rev=64.0,
-    )
+    calibration = healthy(LavalRotor(natural_frequency_hz=30.0, damping_ratio=0.1), 200)
     save_calibration(calibration, tmp_path / "healthy.toml")
     text, _ = changed(EXAMPLE, ("probe_drift_um = 0.0", 'calibration = "healthy.toml"'))
     given = parse_machine_file(text, tmp_path / "m.toml")
@@ -156,17 +160,7 @@ def test_a_calibration_is_read_beside_the_machine_file(tmp_path):
 
 
 def test_a_kept_healthy_state_is_used_with_what_the_file_says_of_the_rotor_now(tmp_path, caplog):
-    rotor = LavalRotor(natural_frequency_hz=99.0, damping_ratio=0.5)
-    calibration = Calibration(
-        rotor=rotor,
-        speed_rpm=1500.0,
-        revolutions=50,
-        baseline=np.array([-10j, 16.0, 0.1, 0.0, 0.0]),
-        variance=np.full(5, 0.01),
-        noise=0.5,
-        noise_variance=0.02,
-        samples_per_rev=64.0,
-    )
+    calibration = healthy(LavalRotor(natural_frequency_hz=99.0, damping_ratio=0.5), 50)
 
     def kept():
         made = assembly.detectors(machine(), tmp_path)
@@ -204,16 +198,7 @@ def test_a_run_up_tells_the_rotor_and_the_healthy_state_is_learnt_live(tmp_path)
     assert learning.rotor.natural_frequency_tolerance == 0.02
     assert learning.rotor.clearance_um == 100.0, "that of the machine file"
     # What was learnt is kept, and comes back with the rotor of the run-up.
-    kept = Calibration(
-        rotor=LavalRotor(natural_frequency_hz=31.0, damping_ratio=0.1),
-        speed_rpm=1500.0,
-        revolutions=50,
-        baseline=np.array([-10j, 16.0, 0.1, 0.0, 0.0]),
-        variance=np.full(5, 0.01),
-        noise=0.5,
-        noise_variance=0.02,
-        samples_per_rev=64.0,
-    )
+    kept = healthy(LavalRotor(natural_frequency_hz=31.0, damping_ratio=0.1), 50)
     save_calibration(kept, store / "rotor-synchronous.toml")
     assert watch().state == "watching"
     assert watch().calibration.rotor == learning.rotor
