@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _LEAST_ORBIT_UM = 0.01
 _MOST_ORBIT_UM = 10_000.0
 _MOST_CLEARANCES = 20.0
+_LEAST_OF_CLEARANCE = 1e-3
 _CLIPPED = 1 / 16
 """Part of a revolution at an extreme value from which on a probe may be clipped."""
 _LEAST_CLIPPED_REVOLUTIONS = 3
@@ -208,8 +209,7 @@ def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
     Raises:
         RefusedError: the orbit is too small or too large.
     """
-    spread = np.nanpercentile(samples, [1.0, 99.0], axis=0)
-    radius_um = float((spread[1] - spread[0]).max()) / 2.0
+    radius_um = _radius_um(samples)
     most_um = _MOST_ORBIT_UM
     than = f"{most_um / 1000:g} mm"
     if clearance_um is not None and _MOST_CLEARANCES * clearance_um < most_um:
@@ -227,7 +227,30 @@ def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
         )
 
 
-def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[str]) -> None:
+def doubt_size(quality: DataQuality, samples: Floats, clearance_um: float | None, unit: str) -> DataQuality:
+    """Tell of an orbit so small in its clearance that the unit may be wrong.
+
+    Args:
+        quality: what is known so far.
+        samples: float64 ``[n, 2]`` in um, NaN where missing.
+        clearance_um: radial clearance, if known.
+        unit: what the samples were said to be in.
+    """
+    radius_um = _radius_um(samples)
+    if clearance_um is None or radius_um >= _LEAST_OF_CLEARANCE * clearance_um:
+        return quality
+    return quality.with_problem(
+        f"the unit {unit!r} may be wrong: the orbit has a radius of {radius_um:.2g} um in a clearance of "
+        f"{clearance_um:.4g} um"
+    )
+
+
+def _radius_um(samples: Floats) -> float:
+    spread = np.nanpercentile(samples, [1.0, 99.0], axis=0)
+    return float((spread[1] - spread[0]).max()) / 2.0
+
+
+def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[Complaint]) -> None:
     """Refuse a recording most revolutions of which cannot be judged.
 
     Args:
@@ -240,18 +263,43 @@ def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[str]) -> N
     """
     if not revolutions:
         raise RefusedError("no whole revolution was found; check the speed and the keyphasor")
-    why = complaints[-1] if complaints else "samples are missing"
     if unusable > _MOST_UNUSABLE * revolutions:
+        why = max(complaints, key=lambda one: one.times).reason if complaints else "samples are missing"
         raise RefusedError(f"{why} ({unusable} of {revolutions} revolutions cannot be judged)")
 
 
+@dataclass(slots=True)
+class Complaint:
+    """What a detector complained of.
+
+    Attributes:
+        reason: in its words, of the first time.
+        times: how often it said so.
+    """
+
+    reason: str
+    times: int = 0
+
+    def describe(self) -> str:
+        """As a problem of the recording."""
+        again = self.times - 1
+        if not again:
+            return self.reason
+        return f"{self.reason} (and {again} {'time' if again == 1 else 'times'} more)"
+
+
 def lacks_mean(samples: Floats) -> bool:
-    """Whether both probes swing about zero through the whole recording, as AC-coupled ones do.
+    """Whether both probes swing about zero in the end, as AC-coupled ones do.
+
+    The first half does not count: what the coupling makes of switching on takes its time to die away.
 
     Args:
         samples: float64 ``[n, 2]`` in um, NaN where missing.
     """
-    mean, deviation = np.nanmean(samples, axis=0), np.nanstd(samples, axis=0)
+    later = samples[len(samples) // 2 :]
+    if not np.isfinite(later).any(axis=0).all():
+        return False
+    mean, deviation = np.nanmean(later, axis=0), np.nanstd(later, axis=0)
     # Noise leaves something of a mean even where there is none.
-    allowed = math.sqrt(2.0) * deviation * _NO_MEAN + 3.0 * deviation / math.sqrt(len(samples))
+    allowed = math.sqrt(2.0) * deviation * _NO_MEAN + 3.0 * deviation / math.sqrt(len(later))
     return bool((np.abs(mean) < allowed).all())

@@ -16,10 +16,10 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.analysis import quality as checks
 from daqsvc.analysis.alarms import Places, declared_at, rotor_alarms
-from daqsvc.analysis.quality import ClippedError, DataQuality
+from daqsvc.analysis.quality import ClippedError, Complaint, DataQuality
 from daqsvc.analysis.result import RotorAnalysis, Step, Trace
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.analysis.speed import LEAST_JUDGED, speed_of, too_short
+from daqsvc.analysis.speed import LEAST_JUDGED, refuse_coarse, speed_of, too_short
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.probe_checks import Probe
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
@@ -50,7 +50,7 @@ _NO_MEAN = (
     "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss cannot be "
     "seen"
 )
-_FIGURES = re.compile(r"[\d.]+")
+_FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 _MOST_REFERENCE = 2000
 """Revolutions that the baseline grows to (`daqsvc.rotor.synchronous.departure`)."""
 _SEEN = 128
@@ -128,7 +128,13 @@ def _judge(
     checks.refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
     speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
+    refuse_coarse(period, recording.rate_hz)
+    quality = checks.doubt_size(quality, samples[:, :2], setup.rotor.clearance_um, setup.unit)
     quality = checks.refuse_stuck(quality, setup.probes, samples[:, :2], period)
+    healthy = _healthy_state(setup, speed.rpm)
+    if healthy is None and setup.calibrations:
+        quality = quality.with_problem(_learnt_anew(setup, speed.rpm))
+    setup = replace(setup, calibrations=() if healthy is None else (healthy,))
     detector = RotorSynchronousDetector(
         machine="recording",
         stream=str(recording.source),
@@ -141,7 +147,7 @@ def _judge(
         reference=speed.keyphasor or ("orbit" if setup.follow_orbit else "fixed"),
         rotor=setup.rotor,
         rules=replace(setup.rules, speed_uncertainty=speed.uncertainty),
-        calibration=_healthy_state(setup, speed.rpm),
+        calibration=healthy,
         ac_coupled=setup.ac_coupled or checks.lacks_mean(samples[:, :2]),
         listener=watched.take,
     )
@@ -151,19 +157,29 @@ def _judge(
     if detector.ac_coupled and not setup.ac_coupled:
         quality = quality.with_problem(_NO_MEAN)
     vectors = SynchronousVectors.joined(watched.vectors)
-    reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, tuple(complaints))
+    reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, complaints)
     return reading.verdict(quality)
 
 
 def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
     """The calibration that the recording is held against; None to make one of its first revolutions."""
-    if len(setup.calibrations) < 2:
-        # Whether a single one is of this speed, the detector asks at every revolution.
-        return setup.calibrations[0] if setup.calibrations else None
+    if not setup.calibrations:
+        return None
     try:
         return baseline_at(setup.calibrations, speed_rpm)
     except ValueError as error:
+        if all(one.fit_error is not None for one in setup.calibrations):
+            return None  # a run-up tells the rotor at any speed
         raise RefusedError(str(error)) from None
+
+
+def _learnt_anew(setup: RotorSetup, speed_rpm: float) -> str:
+    """Why the first revolutions are the healthy machine in spite of a calibration."""
+    known = ", ".join(f"{one.speed_rpm:.1f}" for one in setup.calibrations)
+    return (
+        f"the calibration has no baseline at {abs(speed_rpm):.1f} rpm, but at {known} rpm: the rotor is that "
+        f"of its run-up, the first {setup.rules.calibrate_revolutions} revolutions are the healthy machine"
+    )
 
 
 def _feed(
@@ -172,9 +188,9 @@ def _feed(
     rate_hz: float,
     period_samples: float,
     progress: Callable[[int, int], None] | None,
-) -> list[str]:
+) -> tuple[Complaint, ...]:
     """Hand the recording to the detector in windows; what it complains of, each kind once."""
-    complaints: dict[str, list[str]] = {}
+    complaints: dict[str, Complaint] = {}
     length = max(1, round(_WINDOW_REVOLUTIONS * period_samples / detector.block)) * detector.block
     period_ns = NS_PER_S / rate_hz
     for begin in range(0, len(samples), length):
@@ -183,15 +199,12 @@ def _feed(
         for said in detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns)):
             if said.quality != "good":
                 # Complaints that differ in figures only are of one kind.
-                complaints.setdefault(_FIGURES.sub("", said.reason), []).append(said.reason)
+                complaints.setdefault(_FIGURES.sub("", said.reason), Complaint(said.reason)).times += 1
         if progress is not None:
             progress(end, len(samples))
         if detector.refused:
             raise RefusedError(detector.refused)
-    return [
-        reasons[0] if len(reasons) == 1 else f"{reasons[0]} (and {len(reasons) - 1} times more)"
-        for reasons in complaints.values()
-    ]
+    return tuple(complaints.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +216,7 @@ class _Reading:
     detector: RotorSynchronousDetector
     reports: tuple[WatchReport, ...]
     vectors: SynchronousVectors
-    complaints: tuple[str, ...]
+    complaints: tuple[Complaint, ...]
 
     def verdict(self, quality: DataQuality) -> RotorAnalysis:
         watch = self.detector.watch
@@ -214,7 +227,7 @@ class _Reading:
             keyphasor=self.detector.edges if self.setup.keyphasor is not None else None,
         )
         for complaint in self.complaints:
-            quality = quality.with_problem(complaint)
+            quality = quality.with_problem(complaint.describe())
         calibration = watch.calibration
         calibrated = 0 if self.setup.calibrations else self.setup.rules.calibrate_revolutions
         if calibration is None:

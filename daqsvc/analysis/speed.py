@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 LEAST_JUDGED = 3
 """Revolutions that must be left to judge after those that calibrate."""
+LEAST_SAMPLES = 8
+"""Samples of a revolution that is fitted (`daqsvc.rotor.synchronous.vectors`)."""
 
+_NEARLY = 0.02
 _FIXED_SPEED_TURN = 0.05
 """What a wrong speed may turn the angle by during calibration, in revolutions."""
 _SIGNIFICANT = 5.0
@@ -82,6 +85,7 @@ def speed_of(
     if setup.keyphasor is not None:
         return _keyphasor_speed(recording, setup, setup.keyphasor, samples[:, 2], quality)
     assert setup.speed_rpm is not None  # noqa: S101 - see RotorSetup
+    refuse_coarse(60.0 * recording.rate_hz / abs(setup.speed_rpm), recording.rate_hz)
     revolutions = len(samples) * abs(setup.speed_rpm) / 60.0 / recording.rate_hz
     needed = LEAST_JUDGED + (0 if setup.calibrations else setup.rules.calibrate_revolutions)
     if revolutions < needed:
@@ -97,6 +101,24 @@ def speed_of(
             "same shaft angle as the healthy one"
         )
     return _fixed_speed(recording, setup, setup.speed_rpm, samples, quality)
+
+
+def refuse_coarse(period_samples: float, rate_hz: float) -> None:
+    """Refuse a recording with too few samples a revolution for mean, 1X and 2X and what noise leaves.
+
+    Args:
+        period_samples: samples per revolution.
+        rate_hz: sampling rate.
+
+    Raises:
+        RefusedError: there are too few.
+    """
+    if period_samples < LEAST_SAMPLES * (1.0 - _NEARLY):
+        raise RefusedError(
+            f"a revolution has {period_samples:.3g} samples ({rate_hz:.6g} Hz at "
+            f"{60.0 * rate_hz / period_samples:.1f} rpm); 1X and 2X need {LEAST_SAMPLES}: sample at "
+            f"{LEAST_SAMPLES * rate_hz / period_samples:.6g} Hz or faster"
+        )
 
 
 def too_short(revolutions: float, needed: int, setup: RotorSetup) -> str:

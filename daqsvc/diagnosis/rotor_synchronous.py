@@ -7,6 +7,8 @@ from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe, Verdict
 from daqsvc.diagnosis.probe_quality import RevolutionJudge
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
@@ -243,11 +245,7 @@ class RotorSynchronousDetector:
         if verdict.quality != "good":
             return verdict
         if not turn.vector.usable[0]:
-            return Verdict(
-                "missing",
-                f"{len(turn.raw)} samples of a revolution, some missing in one piece, cannot tell its "
-                "harmonics; check the bus and the device, or sample faster",
-            )
+            return Verdict("missing", _cannot_fit(turn))
         self._checks.add(turn.vector.vectors[0])
         return Verdict() if calibration is None else self._checks.judge(calibration)
 
@@ -317,3 +315,14 @@ class RotorSynchronousDetector:
     def _end(self, end_index: int) -> tuple[int, int]:
         """An end of evidence with the monotonic time of the last sample before it."""
         return end_index, self._t_end_ns - round((self._turns.end_index - end_index) * self._period_ns)
+
+
+def _cannot_fit(turn: Turn) -> str:
+    """Why the samples of a revolution do not tell its harmonics."""
+    missing = int((~np.isfinite(turn.raw).all(axis=1)).sum())
+    if missing:
+        return (
+            f"{missing} of {len(turn.raw)} samples of a revolution are missing, too many or too close "
+            "together to tell its harmonics; check the bus and the device"
+        )
+    return f"{len(turn.raw)} samples of a revolution are too few to tell its harmonics; sample faster"

@@ -82,10 +82,12 @@ def load_healthy(
 
     Returns:
         The rotor, and the baseline of the speed, or of every speed if it is not known. None at all if the
-        file holds a run-up only: the first revolutions have to be the baseline then.
+        file holds a run-up, which is true at any speed, and no baseline of that one: the first revolutions
+        have to be the baseline then.
 
     Raises:
-        CalibrationFileError: the file cannot be read or used, or has baselines, but none of that speed.
+        CalibrationFileError: the file cannot be read or used, or has neither a run-up nor a baseline of that
+            speed.
     """
     record = load_record(path)
     rotor, baselines = record.rotor, record.steady
@@ -93,7 +95,9 @@ def load_healthy(
         try:
             baselines = (record.at(speed_rpm),)
         except ValueError as error:
-            raise CalibrationFileError(f"{path}: {error}") from None
+            if record.run_up is None:
+                raise CalibrationFileError(f"{path}: {error}") from None
+            baselines = ()
     if clearance_um is not None:
         rotor = replace(rotor, clearance_um=clearance_um)
         baselines = tuple(replace(baseline, rotor=rotor) for baseline in baselines)
