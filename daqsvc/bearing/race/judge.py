@@ -141,7 +141,7 @@ def race_features(
     sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
-    shaft = shaft_rate(spectrum, rate_hz / length, speed_rpm / 60.0, rules.speed_tolerance)
+    shaft = shaft_rate(spectrum, rate_hz / length, speed_rpm / 60.0, rules.speed_tolerance, bearing.cage)
     revolutions = length / rate_hz * shaft.rate_hz
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)

@@ -1,0 +1,56 @@
+"""What the race test costs: the share of a core that one channel of 25.6 kHz takes in steady operation.
+
+Run by ``make bench``. Real time is the reference: windows of 2.5 s, each judged with the 7.5 s before it.
+"""
+
+# ruff: noqa: T201 - printing is what it is for
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+
+import numpy as np
+
+from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.race import RaceWatch, race_test
+from daqsvc.bearing.race.watch import WINDOW_S
+
+RATE_HZ = 25_600.0
+SPEED_RPM = 1797.0
+LIMIT = 0.02
+
+
+def main() -> None:
+    """Measure and print."""
+    bearing = bearing_orders("6205-2RS")
+    random = np.random.default_rng(0)
+    watch = RaceWatch(RATE_HZ, SPEED_RPM, bearing)
+    windows = [random.standard_normal(watch.window).astype(np.float32) for _ in range(8)]
+    for window in windows:
+        watch.take(window)
+    spent = []
+    for window in windows:
+        begin = time.process_time()
+        watch.take(window)
+        spent.append(time.process_time() - begin)
+    share = float(np.median(spent)) / WINDOW_S
+    single = []
+    for window in windows:
+        begin = time.process_time()
+        race_test(window, RATE_HZ, SPEED_RPM, bearing)
+        single.append(time.process_time() - begin)
+    print(f"one window    {1e3 * np.median(single):6.1f} ms CPU for {WINDOW_S} s alone")
+    met = "met" if share <= LIMIT else "MISSED"
+    print(f"steady        {1e3 * np.median(spent):6.1f} ms CPU a window with the last 10 s: ", end="")
+    print(f"{share:.2%} of a core (limit {LIMIT:.0%}: {met})")
+    tracemalloc.start()
+    watch.take(windows[0])
+    before = tracemalloc.get_traced_memory()[0]
+    for window in windows:
+        watch.take(window)
+    print(f"memory        {(tracemalloc.get_traced_memory()[0] - before) / 1024:6.0f} KiB more after 20 s")
+
+
+if __name__ == "__main__":
+    main()
