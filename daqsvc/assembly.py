@@ -301,13 +301,32 @@ def healthy_rotor(
     return stated, ()
 
 
-def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Path | None) -> Detector:
+def check_calibrations(machine: MachineFile) -> None:
+    """See whether the calibrations that a machine file names can be used.
+
+    Raises:
+        AssemblyError: one cannot; the message names file, key, value and remedy.
+    """
+    pipeline = machine.pipeline
+    if pipeline.rotor_synchronous is not None:
+        _stated_rotor(machine, pipeline.rotor_synchronous)
+    if pipeline.bearing is not None and pipeline.bearing.calibration is not None:
+        _bearing(machine, None)
+
+
+def _stated_rotor(
+    machine: MachineFile, given: RotorSynchronous
+) -> tuple[LavalRotor, tuple[Calibration, ...]]:
     try:
-        rotor, baselines = healthy_rotor(machine, given)
+        return healthy_rotor(machine, given)
     except CalibrationFileError as error:
         raise AssemblyError(
             f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(given.calibration)!r}: {error}"
         ) from error
+
+
+def _rotor_synchronous(machine: MachineFile, given: RotorSynchronous, store: Path | None) -> Detector:
+    rotor, baselines = _stated_rotor(machine, given)
     calibration, kept = (baselines[0] if baselines else None), None
     if calibration is None and store is not None:
         kept = store / f"{ROTOR_SYNCHRONOUS}.toml"

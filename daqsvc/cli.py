@@ -65,8 +65,14 @@ class CheckCommand:
         machine = load(arguments.file)
         if machine is None:
             return EXIT_BAD_FILE
+        from daqsvc.assembly import AssemblyError, check_calibrations  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
 
+        try:
+            check_calibrations(machine)
+        except AssemblyError as error:
+            print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+            return EXIT_BAD_FILE
         print(describe(machine))  # noqa: T201 - this is what the verb is for
         return EXIT_OK
 

@@ -16,7 +16,7 @@ from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
-from daqsvc.analysis.statements import Statements, listen
+from daqsvc.analysis.statements import Statements, by_name, listen, worst
 from daqsvc.recording.channels import UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
@@ -226,13 +226,14 @@ class MachineAnalyst:
         others = machine.model_copy(update={"pipeline": pipeline})
         streams = {name: self._stream(machine, name, recording) for name in machine.streams}
         return {
-            detector.name: Statements(
+            statements.detector: statements
+            for detector in assembly.detectors(others)
+            for statements in by_name(
                 detector.name,
                 tuple(listen(detector, streams[detector.stream], recording.rate_hz)),
                 recording.rate_hz,
                 getattr(detector, "faults", {}),
             )
-            for detector in assembly.detectors(others)
         }
 
     def _stream(self, machine: MachineFile, stream: str, recording: Recording) -> Floats:
@@ -285,4 +286,6 @@ def _outcome(
             found["bearing"] = bearings.analysis.as_json()
             texts.append(f"bearings of {bearings.analysis.describe()}")
     found["detectors"] = {said.detector: said.as_json() for said in statements}
+    if alarmed := worst(statements):
+        texts.insert(1, f"worst of the other detectors: {alarmed}")
     return Outcome(found, "\n  ".join(texts), first.refused is not None)

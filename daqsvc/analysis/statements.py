@@ -12,7 +12,7 @@ from daqsvc.analysis.result import finite
 from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
+_SEVERITIES = ("normal", "alert", "danger")
 _BLOCKS = 256
 """Blocks handed over at a time."""
 
@@ -46,6 +47,12 @@ class Statements:
         """The last statement; None if it said nothing."""
         return self.diagnoses[-1] if self.diagnoses else None
 
+    @property
+    def worst(self) -> Diagnosis | None:
+        """The first of its most severe statements that rest on good data; None without any."""
+        sound = [said for said in self.diagnoses if said.quality == "good"]
+        return max(sound, key=lambda said: _SEVERITIES.index(said.severity), default=None)
+
     def changes(self) -> Iterator[Diagnosis]:
         """The statements that say something else than the one before."""
         before: tuple[str, str, str] | None = None
@@ -59,7 +66,14 @@ class Statements:
         """For the output."""
         last = self.last
         if last is None:
-            return {"decision": None, "quality": "missing", "reason": "it said nothing", "history": []}
+            return {
+                "decision": None,
+                "quality": "missing",
+                "reason": "it said nothing",
+                "worst": None,
+                "history": [],
+            }
+        worst = self.worst
         said: dict[str, Any] = finite(
             {
                 "decision": last.decision,
@@ -73,6 +87,7 @@ class Statements:
                 "quality": last.quality,
                 "reason": last.reason,
                 "sensors": list(last.sensors),
+                "worst": None if worst is None else self._step(worst),
                 "history": [self._step(change) for change in self.changes()],
             }
         )
@@ -89,7 +104,11 @@ class Statements:
             for name, value in last.statistics.items()
             if not name.startswith("paper.")
         )
-        return f"{self.detector}: {last.decision} ({last.severity}){doubt}; {figures}"
+        worst = self.worst
+        before = ""
+        if worst is not None and worst.severity != last.severity:
+            before = f", {worst.severity} at {worst.first_index / self.rate_hz:.3f} s"
+        return f"{self.detector}: {last.decision} ({last.severity}{before}){doubt}; {figures}"
 
     def _step(self, said: Diagnosis) -> dict[str, Any]:
         return {
@@ -101,6 +120,36 @@ class Statements:
             "severity": said.severity,
             "quality": said.quality,
         }
+
+
+def by_name(
+    detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float, faults: Mapping[str, str]
+) -> list[Statements]:
+    """What a detector said, apart by whom it speaks for: a level detector speaks for each of its sensors.
+
+    Args:
+        detector: its name.
+        diagnoses: in order.
+        rate_hz: sampling rate of the recording.
+        faults: see `Statements`.
+    """
+    said: dict[str, list[Diagnosis]] = {}
+    for diagnosis in diagnoses:
+        said.setdefault(diagnosis.detector, []).append(diagnosis)
+    return [
+        Statements(name, tuple(of_name), rate_hz, faults)
+        for name, of_name in (said or {detector: []}).items()
+    ]
+
+
+def worst(statements: Iterable[Statements]) -> str:
+    """The most severe of what several detectors said, in words; empty if all is normal."""
+    found = [(said.detector, said.worst, said.rate_hz) for said in statements if said.worst is not None]
+    alarmed = [one for one in found if one[1].severity != "normal"]
+    if not alarmed:
+        return ""
+    name, diagnosis, rate_hz = max(alarmed, key=lambda one: _SEVERITIES.index(one[1].severity))
+    return f"{name}, {diagnosis.severity} from {diagnosis.first_index / rate_hz:.3f} s on"
 
 
 def listen(

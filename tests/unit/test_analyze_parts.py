@@ -22,7 +22,9 @@ from daqsvc.analysis.progress import Patience
 from daqsvc.analysis.result import finite
 from daqsvc.analysis.rotor import analyse, posterior
 from daqsvc.analysis.setup import RefusedError, RotorSetup
+from daqsvc.analysis.statements import by_name, worst
 from daqsvc.commands.option_types import SpeedOption, speed
+from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 
@@ -195,3 +197,34 @@ def test_recordings_go_to_processes_and_come_back_in_order() -> None:
 def test_a_process_that_is_killed_is_told() -> None:
     with pytest.raises(WorkerLostError, match="fewer --jobs"):
         list(judge_all(Sleepless("1"), ["0", "1", "2"], [None] * 3, processes=2))
+
+
+def test_each_sensor_of_a_level_detector_has_a_statement_of_its_own_and_the_worst_is_told() -> None:
+    def said(sensor: str, first_index: int, severity: Severity) -> Diagnosis:
+        return Diagnosis(
+            machine="m",
+            detector=f"levels/{sensor}",
+            t_ns=0,
+            stream="shaft",
+            first_index=first_index,
+            end_index=first_index + 100,
+            decision=severity,
+            severity=severity,
+            statistics={"rms": 1.0},
+        )
+
+    diagnoses = [
+        *(said("probe-x", 0, "normal"), said("probe-y", 0, "normal")),
+        *(said("probe-x", 100, "danger"), said("probe-y", 100, "normal")),
+        *(said("probe-x", 200, "alert"), said("probe-y", 200, "alert")),
+    ]
+    found = by_name("levels/shaft", diagnoses, 100.0, {})
+    assert [one.detector for one in found] == ["levels/probe-x", "levels/probe-y"]
+    assert [one.as_json()["severity"] for one in found] == ["alert", "alert"]
+    assert found[0].as_json()["worst"]["severity"] == "danger"
+    assert found[0].as_json()["worst"]["onset_sample"] == 100
+    assert found[0].describe().startswith("levels/probe-x: alert (alert, danger at 1.000 s); rms 1")
+    assert worst(found) == "levels/probe-x, danger from 1.000 s on"
+    assert worst(by_name("levels/shaft", diagnoses[:2], 100.0, {})) == ""
+    (silent,) = by_name("levels/shaft", [], 100.0, {})
+    assert silent.as_json()["worst"] is None
