@@ -13,7 +13,9 @@ import pytest
 from brokers import free_port
 
 CONFIG = Path(__file__).parents[2] / "config" / "machines"
+README = CONFIG.parents[1] / "README.md"
 STOP_S = 2.0
+VERBS = ("run", "check", "analyze", "calibrate", "detectability", "demo", "reproduce")
 
 
 def daqsvc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -53,13 +55,20 @@ def test_check_of_a_file_that_is_not_there_says_so(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("verb", [[], ["run"], ["check"], ["demo"]])
+@pytest.mark.parametrize("verb", [[], *([verb] for verb in VERBS)])
 def test_help_reads_well(verb: list[str]) -> None:
     done = daqsvc(*verb, "--help")
     assert done.returncode == 0
     assert done.stdout.startswith("usage: daqsvc")
     for line in done.stdout.splitlines():
         assert len(line) <= 100
+
+
+def test_the_readme_names_every_verb() -> None:
+    listed = re.findall(r"^    (\w+)", daqsvc("--help").stdout.split("verbs:")[1], flags=re.MULTILINE)
+    assert tuple(listed) == VERBS
+    table = re.findall(r"^\| `(\w+)[ `].*\|$", README.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert sorted(table) == sorted(VERBS)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
