@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 from daqsvc.dsp.marks import Edge, EdgeCounts, EdgeFinder, Mark, MarkLine
 from daqsvc.dsp.orbit_speed import OrbitPhase
 from daqsvc.dsp.shaft import WAIT_REVOLUTIONS, Between, Revolutions, Shaft
+from daqsvc.dsp.steady_edges import SharpEdges, SteadyEdges
 
 if TYPE_CHECKING:
     import numpy as np
@@ -96,9 +97,10 @@ class KeyphasorCutter:
     """Revolutions between the edges of a keyphasor (`EdgeFinder`, `MarkLine`).
 
     Between two edges the angle follows the mean of the parabolas through them and the edge before, and
-    through them and the edge after: a constant acceleration leaves no error. Hence a revolution comes out
-    when the next one is complete; up to three missing pulses are bridged. Where no edge comes for longer,
-    or the edges make no sense, the stretch is divided evenly into revolutions that are not trusted.
+    through them and the edge after: a constant acceleration leaves no error. Edges that lie
+    anywhere between two samples are placed where an evenly turning shaft puts them (`SteadyEdges`). Hence a
+    revolution comes out when the next one is complete; up to three missing pulses are bridged. Where no edge
+    comes for longer, or the edges make no sense, the stretch is divided evenly into revolutions that are not trusted.
 
     Args:
         threshold: level that marks the edge, in the unit of the marker.
@@ -126,6 +128,7 @@ class KeyphasorCutter:
             shortest = max(period_samples / _SPEED_RATIO, min(_SHORTEST_PERIOD, period_samples))
             period_range = (shortest, _SPEED_RATIO * period_samples)
         self._finder = EdgeFinder(threshold, hysteresis, edge)
+        self._sharp, self._steady = SharpEdges(), SteadyEdges()
         self._line = MarkLine(period_samples, period_range)
         self._period = period_samples
         self._patience = WAIT_REVOLUTIONS * period_range[1]
@@ -139,6 +142,8 @@ class KeyphasorCutter:
     def reset(self) -> None:
         """See `RevolutionCutter.reset`."""
         self._finder.reset()
+        self._sharp.reset()
+        self._steady.reset()
         self._line.reset()
         self._number = self._line.number
         self._shaft = Shaft()
@@ -151,15 +156,18 @@ class KeyphasorCutter:
         _check_samples(xy, marker)
         begin = self._shaft.position
         self._shaft.append(xy)
+        sharp = self._sharp.sharp(marker)
         for sample, fraction in self._finder.find(marker):
             # Whatever is overdue at this sample is settled before its edge, in blocks of any size.
             self._marks.wait(begin + sample)
             accepted = self._line.judge(begin + sample, fraction)
             if self._line.number != self._number:
                 self._number = self._line.number
+                self._steady.reset()
                 self._marks.restart(self._line.marks, self._line.period)
             elif accepted and self._line.locked:
-                self._marks.add(self._line.marks[-1], self._line.period)
+                mark = self._steady.place(self._line.marks[-1], sharp=bool(sharp[sample]))
+                self._marks.add(mark, self._line.period)
         self._marks.wait(self._shaft.position)
         return self._shaft.take()
 

@@ -37,6 +37,8 @@ _FLOOR = 0.002
 """Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
 _NOISE_FLOOR = 1e-3
 """The same of the residual: rounding of the recording."""
+_EDGE_SAMPLES = 0.29
+"""A keyphasor's edge may lie anywhere between two samples: a sharp one is not interpolated."""
 _TURNING_LEAVES = 0.1
 """Part of 1X that may still move where turning is what it is."""
 _LEAST_UNREST = 0.15
@@ -223,9 +225,11 @@ def calibrate(
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
-    restless = unrest(moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples)
-    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, assumed=angle_assumed)
-    _refuse_restless(restless)
+    restless = unrest(
+        moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
+    )
+    _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)
+    _refuse_restless(restless, samples)
     if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
         raise NotCalibratableError(
             f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of "
@@ -282,7 +286,14 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
 
 
 def _refuse_unsteady(
-    moved: Complexes, white: float, rotor: LavalRotor, speed_rad_s: float, deviation: Floats, *, assumed: bool
+    moved: Complexes,
+    white: float,
+    rotor: LavalRotor,
+    speed_rad_s: float,
+    deviation: Floats,
+    samples: float,
+    *,
+    assumed: bool,
 ) -> None:
     """Whether any stretch of the revolutions differs from the others; if so, say how.
 
@@ -292,13 +303,15 @@ def _refuse_unsteady(
         rotor: what is known about the rotor.
         speed_rad_s: mean speed.
         deviation: float64 ``[R]``, relative deviation of every revolution's speed.
+        samples: samples in a revolution.
         assumed: whether the angle rests on a stated speed.
     """
     amplitude = float(np.median(np.abs(moved[:, 1])))
     memory, floor = _memory(rotor, speed_rad_s), (_FLOOR * amplitude) ** 2
     _, slope = rotor.speed_slope(speed_rad_s)
     guard = amplitude * slope * deviation
-    odd = oddest_stretch(moved, white, memory, floor, guard)
+    jitter_rad = 0.0 if assumed else _EDGE_SAMPLES * 2.0 * math.pi / samples
+    odd = oddest_stretch(moved, white, memory, floor, guard, jitter_rad)
     if odd.nats <= VECTOR_NATS:
         return
     turn = turn_per_revolution(moved[:, 1]) if assumed else 0.0
@@ -321,9 +334,9 @@ def _refuse_unsteady(
     )
 
 
-def _refuse_restless(values: Floats) -> None:
+def _refuse_restless(values: Floats, samples: float) -> None:
     """Whether what does not repeat with the shaft comes or goes."""
-    restless = most_restless_stretch(values)
+    restless = most_restless_stretch(values, samples)
     usual = math.sqrt(float(np.median(values)) / 2.0)
     if restless.nats <= UNREST_NATS or abs(restless.by / max(usual, 1e-300) - 1.0) < _LEAST_UNREST:
         return

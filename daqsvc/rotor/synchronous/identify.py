@@ -138,7 +138,8 @@ def identify(
     agreed = previous is not None and (
         set(previous.candidates) == set(candidates) or (told and set(candidates) < set(previous.candidates))
     )
-    named = may_name and agreed
+    # That the machine may be healthy again is for the watch to decide; until then a name stands.
+    named = may_name and agreed and "normal" not in candidates
     group = candidates
     if previous is not None and previous.named and not named:
         # One look does not take a name away.

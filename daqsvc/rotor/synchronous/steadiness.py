@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.rotor.synchronous.vectors import HARMONICS
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -21,9 +23,13 @@ if TYPE_CHECKING:
 
 VECTOR_NATS = 30.0
 """Gamma(5, 1) passes this once in 300 million stretches; a calibration has some thousands."""
-UNREST_NATS = 20.0
+UNREST_NATS = 25.0
 _LENGTHS = np.unique(np.round(np.geomspace(1, 1000, 25)).astype(np.int64))
 _STARTS = 400
+_SHORTEST_UNREST = 4
+"""A bend reaches over three revolutions."""
+_WITHOUT_TURNING = 10.0 / 9.0
+"""One of ten real figures is left out."""
 _NAMES = ("the mean position", "1X", "backward 1X", "2X", "backward 2X")
 _MEDIAN = math.log(2.0)
 _TURN_PADDING = 16
@@ -49,23 +55,35 @@ class Stretch:
     by: float
 
 
-def unrest(vectors: Complexes, noise: Floats, samples: Floats, previous: Complexes | None = None) -> Floats:
+def unrest(
+    vectors: Complexes,
+    noise: Floats,
+    samples: Floats,
+    baseline: Complexes,
+    previous: Complexes | None = None,
+) -> Floats:
     """Variance of a sample that does not repeat with the shaft, float64 ``[R]``.
 
     The residual within the revolution, and the bend of the vector over three revolutions: a whirl at half
     the speed leaves little in the residual, as five harmonics fit half a cycle well, but is another one
-    every time. A vector that creeps or settles hardly bends. For white noise it equals the noise.
+    every time. A vector that creeps or settles hardly bends, and what jitter of the marks does to it (all
+    components turn together) is left out. For white noise it equals the noise.
 
     Args:
         vectors: complex128 ``[R, 5]``.
         noise: float64 ``[R]``, variance of the residual of a sample.
         samples: float64 ``[R]``.
+        baseline: complex128 ``[5]``, mean vector.
         previous: complex128 ``[P, 5]``, vectors of the revolutions before, the last two of them count.
     """
     known = vectors if previous is None else np.vstack((previous[-2:], vectors))
     bends = np.full(len(known), np.nan)
     if len(known) > 2:
-        bends[2:] = np.sum(np.abs(known[2:] - 2.0 * known[1:-1] + known[:-2]) ** 2, axis=1) / 6.0
+        bend = known[2:] - 2.0 * known[1:-1] + known[:-2]
+        turning = 1j * np.array(HARMONICS) * baseline
+        turning /= max(float(np.linalg.norm(turning)), 1e-300)
+        along = (bend @ turning.conj()).real
+        bends[2:] = (np.sum(np.abs(bend) ** 2, axis=1) - along**2) / 6.0 * _WITHOUT_TURNING
         bends[:2] = bends[2]
     else:
         bends[:] = 5.0 * noise.mean() / samples.mean()
@@ -73,7 +91,9 @@ def unrest(vectors: Complexes, noise: Floats, samples: Floats, previous: Complex
     return np.asarray((noise * np.maximum(samples - 5.0, 1.0) + samples * bends) / samples)
 
 
-def oddest_stretch(vectors: Complexes, white: float, memory: float, floor: float, guard: Floats) -> Stretch:
+def oddest_stretch(
+    vectors: Complexes, white: float, memory: float, floor: float, guard: Floats, jitter_rad: float = 0.0
+) -> Stretch:
     """The stretch whose mean vector differs most from that of the others.
 
     Args:
@@ -82,10 +102,12 @@ def oddest_stretch(vectors: Complexes, white: float, memory: float, floor: float
         memory: correlation of the stirred orbit from one revolution to the next.
         floor: um^2 that no difference counts below.
         guard: float64 ``[R]``, um of 1X that each revolution's speed leaves uncertain, with its sign.
+        jitter_rad: standard deviation of where a revolution begins.
     """
     neighbours = np.median(np.abs(np.diff(vectors, axis=0)) ** 2, axis=0) / (2.0 * _MEDIAN)
     stirred = np.maximum(neighbours - white, 0.0) / (1.0 - memory)
     variance = white + stirred * (1.0 + memory) / (1.0 - memory)
+    variance = variance + (jitter_rad * np.abs(np.array(HARMONICS) * np.median(np.abs(vectors), axis=0))) ** 2
     columns = np.column_stack((vectors, guard.astype(np.complex128)))
     best = Stretch(0, 0, 0.0, "", 0.0)
     for length, starts, inside, outside, share in _stretches(columns):
@@ -103,17 +125,20 @@ def oddest_stretch(vectors: Complexes, white: float, memory: float, floor: float
     return best
 
 
-def most_restless_stretch(values: Floats) -> Stretch:
+def most_restless_stretch(values: Floats, samples: float) -> Stretch:
     """The stretch whose unrest differs most from that of the others.
 
     Args:
         values: float64 ``[R]``, unrest of every revolution.
+        samples: samples in a revolution; white noise scatters the less the more there are.
     """
     typical = float(np.median(values))
     scatter = float(np.median(np.abs(np.diff(values)))) / (0.6745 * math.sqrt(2.0))
-    scatter = max(scatter, 1e-3 * typical, 1e-300)
+    scatter = max(scatter, typical / math.sqrt(max(samples - 5.0, 1.0)), 1e-300)
     best = Stretch(0, 0, 0.0, "", 0.0)
     for length, starts, inside, outside, share in _stretches(values[:, np.newaxis]):
+        if length < _SHORTEST_UNREST:
+            continue
         nats = (inside[:, 0] - outside[:, 0]) ** 2 / (2.0 * share * scatter**2)
         at = int(nats.argmax())
         if nats[at] > best.nats:

@@ -181,7 +181,7 @@ class RotorWatch:
         if self.calibration is None:
             return self._calibrate(one)
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
-        restless = float(unrest(moved, one.noise, one.samples, self._previous)[0])
+        restless = float(unrest(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0])
         self._previous = np.vstack((self._previous[-1:], moved))
         row = Row(self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0]))
         self._rows.append(row)
