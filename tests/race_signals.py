@@ -25,7 +25,9 @@ def strikes(
     random = np.random.default_rng(seed)
     n = int(seconds * rate_hz)
     turn = speed_rpm / 60.0 / rate_hz * np.arange(n)
-    x = random.standard_normal(n) + 0.5 * np.cos(2 * np.pi * turn) + 0.3 * np.cos(4 * np.pi * turn + 1.0)
+    x = random.standard_normal(n)
+    for harmonic, height in ((1, 0.5), (2, 0.3), (3, 0.2)):
+        x += height * np.cos(2 * np.pi * harmonic * turn + harmonic)
     if part is not None:
         order = {"inner": BEARING.inner, "outer": BEARING.outer, "ball": BEARING.ball_pass}[part]
         count = int(order * turn[-1]) + 2

@@ -20,6 +20,8 @@ HARMONICS = (1, 2, 3, 4)
 HALF_WIDTH = 0.006
 """Half width of a line as a share of its frequency: slip smears it."""
 
+FLAT_TOP = 0.98
+
 
 class ModulationDepth:
     """Modulation depth by order of one envelope spectrum.
@@ -69,5 +71,9 @@ def sharpest(views: Sequence[ModulationDepth], order: float, reach: float, bins_
     step = 0.5 / HARMONICS[-1] / bins_per_order
     count = int(reach * order / step)
     trials = np.asarray(order + step * np.arange(-count, count + 1), dtype=np.float64)
-    deepest = np.argmax(np.sum([view.comb(trials) ** 2 for view in views], axis=0))
-    return float(trials[deepest])
+    depth = np.sum([view.comb(trials) ** 2 for view in views], axis=0)
+    # A line narrower than what is summed has a flat top: its middle is the line.
+    top = np.flatnonzero(depth >= FLAT_TOP * depth.max())
+    deepest = int(np.argmax(depth))
+    run = top[np.abs(top - deepest) <= 2.0 * HALF_WIDTH * order / step]
+    return float(trials[run].mean())

@@ -128,7 +128,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         speed_seen=features.speed_seen,
         revolutions=features.revolutions,
         false_alarm_probability=len(PARTS) * false_alarm_probability(rules.z_limit),
-        level_db=float("nan") if change_db is None else change_db[0],
+        level_db=None if change_db is None else change_db[0],
         notes=tuple(notes),
         spectrum=features.spectrum,
     )

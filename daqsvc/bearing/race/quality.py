@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 MISSING_SHARE = 0.01
 CLIPPED_SHARE = 0.01
 CLIPPED_NOTE_SHARE = 1e-4
-CLIPPED_RUN = 3
-"""Least run of samples at the same extreme value that only a limit makes."""
+LEAST_CLIPPED = 3
+NEAR_LIMIT = 0.025
+PILED_UP = 1.5
+"""Samples at the extreme value over those within 2.5 % of the range of it, beyond which it is a limit."""
 DEAD_SHARE = 0.5
 OFFSET_DEVIATIONS = 5.0
 SHIFT_DEVIATIONS = 1.0
@@ -122,12 +124,12 @@ def _clean(x: Real) -> Real:
 
 
 def _clipped_share(x: Real) -> float:
-    """Share of samples in runs at an extreme value."""
+    """Share of samples that stand at a limit: more of them than just short of it."""
+    low, high = float(x.min()), float(x.max())
+    short = NEAR_LIMIT * (high - low)
     clipped = 0
-    for extreme in (x.min(), x.max()):
-        at = np.flatnonzero(x == extreme)
-        if len(at) >= CLIPPED_RUN:
-            starts = np.flatnonzero(np.diff(at, prepend=at[0] - 2) > 1)
-            runs = np.diff(starts, append=len(at))
-            clipped += int(runs[runs >= CLIPPED_RUN].sum())
+    for at, near in ((x == low, x < low + short), (x == high, x > high - short)):
+        count = int(np.count_nonzero(at))
+        if count >= LEAST_CLIPPED and count > PILED_UP * (np.count_nonzero(near) - count):
+            clipped += count
     return clipped / len(x)

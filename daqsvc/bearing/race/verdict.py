@@ -120,7 +120,7 @@ class RaceVerdict:
         speed_seen: whether harmonics of the shaft stood out at all.
         revolutions: of the shaft in the evidence.
         false_alarm_probability: what the significance limit is set to, per test of three parts, in noise.
-        level_db: broadband level over the baseline; NaN without one.
+        level_db: broadband level over the baseline; None without one.
         notes: what a reader should know, e.g. ``"ball not testable here: ..."``.
         spectrum: for figures.
     """
@@ -135,6 +135,6 @@ class RaceVerdict:
     speed_seen: bool
     revolutions: float
     false_alarm_probability: float
-    level_db: float = float("nan")
+    level_db: float | None = None
     notes: tuple[str, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)
