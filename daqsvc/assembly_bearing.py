@@ -10,7 +10,10 @@ from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.model import BearingParameters
 from daqsvc.diagnosis.bearing import BearingDetector, HousedBearing
+from daqsvc.diagnosis.bearing_direction import RaceDirection, TwoSensors
+from daqsvc.dsp.levels import STANDARD_GRAVITY
 from daqsvc.settings.bearing import BEARING
 
 if TYPE_CHECKING:
@@ -24,6 +27,7 @@ log = logging.getLogger(__name__)
 
 _SAME_RATE = 1e-3
 _SAME_SPEED = 0.05
+_M_S2_PER_UNIT = {"g": STANDARD_GRAVITY, "m/s2": 1.0}
 
 
 def bearing_detector(
@@ -71,7 +75,41 @@ def bearing_detector(
 def _housed(machine: MachineFile, index: int, given: WatchedBearing) -> HousedBearing:
     sensor = machine.sensor(given.sensor)
     column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
-    return HousedBearing(given.name, given.sensor, column, orders_of(given, index))
+    two = _two_sensors(machine, given, index)
+    return HousedBearing(given.name, given.sensor, column, orders_of(given, index), two)
+
+
+def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> TwoSensors | None:
+    """The accelerometer on the rotor and the masses of a bearing of a machine file; None if it has none.
+
+    Args:
+        machine: the machine file.
+        given: the bearing.
+        index: its place in ``pipeline.bearing.bearings``.
+
+    Raises:
+        ValueError: its masses and springs cannot be those of a bearing, or the rate is too low for them.
+    """
+    if given.rotor_sensor is None or given.model is None:
+        return None
+    model = given.model
+    (m_r, m_b, m_h), (k_s, k_c, k_h), (c_s, c_c, c_h) = (
+        model.masses_kg,
+        model.stiffness_n_per_m,
+        model.damping_n_s_per_m,
+    )
+    rotor, housing = machine.sensor(given.rotor_sensor), machine.sensor(given.sensor)
+    column = machine.streams[rotor.stream].layout.channel_names.index(rotor.channel)
+    m_s2_per_unit = (_M_S2_PER_UNIT[rotor.unit], _M_S2_PER_UNIT[housing.unit])
+    try:
+        parameters = BearingParameters(
+            m_r=m_r, m_b=m_b, m_h=m_h, k_s=k_s, k_c=k_c, k_h=k_h, c_s=c_s, c_c=c_c, c_h=c_h
+        )
+        two = TwoSensors(rotor.name, column, parameters, m_s2_per_unit)
+        RaceDirection(two, machine.streams[housing.stream].rate_hz)
+    except ValueError as error:
+        raise ValueError(f"pipeline.bearing.bearings[{index}].model: {error}") from None
+    return two
 
 
 def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
@@ -106,7 +144,10 @@ def _fitting(path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rp
     """
     found = load_bearing_baseline(path)
     lacking = [
-        b.sensor for b in bearings if (b.sensor,) not in found.residuals or b.sensor not in found.races
+        name
+        for b in bearings
+        for name in b.sensors
+        if b.sensors not in found.residuals or b.sensor not in found.races
     ]
     if lacking:
         known = ", ".join(found.races) or "none"

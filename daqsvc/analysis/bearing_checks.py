@@ -22,14 +22,10 @@ if TYPE_CHECKING:
 _LEAST_M_S2 = 1e-4
 _MOST_M_S2 = 10_000.0
 """No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""
-_OFFSET = 10.0
-"""A mean of so many times the motion is an offset; of an acceleration it means nothing."""
-_SHIFT = 4.0
-_PARTS = 20
 
 
 def accelerometer_quality(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> DataQuality:
-    """Count what is missing, and tell of offsets, of zeros that move, and of sizes that no acceleration has.
+    """Count what is missing, and tell of sizes that no acceleration has; the race test tells of offsets.
 
     Args:
         names: of the channels.
@@ -39,22 +35,11 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
     quality = count_bad(names, samples)
     for name, column in zip(names, samples.T, strict=True):
         signal = column[np.isfinite(column)]
-        if len(signal) < _PARTS:
+        if not len(signal):
             continue
-        parts = [part.mean() for part in np.array_split(signal, _PARTS)]
-        rms = float(np.sqrt(np.mean([part.var() for part in np.array_split(signal, _PARTS)])))
+        rms = float(signal.std())
         if rms == 0.0:
             continue  # dead: the race test says so
-        if float(np.ptp(parts)) > _SHIFT * rms:
-            quality = quality.with_problem(
-                f"{name}: its zero moves from {min(parts):.4g} to {max(parts):.4g} {unit} during the "
-                f"recording, {float(np.ptp(parts)) / rms:.0f} times the vibration; check cable and mounting"
-            )
-        elif abs(float(signal.mean())) > _OFFSET * rms:
-            quality = quality.with_problem(
-                f"{name}: stands at {signal.mean():.4g} {unit}, {abs(float(signal.mean())) / rms:.0f} times "
-                "the vibration; the offset was taken out"
-            )
         m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
         if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
             quality = quality.with_problem(

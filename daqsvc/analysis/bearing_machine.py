@@ -56,7 +56,13 @@ def present(given: Bearing | None, sensors: tuple[str, ...]) -> Bearing | None:
     """
     if given is None:
         return None
-    bearings = tuple(bearing for bearing in given.bearings if bearing.sensor in sensors)
+    bearings = tuple(
+        bearing
+        if bearing.rotor_sensor is None or bearing.rotor_sensor in sensors
+        else bearing.model_copy(update={"rotor_sensor": None, "model": None})
+        for bearing in given.bearings
+        if bearing.sensor in sensors
+    )
     return given.model_copy(update={"bearings": bearings}) if bearings else None
 
 
@@ -144,8 +150,8 @@ def _analysis(
     change_at = max(look.changes, key=lambda name: look.changes[name].departure, default=None)
     healthy = None
     if detector.baseline is not None and change_at is not None:
-        sensor = next(bearing.sensor for bearing in detector.bearings if bearing.name == change_at)
-        healthy = detector.baseline.residuals[(sensor,)]
+        sensors = next(bearing.sensors for bearing in detector.bearings if bearing.name == change_at)
+        healthy = detector.baseline.residuals[sensors]
     return replace(
         analysis,
         finding=BearingFinding(

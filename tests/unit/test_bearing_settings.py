@@ -130,6 +130,27 @@ def test_two_sensors_of_a_slow_stream_get_a_warning() -> None:
     assert ["look alike" in str(warning) for warning in slow.warnings] == [True]
 
 
+def test_two_sensors_of_a_bearing_tell_its_races_by_direction() -> None:
+    pair = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}'
+    given = machine((TYPE, pair), ('unit = "g"', 'unit = "m/s2"'))
+    assert "races also by direction with accel-fe" in " ".join(describe(given).split())
+    first, second = detector(given).bearings
+    assert (first.sensors, first.columns) == (("accel-fe", "accel-de"), (1, 0))
+    assert first.two.m_s2_per_unit == (9.80665, 1.0)
+    assert (first.two.parameters.m_b, first.two.parameters.k_c, first.two.parameters.c_h) == (
+        0.0185,
+        1e8,
+        2000.0,
+    )
+    assert (second.two, second.sensors) == (None, ("accel-fe",))
+
+
+def test_a_rate_too_low_for_the_rolling_elements_stops_it() -> None:
+    pair = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}'
+    with pytest.raises(assembly.AssemblyError, match=r"bearings\[0\].model: .* a corner of 3204.53"):
+        detector(machine((TYPE, pair), ("rate_hz = 25_600.0", "rate_hz = 7_000.0")))
+
+
 def test_an_alarm_follows_it_only_if_it_is_there() -> None:
     problem, _ = only_problem(ROTOR, ('detector = "rotor-synchronous"', 'detector = "bearing"'))
     assert "not configured" in problem.message

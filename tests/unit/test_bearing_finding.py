@@ -1,0 +1,149 @@
+"""What the bearings of a machine say together, and how steadily that is stood by."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from daqsvc.bearing.identify_change import BANDS, ResidualChange
+from daqsvc.bearing.race.verdict import PARTS, PartEvidence, RaceVerdict
+from daqsvc.diagnosis.bearing_direction import Direction
+from daqsvc.diagnosis.bearing_finding import WORDS, find
+from daqsvc.diagnosis.bearing_standing import CLEAR_LOOKS, CONFIRM_LOOKS, Steadfast
+
+
+def evidence(severity: float) -> PartEvidence:
+    return PartEvidence(
+        z=severity,
+        depth=1.0,
+        severity=severity,
+        steadiness=1.0,
+        z_limit=5.0,
+        limit=3.0,
+        steadiness_limit=0.5,
+        false_alarm_probability=1e-3,
+        order=4.0,
+    )
+
+
+def race(verdict: str, group: tuple[str, ...] | None = None, severity: float = 6.0) -> RaceVerdict:
+    group = group or (verdict,)
+    parts = [part for part in PARTS if part in group]
+    probability = {"normal": 0.1, **{part: 0.9 / len(parts) for part in parts}} if parts else {"normal": 1.0}
+    return RaceVerdict(
+        verdict=verdict,
+        group=group,
+        evidence={part: evidence(severity if part in group else 0.5) for part in PARTS},
+        probability=probability,
+        lines=(),
+        margin=2.0,
+        speed_rpm=1800.0,
+        speed_seen=True,
+        revolutions=300.0,
+        false_alarm_probability=1e-3,
+    )
+
+
+def change(*, changed: bool) -> ResidualChange:
+    rise = np.full(1 + BANDS, 9.0 if changed else 0.0)
+    return ResidualChange(changed, rise, np.full(1 + BANDS, 3.0), 5, quiet=False, gain=False)
+
+
+def test_the_bearing_that_shows_more_decides() -> None:
+    found = find({"a": race("outer", severity=4.0), "b": race("inner", severity=9.0)}, None, 1e-3)
+    assert (found.verdict, found.where, found.severity) == ("inner", "b", 9.0)
+    found = find({"a": race("outer", severity=4.0), "b": race("normal", severity=9.0)}, None, 1e-3)
+    assert (found.verdict, found.where) == ("outer", "a")
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "changed", "verdict"),
+    [
+        (("normal", "normal"), None, "normal"),
+        (("normal", "changed"), None, "changed"),
+        (("normal", "changed"), False, "normal"),  # significance and size outweigh a level alone
+        (("normal", "normal"), True, "changed"),
+        (("outer", "normal"), True, "outer"),
+        (("outer", "normal"), False, "outer"),
+    ],
+)
+def test_the_innovations_say_whether_anything_has_changed(verdicts, changed, verdict) -> None:
+    given = dict(zip("ab", map(race, verdicts), strict=True))
+    found = find(given, None if changed is None else change(changed=changed), 1e-3)
+    assert (found.verdict, found.group) == (verdict, (verdict,))
+    assert set(found.probabilities) == set(WORDS)
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert max(found.probabilities, key=found.probabilities.get) == verdict
+
+
+@pytest.mark.parametrize(
+    ("by_lines", "by_direction", "verdict", "group"),
+    [
+        (race("normal"), Direction(("outer",), -9.0), "outer", ("outer",)),
+        (race("normal"), Direction(("ball",), 0.0), "ball", ("ball",)),
+        (race("normal"), Direction(("inner", "outer", "ball"), math.nan), "changed", ("changed",)),
+        (race("inner_or_outer", ("inner", "outer")), Direction(("outer",), -9.0), "outer", ("outer",)),
+        (
+            race("inner_or_outer", ("inner", "outer")),
+            Direction(("ball",), 0.0),
+            "inner_or_outer",
+            ("inner", "outer"),
+        ),
+        (race("normal"), Direction(("inner", "ball"), 3.0), "inner_or_outer", ("inner", "ball")),
+        (race("inner"), Direction(("inner",), 9.0), "inner", ("inner",)),
+        (race("inner"), Direction(("outer",), -9.0), "inner_or_outer", ("inner", "outer")),
+        (race("ball"), Direction(("outer",), -9.0), "ball", ("ball",)),
+    ],
+)
+def test_the_direction_settles_a_doubt_or_raises_one(by_lines, by_direction, verdict, group) -> None:
+    found = find({"a": by_lines}, change(changed=True), 1e-3, {"a": by_direction})
+    assert (found.verdict, found.group) == (verdict, group)
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert max(found.probabilities, key=found.probabilities.get) == verdict
+
+
+def looks(steadfast: Steadfast, *words: str) -> list[str]:
+    said = []
+    for word in words:
+        group = ("inner", "outer") if word == "inner_or_outer" else (word,)
+        steadfast.look(find({"a": race(word, group)}, None, 1e-3))
+        said.append(steadfast.standing.decision)
+    return said
+
+
+def test_faults_need_two_looks_and_health_eight() -> None:
+    steadfast = Steadfast()
+    assert looks(steadfast, "normal", "outer", "normal", "outer") == ["normal"] * 4
+    assert looks(steadfast, "outer") == ["outer"]
+    assert steadfast.standing.where == "a"
+    assert looks(steadfast, *["normal"] * (CLEAR_LOOKS - 1), "outer") == ["outer"] * CLEAR_LOOKS
+    assert looks(steadfast, *["normal"] * CLEAR_LOOKS) == ["outer"] * (CLEAR_LOOKS - 1) + ["normal"]
+    assert CONFIRM_LOOKS == 2
+
+
+def test_two_names_of_a_fault_are_a_fault() -> None:
+    assert looks(Steadfast(), "normal", "changed", "outer") == ["normal", "normal", "outer"]
+
+
+def test_a_part_once_named_is_not_blurred_but_may_be_renamed() -> None:
+    steadfast = Steadfast()
+    assert looks(steadfast, "inner", "inner", *["changed"] * 20) == ["undetermined"] + ["inner"] * 21
+    assert looks(steadfast, "outer", "ball", "ball") == ["inner", "inner", "ball"]
+
+
+def test_a_gap_breaks_a_row_of_looks() -> None:
+    steadfast = Steadfast()
+    looks(steadfast, "normal", "outer")
+    steadfast.interrupt()
+    assert looks(steadfast, "outer", "outer") == ["normal", "outer"]
+
+
+def test_the_last_look_of_a_short_recording_counts_by_itself() -> None:
+    steadfast = Steadfast()
+    assert steadfast.look(find({"a": race("outer")}, None, 1e-3), last=True)
+    assert steadfast.standing.decision == "outer"
+    steadfast = Steadfast()
+    looks(steadfast, "normal")
+    assert not steadfast.look(find({"a": race("outer")}, None, 1e-3), last=True)
