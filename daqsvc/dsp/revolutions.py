@@ -100,7 +100,8 @@ class KeyphasorCutter:
     through them and the edge after: a constant acceleration leaves no error. Edges that lie
     anywhere between two samples are placed where an evenly turning shaft puts them (`SteadyEdges`). Hence a
     revolution comes out when the next one is complete; up to three missing pulses are bridged. Where no edge
-    comes for longer, or the edges make no sense, the stretch is divided evenly into revolutions that are not trusted.
+    comes for longer, or the edges make no sense, the stretch is divided evenly into revolutions that are not
+    trusted.
 
     Args:
         threshold: level that marks the edge, in the unit of the marker.
