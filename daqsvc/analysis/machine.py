@@ -17,6 +17,7 @@ from daqsvc.analysis.result import RotorAnalysis
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
 from daqsvc.analysis.statements import Statements, by_name, listen, worst
+from daqsvc.assembly_rotor import healthy_rotor
 from daqsvc.recording.channels import UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
@@ -68,7 +69,7 @@ class MachineAnalyst:
         machine = load_machine_file(Path(self.machine))
         self.check_map(machine)
         if machine.pipeline.rotor_synchronous is not None:
-            assembly.healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
+            healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
         elif self.calibration is not None and machine.pipeline.bearing is None:
             raise ValueError(
                 f"--calibration: {self.machine} has neither [pipeline.rotor_synchronous] nor "
@@ -178,7 +179,7 @@ class MachineAnalyst:
         if given.reference == "keyphasor" and given.keyphasor is not None:
             sensor = cast("models.Keyphasor", machine.sensor(given.keyphasor))
             keyphasor = Keyphasor(sensor.name, sensor.threshold_v, sensor.edge, sensor.hysteresis_v)
-        rotor, calibrations = assembly.healthy_rotor(machine, given, self.calibration)
+        rotor, calibrations = healthy_rotor(machine, given, self.calibration)
         return RotorSetup(
             probes=(x.name, y.name),
             probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),

@@ -320,3 +320,7 @@ class MachineFile(Section):
             if sensor.name == name:
                 return sensor
         raise KeyError(f"no sensor {name!r}; there are {', '.join(s.name for s in self.sensors)}")
+
+    def column(self, sensor: Sensor) -> int:
+        """Where a sensor stands among the channels of its stream."""
+        return self.streams[sensor.stream].layout.channel_names.index(sensor.channel)
