@@ -1,4 +1,4 @@
-"""``daqsvc detectability MACHINE``: what a machine's rotor bank can tell apart, before anything breaks."""
+"""``daqsvc detectability MACHINE``: what can be seen of a machine's rotor, before anything breaks."""
 
 from __future__ import annotations
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from daqsvc.rotor.detectability.foretell import Detectability
     from daqsvc.settings import MachineFile
 
+LEAST_FALSE_ALARMS = 1e-9
+MOST_FALSE_ALARMS = 10.0
+"""Per 1000 revolutions: what a machine file may say."""
+
 _FAILED = 1
 _BAD_FILE = 2
 
@@ -29,11 +33,12 @@ class DetectabilityCommand:
         prepare_kernel_cache: says where compiled kernels are kept.
     """
 
-    help = "say what the rotor bank of a machine can tell apart, how soon, and from which change on"
+    help = "say what can be told apart on a machine's rotor, how soon, and from which change on"
     description = (
         "Say, before any fault happens, what the rotor bank of a machine file can tell apart: evidence "
         "between every two modes in nats a revolution, expected delay of its alarms, smallest visible "
-        "change of every kind, and which modes look the same at this speed."
+        "change of every kind, and which modes look the same at this speed. Without a rotor bank, what the "
+        "synchronous vector of [pipeline.rotor_synchronous] can see: by its calibration, or by --noise-um."
     )
 
     def __init__(
@@ -64,6 +69,18 @@ class DetectabilityCommand:
             help="how much the machine itself shakes at random: power spectral density of the acceleration, "
             "normalised (default: process_noise of the file, mostly more than a machine has)",
         )
+        parser.add_argument(
+            "--noise-um",
+            type=positive,
+            metavar="N",
+            help="without a rotor bank: noise of one probe, where no calibration tells it",
+        )
+        parser.add_argument(
+            "--eccentricity-um",
+            type=positive,
+            metavar="E",
+            help="without a rotor bank: mass eccentricity, where neither calibration nor file tells it",
+        )
         parser.add_argument("--json", action="store_true", help="print one JSON object")
 
     def run(self, arguments: argparse.Namespace) -> int:
@@ -71,17 +88,16 @@ class DetectabilityCommand:
         machine = self._load(arguments.file)
         if machine is None:
             return _BAD_FILE
-        if machine.pipeline.rotor_bank is None:
-            _complain(
-                f"{arguments.file}: there is no [pipeline.rotor_bank], whose modes could be told apart; "
-                "add one, with [machine.rotor] for the rotor that it watches"
-            )
+        if wrong := _misuse(machine, arguments):
+            _complain(f"{arguments.file}: {wrong}")
             return _BAD_FILE
+        machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
+        if machine.pipeline.rotor_bank is None:
+            return _tell_vector(machine, arguments)
         self._prepare_kernel_cache()
         from daqsvc.assembly import AssemblyError  # noqa: PLC0415 - it brings the kernels' compiler
         from daqsvc.commands.detectability_report import as_json, as_text  # noqa: PLC0415
 
-        machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
         try:
             found = _foresee(machine, arguments.process_noise)
         except (AssemblyError, ValueError) as error:
@@ -89,6 +105,50 @@ class DetectabilityCommand:
             return _FAILED
         print(json.dumps(as_json(found, machine)) if arguments.json else as_text(found, machine))  # noqa: T201
         return 0
+
+
+def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
+    """What is wrong with the options for this machine; empty if nothing is."""
+    pipeline = machine.pipeline
+    if pipeline.rotor_bank is None and pipeline.rotor_synchronous is None:
+        return (
+            "there is neither [pipeline.rotor_bank], whose modes could be told apart, nor "
+            "[pipeline.rotor_synchronous]; add one, with [machine.rotor] for the rotor that it watches"
+        )
+    if pipeline.rotor_bank is None:
+        if arguments.process_noise is not None:
+            return "--process-noise: there is no [pipeline.rotor_bank] that it belongs to; leave it out"
+    elif arguments.noise_um is not None or arguments.eccentricity_um is not None:
+        return (
+            "--noise-um, --eccentricity-um: pipeline.rotor_bank.noise_um and machine.rotor.eccentricity_um "
+            "say this; leave them out"
+        )
+    rate = arguments.false_alarms_per_1000_rev
+    if rate is not None and not LEAST_FALSE_ALARMS <= rate <= MOST_FALSE_ALARMS:
+        return (
+            f"--false-alarms-per-1000-rev = {rate:g}: give a rate from {LEAST_FALSE_ALARMS:g} to "
+            f"{MOST_FALSE_ALARMS:g}"
+        )
+    return ""
+
+
+def _tell_vector(machine: MachineFile, arguments: argparse.Namespace) -> int:
+    """Print what the synchronous vector can see."""
+    from daqsvc.commands.detectability_vector import (  # noqa: PLC0415 - it brings NumPy
+        foresee_vector,
+        vector_json,
+        vector_text,
+    )
+
+    try:
+        found = foresee_vector(
+            machine, noise_um=arguments.noise_um, eccentricity_um=arguments.eccentricity_um
+        )
+    except ValueError as error:
+        _complain(f"{arguments.file}: {error}")
+        return _FAILED
+    print(json.dumps(vector_json(found, machine)) if arguments.json else vector_text(found, machine))  # noqa: T201
+    return 0
 
 
 def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability:
@@ -120,11 +180,14 @@ def _varied(
         signed_rpm = math.copysign(speed_rpm, machine.machine.speed_rpm)
         at_speed = machine.machine.model_copy(update={"speed_rpm": signed_rpm})
         machine = machine.model_copy(update={"machine": at_speed})
-    if false_alarms_per_1000_rev is not None and machine.pipeline.rotor_bank is not None:
+    if false_alarms_per_1000_rev is not None:
         update = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev}
-        bank = machine.pipeline.rotor_bank.model_copy(update=update)
-        pipeline = machine.pipeline.model_copy(update={"rotor_bank": bank})
-        machine = machine.model_copy(update={"pipeline": pipeline})
+        watching = {
+            name: getattr(machine.pipeline, name).model_copy(update=update)
+            for name in ("rotor_bank", "rotor_synchronous")
+            if getattr(machine.pipeline, name) is not None
+        }
+        machine = machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=watching)})
     return machine
 
 

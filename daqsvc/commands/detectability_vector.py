@@ -1,0 +1,179 @@
+"""``daqsvc detectability`` of a machine whose rotor is watched by its synchronous vector alone."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.assembly import healthy_rotor
+from daqsvc.rotor.detectability.vector import stated_calibration, vector_detectability
+from daqsvc.rotor.synchronous.departure import threshold_for
+from daqsvc.rotor.synchronous.vectors import HARMONICS
+
+if TYPE_CHECKING:
+    from daqsvc.rotor.detectability.vector import VectorDetectability, VisibleFault
+    from daqsvc.settings import MachineFile
+
+_COMPONENTS = ("mean position", "forward 1X", "backward 1X", "forward 2X", "backward 2X")
+_QUANTITIES = {
+    "unbalance": ("unbalance, times the healthy one", ""),
+    "damping_loss": ("damping ratio", ""),
+    "stiffness_loss": ("stiffness, of the healthy one", ""),
+    "static_load": ("static load, as further sag", " um"),
+}
+
+
+def foresee_vector(
+    machine: MachineFile, *, noise_um: float | None, eccentricity_um: float | None
+) -> VectorDetectability:
+    """Detectability of the calibrated rotor that the service would run for a machine file.
+
+    Args:
+        machine: the machine file, with ``[pipeline.rotor_synchronous]``.
+        noise_um: standard deviation of one probe's noise, where no calibration tells it.
+        eccentricity_um: mass eccentricity, where neither calibration nor machine file tells it.
+
+    Raises:
+        ValueError: something is not known, or cannot be used; the message says which option tells it.
+    """
+    given, rotor_table = machine.pipeline.rotor_synchronous, machine.machine.rotor
+    assert given is not None  # noqa: S101 - the command has looked
+    assert rotor_table is not None  # noqa: S101 - settings/rotor_checks.py: it needs [machine.rotor]
+    threshold_nats = threshold_for(given.false_alarms_per_1000_rev)
+    rotor, calibrations = healthy_rotor(machine, given)
+    if calibrations:
+        calibration = calibrations[0]
+    else:
+        eccentricity_um = eccentricity_um or rotor_table.eccentricity_um
+        lacking = [
+            option
+            for option, value in (("--noise-um", noise_um), ("--eccentricity-um", eccentricity_um))
+            if value is None
+        ]
+        if noise_um is None or eccentricity_um is None:
+            raise ValueError(
+                f"no calibration tells how the healthy machine whirls and how noisy its probes are: give "
+                f"{' and '.join(lacking)}, or calibrate the machine and name the file as "
+                "pipeline.rotor_synchronous.calibration"
+            )
+        rate_hz = machine.streams[machine.sensor(given.probes[0]).stream].rate_hz
+        calibration = stated_calibration(
+            rotor,
+            speed_rpm=machine.machine.speed_rpm,
+            samples_per_rev=60.0 * rate_hz / abs(machine.machine.speed_rpm),
+            noise_um=noise_um,
+            eccentricity_um=eccentricity_um,
+            revolutions=given.calibrate_revolutions,
+        )
+    return vector_detectability(
+        calibration, threshold_nats, probe_drift_um=given.probe_drift_um, ac_coupled=machine.ac_coupled
+    )
+
+
+def vector_json(found: VectorDetectability, machine: MachineFile) -> dict[str, Any]:
+    """The figures; what is never reached is null.
+
+    Args:
+        found: the figures.
+        machine: the machine file that they are for.
+    """
+    was, given = found.calibration, machine.pipeline.rotor_synchronous
+    assert given is not None  # noqa: S101 - see foresee_vector
+    return {
+        "machine": machine.machine.name,
+        "speed_rpm": math.copysign(was.speed_rpm, machine.machine.speed_rpm),
+        "samples_per_rev": was.samples_per_rev,
+        "noise_um": was.noise_um,
+        "amplitude_um": was.amplitude_um,
+        "calibration_rev": was.revolutions,
+        "false_alarms_per_1000_rev": given.false_alarms_per_1000_rev,
+        "threshold_nats": found.threshold_nats,
+        "smallest_um": {
+            str(order): value if math.isfinite(value) else None
+            for order, value in zip(HARMONICS, found.smallest_um.tolist(), strict=True)
+        },
+        "smallest_change": [
+            {
+                "fault": one.fault,
+                "quantity": _QUANTITIES[one.fault][0],
+                "unit": _QUANTITIES[one.fault][1].strip(),
+                "healthy": one.healthy,
+                "by_vector": one.smallest,
+                "change_um": one.change_um,
+                "delays": [{"size": delay.size, "delay_rev": delay.revolutions} for delay in one.delays],
+            }
+            for one in found.faults
+        ],
+        "ambiguous": [
+            {
+                "modes": ["unbalance", "damping_loss"],
+                "misfit_nats": found.misfit_nats,
+                "opens_at_rpm": found.opens_at_rpm,
+                "told_by_transient": found.told_by_transient,
+            }
+        ]
+        if found.one_group
+        else [],
+    }
+
+
+def vector_text(found: VectorDetectability, machine: MachineFile) -> str:
+    """Tables and sentences for a person.
+
+    Args:
+        found: the figures.
+        machine: the machine file that they are for.
+    """
+    was = found.calibration
+    head = (
+        f"{machine.machine.name} at {was.speed_rpm:.6g} rpm, by its synchronous vector: 1X "
+        f"{was.amplitude_um:.4g} um, {was.samples_per_rev:.4g} samples a revolution,\n"
+        f"noise {was.noise_um:.3g} um, {was.revolutions} revolutions of calibration; a change is an alarm at "
+        f"{found.threshold_nats:.3g} nats"
+    )
+    components = [
+        "Smallest change of a component that can be seen",
+        *(
+            f"{name:>34}{f'{value:.3g} um' if math.isfinite(value) else 'never':>12}"
+            for name, value in zip(_COMPONENTS, found.smallest_um.tolist(), strict=True)
+        ),
+    ]
+    faults = [
+        "Smallest change of every kind, and revolutions until larger ones are an alarm",
+        f"{'':>34}{'healthy':>12}{'smallest':>12}   larger ones",
+        *(_row(one) for one in found.faults),
+    ]
+    return "\n\n".join([head, "\n".join(components), "\n".join(faults), _ambiguity(found)])
+
+
+def _row(one: VisibleFault) -> str:
+    quantity, unit = _QUANTITIES[one.fault]
+    smallest = "never" if one.smallest is None else f"{one.smallest:.4g}{unit}"
+    larger = ", ".join(
+        f"{delay.size:.3g}{unit} " + ("never" if delay.revolutions is None else f"in {delay.revolutions:.0f}")
+        for delay in one.delays
+    )
+    return f"{quantity:>34}{f'{one.healthy:.3g}{unit}':>12}{smallest:>12}   {larger}".rstrip()
+
+
+def _ambiguity(found: VectorDetectability) -> str:
+    was = found.calibration
+    if not found.one_group:
+        said = (
+            f"At {was.speed_rpm:.6g} rpm no loss of damping moves 1X as unbalance does: a grown unbalance is "
+            "told from it. What a loss of damping does, another unbalance can do as well"
+        )
+    else:
+        said = f"Unbalance and loss of damping are one group at {was.speed_rpm:.6g} rpm"
+        said += (
+            ", and at any speed within 30 % of it"
+            if found.opens_at_rpm is None
+            else f"; at {found.opens_at_rpm:.6g} rpm a grown unbalance is told from it"
+        )
+    transient = (
+        "The transient of an abrupt change tells them apart, too."
+        if found.told_by_transient
+        else "A rotor known within 5 % would tell them apart by the transient of an abrupt change: calibrate "
+        "with a run-up."
+    )
+    return f"{said}.\n{transient}"
