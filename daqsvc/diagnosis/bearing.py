@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,16 +11,24 @@ from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_change import ChangeRules, compare_residual
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PARTS, RaceInputError
+from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
 from daqsvc.diagnosis.bearing_direction import Direction, RaceDirection, TwoSensors
 from daqsvc.diagnosis.bearing_finding import SOUND, BearingFinding, find
+from daqsvc.diagnosis.bearing_look import (
+    LARGE,
+    Look,
+    evidence_of,
+    figures_of,
+    thresholds_of,
+    units_of,
+)
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
 from daqsvc.diagnosis.bearing_standing import Standing, Steadfast
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -41,10 +48,8 @@ _LEAST_LAST = 0.5
 """Part of a look that is worth a last one."""
 _MISSING = 0.01
 """Part of a look's samples that may be missing; single ones are bridged."""
-_LARGE = 10.0
-"""Innovations of so many times those of the healthy machine are danger ..."""
 _NO_LONGER_LARGE = 8.0
-"""... until they are less than so many."""
+"""Danger stays until the innovations are less than so many times the healthy ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,32 +79,6 @@ class HousedBearing:
     def columns(self) -> tuple[int, ...]:
         """Their columns."""
         return (self.column,) if self.two is None else (self.two.column, self.column)
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """What one look has found.
-
-    Attributes:
-        races: of each bearing that could be judged, by name.
-        changes: of the innovations at each of them; empty without a healthy machine.
-        directions: which race two accelerometers tell, of each bearing that has two and has changed.
-        quality: what the samples are worth.
-        reason: why they are not good.
-        finding: what the bearings show together; None if none could be judged.
-    """
-
-    races: Mapping[str, RaceVerdict]
-    changes: Mapping[str, ResidualChange]
-    quality: DataQuality
-    reason: str
-    finding: BearingFinding | None
-    directions: Mapping[str, Direction] = field(default_factory=dict)
-
-    @property
-    def change(self) -> ResidualChange | None:
-        """Of the bearing where the innovations have grown most."""
-        return max(self.changes.values(), key=lambda one: one.departure, default=None)
 
 
 class BearingDetector:
@@ -365,14 +344,14 @@ class BearingDetector:
             self._large = False
             return "normal"
         if change is not None:
-            self._large = change.ratio > (_NO_LONGER_LARGE if self._large else _LARGE)
+            self._large = change.ratio > (_NO_LONGER_LARGE if self._large else LARGE)
         return "danger" if self._large else "alert"
 
     def _statement(self, look: Look, first_index: int, t_ns: int, *, changed: bool) -> Diagnosis:
         standing = self._steadfast.standing
         where = standing.where or (look.finding.where if look.finding is not None else "")
         good = look.quality == "good"
-        figures = _figures(look, where)
+        figures = figures_of(look, where)
         said = Diagnosis(
             machine=self._machine,
             detector=self.name,
@@ -386,9 +365,9 @@ class BearingDetector:
             probabilities={str(k): p for k, p in look.finding.probabilities.items()} if look.finding else {},
             group=standing.group,
             statistics=figures,
-            units=_units(figures),
-            thresholds=_thresholds(look, where),
-            evidence=_evidence(look, where),
+            units=units_of(figures),
+            thresholds=thresholds_of(look, where),
+            evidence=evidence_of(look, where),
             quality=look.quality,
             reason=look.reason,
             sensors=tuple(bearing.sensor for bearing in self.bearings if bearing.name == standing.where)
@@ -409,60 +388,3 @@ class BearingDetector:
 
 class _StandsStillError(ValueError):
     """The machine does not run."""
-
-
-_UNITS = {"speed": "rpm", "residual.rise": "dB", "line.frequency": "Hz"}
-
-
-def _units(figures: Iterable[str]) -> dict[str, str]:
-    """Unit of each figure that has one."""
-    units = {key: "dB" if key.endswith(".direction") else _UNITS.get(key, "") for key in figures}
-    return {key: unit for key, unit in units.items() if unit}
-
-
-def _figures(look: Look, where: str) -> dict[str, float]:
-    """What was measured: of the bearing that the statement is about, and the size of every other."""
-    figures: dict[str, float] = {}
-    if look.change is not None:
-        figures |= {
-            "residual.ratio": look.change.ratio,
-            "residual.rise": float(look.change.rise_db[0]),
-            "residual.departure": look.change.departure,
-        }
-    figures |= {
-        f"{name}.direction": direction.ratio_db
-        for name, direction in look.directions.items()
-        if math.isfinite(direction.ratio_db)
-    }
-    for name, race in look.races.items():
-        for part in PARTS:
-            evidence = race.evidence[part]
-            figures[f"{name}.{part}.z"] = evidence.z
-            figures[f"{name}.{part}.size"] = evidence.depth
-            figures[f"{name}.{part}.severity"] = evidence.severity
-    race_there = look.races.get(where)
-    if race_there is not None:
-        figures["speed"] = race_there.speed_rpm
-        found = [line for line in race_there.lines if line.part in race_there.group]
-        if found:
-            figures |= {"line.frequency": found[0].frequency_hz, "line.order": found[0].order}
-    return figures
-
-
-def _thresholds(look: Look, where: str) -> dict[str, float]:
-    thresholds: dict[str, float] = {}
-    if look.change is not None:
-        thresholds |= {"residual.departure": 1.0, "residual.ratio.danger": _LARGE}
-    if where in look.races:
-        for part, evidence in look.races[where].evidence.items():
-            thresholds[f"{where}.{part}.z"] = evidence.z_limit
-            thresholds[f"{where}.{part}.severity"] = evidence.limit
-    return thresholds
-
-
-def _evidence(look: Look, where: str) -> dict[str, float]:
-    """Log-likelihood ratios of the lines of each part against noise, in nats."""
-    if where not in look.races:
-        return {}
-    lines = look.races[where].lines
-    return {part: float(sum(line.evidence for line in lines if line.part == part)) for part in PARTS}
