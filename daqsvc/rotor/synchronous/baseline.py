@@ -46,8 +46,8 @@ _LEAST_UNREST = 0.15
 _LAVAL_ELLIPTICITY = 0.05
 _REVERSED = 2.0
 _DOUBLED = 5.0
-_LEAST_WHIRL = 4.0
-"""1X amplitude over its own standard deviation below which there is no orbit to speak of."""
+_LEAST_WHIRL = 3.0
+"""Power of the whirl above that of noise, in standard deviations, that makes an orbit."""
 
 
 class NotCalibratableError(ValueError):
@@ -225,27 +225,12 @@ def calibrate(
     noise = max(float(vectors.noise.mean()), (_NOISE_FLOOR * amplitude) ** 2)
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
+    _refuse_no_orbit(vectors.vectors, white)
     restless = unrest(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
     _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)
     _refuse_restless(restless, samples)
-    if amplitude < _LEAST_WHIRL * math.sqrt(4.0 * float(variance[1:].mean()) / count):
-        raise NotCalibratableError(
-            f"there is no orbit: 1X is {abs(baseline[1]):.3g} um in noise of "
-            f"{math.sqrt(noise / 2.0):.3g} um; check that the machine turns, the probes' names and their unit"
-        )
-    if abs(baseline[2]) > _REVERSED * abs(baseline[1]):
-        raise NotCalibratableError(
-            f"the orbit turns against the stated rotation (backward 1X {abs(baseline[2]):.3g} um, forward "
-            f"{abs(baseline[1]):.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft "
-            "turns clockwise; swap the probes, or give the speed a minus sign"
-        )
-    if abs(baseline[3]) > _DOUBLED * abs(baseline[1]):
-        raise NotCalibratableError(
-            f"2X is {abs(baseline[3]):.3g} um where 1X is {abs(baseline[1]):.3g} um: the angle turns half as "
-            "fast as the shaft; check that the keyphasor gives one pulse a revolution, and the stated speed"
-        )
     relative = restless / restless.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
     return Calibration(
@@ -283,6 +268,27 @@ def _long_run_variance(vectors: Complexes, white: float, memory: float) -> Float
     scatter = np.sum(np.abs(level - np.outer(time, trend)) ** 2, axis=0) / (len(vectors) - 2)
     stirred = np.maximum(scatter - white, 0.0)
     return np.asarray(white + stirred * (1.0 + memory) / (1.0 - memory))
+
+
+def _refuse_no_orbit(vectors: Complexes, white: float) -> None:
+    """Whether there is an orbit that turns with the shaft, once in a revolution, be it steady or not."""
+    size = np.sqrt(np.mean(np.abs(vectors) ** 2, axis=0))
+    if np.sum(size[1:] ** 2) < 4.0 * white * (1.0 + _LEAST_WHIRL / math.sqrt(len(vectors))):
+        raise NotCalibratableError(
+            f"there is no orbit: 1X is {size[1]:.3g} um, as noise alone makes it; check that the machine "
+            "turns, the probes' names and their unit"
+        )
+    if size[2] > _REVERSED * size[1]:
+        raise NotCalibratableError(
+            f"the orbit turns against the stated rotation (backward 1X {size[2]:.3g} um, forward "
+            f"{size[1]:.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft turns clockwise; swap the "
+            "probes, or give the speed a minus sign"
+        )
+    if size[3] > _DOUBLED * size[1]:
+        raise NotCalibratableError(
+            f"2X is {size[3]:.3g} um where 1X is {size[1]:.3g} um: the angle turns half as fast as the shaft; "
+            "check that the keyphasor gives one pulse a revolution, and the stated speed"
+        )
 
 
 def _refuse_unsteady(
