@@ -19,6 +19,19 @@ RATE_HZ = SPEED_RPM / 60.0 * SAMPLES_PER_REV
 AMPLITUDE_UM = 40.0
 SAG_UM = 12.0
 NOISE_UM = 1.0
+VERDICTS = {
+    "normal",
+    "unbalance",
+    "damping_loss",
+    "static_load",
+    "stiffness_loss",
+    "rub",
+    "unmodelled",
+    "small_change",
+}
+"""All that the rotor's verdict can be."""
+UNBALANCE = 0.8
+"""Growth of 1X, in healthy amplitudes."""
 ONSET = 80.25
 """In revolutions; not at a mark, where the rounding of the stated speed decides which one it falls into."""
 
