@@ -15,8 +15,8 @@ from orbit_files import OPTIONS, RATE_HZ, SPEED_RPM, UNBALANCE, VERDICTS, Orbit
 from daqsvc.cli import main
 
 if TYPE_CHECKING:
-    from pathlib import Path
     from collections.abc import Callable
+    from pathlib import Path
 
 ROSS = (
     *("--probes", "x_disc,y_disc", "--unit", "m", "--natural-frequency-hz", "85", "--damping-ratio", "0.17"),

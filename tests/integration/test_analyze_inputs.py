@@ -13,8 +13,8 @@ from orbit_files import OPTIONS, RATE_HZ, SPEED_RPM, UNBALANCE, Orbit
 from daqsvc.cli import main
 
 if TYPE_CHECKING:
-    from pathlib import Path
     from collections.abc import Callable
+    from pathlib import Path
 
 
 def _all_missing(orbit: Orbit) -> None:
