@@ -1,0 +1,201 @@
+"""Which race, by likelihood: every hit is asked which race explains it better.
+
+The residual is cut into frames about as long as one hit. In frame t and line f of its spectrum, the healthy
+machine has the covariance S_0(f); a hit of race i adds a s(f) M_i(f). There a is the size of the hit, s the
+spectrum of a short dip, and M_i the second moment of the race's answer over models that are wrong by the
+stated mismatch: lines in which the two races look alike to such models then say nothing. The logarithm of the
+likelihood, each race at its best a, gives for each frame a ratio d of inner over outer race in nats, of which
+what noise alone does is taken off. Under a fault of one race all frames that decide are of one side; a ball
+hits the races in turn, and they are of both. So the rule is one of ratio again: that of the evidence for
+the inner race to that for either.
+
+Against energies of the two components this gains much where the races look nearly alike: the noises of the
+two components are then nearly one, and cancel in d.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from daqsvc.bearing.model import INNER, OUTER, BearingModel, BearingParameters
+from daqsvc.bearing.residual import CORNER_HZ
+
+if TYPE_CHECKING:
+    from daqsvc.bearing.model import Complexes, Floats
+    from daqsvc.bearing.ratio_rule import Race
+
+FRAME_S = 128 / 48_000
+"""Length of a frame: a hit, and little of the next."""
+LOWEST_PER_BALL_MODE, LOWEST_HZ = 0.2, 600.0
+"""Lines below this share of the rolling elements' mode cannot tell the races apart."""
+HIGHEST_PER_NYQUIST = 2.0 / 3.0
+DIP_HZ = 2_500.0
+"""Bandwidth of the displacement as a rolling element passes a spall."""
+STANDS_OUT_NATS = 4.0
+"""A frame counts as a hit if it is so much likelier with one than without."""
+DECIDES_NATS = 2.0
+"""Taken off the ratio of every frame: noise alone makes frames lean to either side by as much."""
+OUTER_BELOW, INNER_ABOVE = 0.31, 0.9
+"""Shares of the evidence for the inner race that bound a ball's."""
+LEAST_NATS = 80.0
+"""Evidence below which the verdict is left open."""
+DOUBT = 0.05
+"""A share this near to a boundary leaves the parts on both sides of it possible."""
+_DRAWS = 200
+_SIZES = np.append(0.0, 10.0 ** np.arange(-1.5, 6.1, 0.3))
+_SMALLEST = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Isolation:
+    """What a window says of a fault that has been detected.
+
+    Attributes:
+        verdict: the faulty part; ``"ball"`` is also what inner and outer race together look like, and
+            ``"inner_or_outer"`` says that the evidence does not decide.
+        group: the parts that the evidence leaves possible, the verdict first.
+        inner_share: evidence for the inner race as a share of all; NaN if there is none.
+        inner_nats: evidence of the frames that are likelier to be hits of the inner race.
+        outer_nats: evidence of the others.
+        hits: frames in which a hit stands out.
+    """
+
+    verdict: Race | Literal["inner_or_outer"]
+    group: tuple[Race, ...]
+    inner_share: float
+    inner_nats: float
+    outer_nats: float
+    hits: int
+
+
+class IsolationRule:
+    """Judges windows of the residual of `daqsvc.bearing.residual.TwoSensorResidual` with its usual corner.
+
+    Args:
+        parameters: of the healthy bearing.
+        rate_hz: sampling rate.
+        healthy: float64 ``[n, 2]``, residual of the healthy machine in m/s^2; frames with NaN are left out.
+        mismatch: share by which each parameter may be wrong.
+        seed: of the models that are drawn.
+
+    Attributes:
+        lines_hz: frequencies that tell the races apart; none if the sampling rate is too low for this
+            bearing, and then every verdict is ``"inner_or_outer"``.
+
+    Raises:
+        ValueError: the healthy residual is too short, or the mismatch not between 0 and 0.5.
+    """
+
+    def __init__(
+        self,
+        parameters: BearingParameters,
+        rate_hz: float,
+        healthy: Floats,
+        *,
+        mismatch: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        if not 0.0 <= mismatch < 0.5:
+            raise ValueError(f"bearing isolation: a mismatch of {mismatch:g}; it must be from 0 to 0.5")
+        self._frame = 2 * round(FRAME_S * rate_hz / 2.0)
+        frequency_hz = np.fft.rfftfreq(self._frame, 1.0 / rate_hz)
+        model = BearingModel(parameters)
+        lowest = max(LOWEST_PER_BALL_MODE * model.modes_hz[2], LOWEST_HZ)
+        highest = HIGHEST_PER_NYQUIST * rate_hz / 2.0
+        self._kept = (frequency_hz > lowest) & (frequency_hz < highest)
+        self.lines_hz: Floats = frequency_hz[self._kept]
+        self._to_displacement = 1.0 / np.diag(model.D)
+        spectra = self._spectra(healthy)
+        if len(spectra) < 4 * self._frame:
+            raise ValueError(
+                f"bearing isolation: {len(healthy) / rate_hz:.2f} s of healthy residual; "
+                f"{2.0 * (self._frame + 1) * self._frame / rate_hz:.1f} s or more are needed"
+            )
+        if len(self.lines_hz):
+            noise = np.einsum("tfi,tfj->fij", spectra, spectra.conj()) / len(spectra)
+            self._weigh(model, noise, mismatch, np.random.default_rng(seed))
+
+    def _weigh(
+        self, model: BearingModel, noise: Complexes, mismatch: float, rng: np.random.Generator
+    ) -> None:
+        """Quadratic forms of the log-likelihood of every race and size, over all lines at once."""
+        moments = _moments(model, np.asarray(self.lines_hz), mismatch, rng)
+        s = 1j * self.lines_hz
+        dip = np.abs(s / (s + CORNER_HZ)) ** 12 / (1.0 + (self.lines_hz / DIP_HZ) ** 2) ** 3
+        smallest = _SMALLEST * float(np.median(np.trace(noise, axis1=1, axis2=2).real / dip))
+        hits = (_SIZES * smallest)[:, None, None, None, None] * dip[:, None, None] * moments[None]
+        precision = np.linalg.inv(noise + hits)
+        self._normaliser = np.log(np.linalg.det(noise + hits).real).sum(axis=-1)
+        cross = precision[..., 0, 1]
+        self._forms = np.concatenate(
+            (precision[..., 0, 0].real, precision[..., 1, 1].real, 2.0 * cross.real, -2.0 * cross.imag),
+            axis=-1,
+        )
+
+    def judge(self, residual: Floats) -> Isolation:
+        """Name the faulty part.
+
+        Args:
+            residual: float64 ``[n, 2]`` in m/s^2, of a window in which a fault was detected; frames with NaN
+                are left out.
+        """
+        inner, outer, hits = self._evidence(residual)
+        total = inner + outer
+        everything: tuple[Race, ...] = ("inner", "outer", "ball")
+        if total < LEAST_NATS:
+            return Isolation(
+                "inner_or_outer", everything, inner / total if total else math.nan, inner, outer, hits
+            )
+        share = inner / total
+        verdict: Race = "outer" if share < OUTER_BELOW else "inner" if share > INNER_ABOVE else "ball"
+        neighbours: dict[Race, bool] = {
+            "outer": share < OUTER_BELOW + DOUBT,
+            "inner": share > INNER_ABOVE - DOUBT,
+            "ball": OUTER_BELOW - DOUBT < share < INNER_ABOVE + DOUBT,
+        }
+        others = tuple(race for race, near in neighbours.items() if near and race != verdict)
+        return Isolation(verdict, (verdict, *others), share, inner, outer, hits)
+
+    def _evidence(self, residual: Floats) -> tuple[float, float, int]:
+        """Nats for the inner and for the outer race, and the number of hits."""
+        spectra = self._spectra(residual)
+        if not len(spectra) or not len(self.lines_hz):
+            return 0.0, 0.0, 0
+        cross = spectra[..., 0].conj() * spectra[..., 1]
+        products = (*np.abs(spectra.transpose(2, 0, 1)) ** 2, cross.real, cross.imag)
+        likelihood = -np.tensordot(np.concatenate(products, axis=1), self._forms, (1, 2)) - self._normaliser
+        gain = likelihood.max(axis=1) - likelihood[:, 0]
+        gain = gain[gain.max(axis=1) > STANDS_OUT_NATS]
+        ratio = gain[:, INNER] - gain[:, OUTER]
+        inner, outer = (np.maximum(side - DECIDES_NATS, 0.0).sum() for side in (ratio, -ratio))
+        return float(inner), float(outer), len(ratio)
+
+    def _spectra(self, residual: Floats) -> Complexes:
+        """Displacement spectra of the whole frames, complex128 ``[t, lines, 2]``."""
+        if len(residual) < self._frame:
+            return np.zeros((0, len(self.lines_hz), 2), dtype=np.complex128)
+        cut = np.lib.stride_tricks.sliding_window_view(residual, self._frame, axis=0)[:: self._frame // 2]
+        cut = cut[np.isfinite(cut).all(axis=(1, 2))]
+        spectra = np.fft.rfft(cut * np.hanning(self._frame), axis=2)[..., self._kept]
+        return np.asarray(spectra.swapaxes(1, 2) * self._to_displacement)
+
+
+def _moments(
+    model: BearingModel, frequency_hz: Floats, mismatch: float, rng: np.random.Generator
+) -> Complexes:
+    """Second moments of what a unit hit of either race looks like, complex128 ``[race, f, 2, 2]``."""
+    nominal = np.linalg.inv(model.fault_transfer_by_stiffness(frequency_hz))
+    moments = np.zeros((2, len(frequency_hz), 2, 2), dtype=np.complex128)
+    figures = asdict(model.parameters)
+    for _ in range(_DRAWS):
+        off = 1.0 + mismatch * rng.uniform(-1.0, 1.0, len(figures))
+        drawn = BearingParameters(
+            **{name: value * x for (name, value), x in zip(figures.items(), off, strict=True)}
+        )
+        seen = nominal @ BearingModel(drawn).fault_transfer_by_stiffness(frequency_hz)
+        moments += np.einsum("fir,fjr->rfij", seen, seen.conj()) / _DRAWS
+    return np.asarray(moments)
