@@ -281,13 +281,13 @@ def _refuse_no_orbit(vectors: Complexes, white: float) -> None:
     if size[2] > _REVERSED * size[1]:
         raise NotCalibratableError(
             f"the orbit turns against the stated rotation (backward 1X {size[2]:.3g} um, forward "
-            f"{size[1]:.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft turns clockwise; swap the "
-            "probes, or give the speed a minus sign"
+            f"{size[1]:.3g} um): x and y are swapped, one probe has the wrong sign, or the shaft turns "
+            "clockwise; swap the probes, or give the speed a minus sign"
         )
     if size[3] > _DOUBLED * size[1]:
         raise NotCalibratableError(
-            f"2X is {size[3]:.3g} um where 1X is {size[1]:.3g} um: the angle turns half as fast as the shaft; "
-            "check that the keyphasor gives one pulse a revolution, and the stated speed"
+            f"2X is {size[3]:.3g} um where 1X is {size[1]:.3g} um: the angle turns half as fast as the "
+            "shaft; check that the keyphasor gives one pulse a revolution, and the stated speed"
         )
 
 
