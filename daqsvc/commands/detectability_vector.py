@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.assembly import healthy_rotor
+from daqsvc.assembly_rotor import healthy_rotor
 from daqsvc.rotor.detectability.vector import stated_calibration, vector_detectability
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.vectors import HARMONICS
