@@ -228,10 +228,24 @@ def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
     return root
 
 
+def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The arguments, those of a verb that takes files with options between them too.
+
+    argparse takes the files of a verb in one piece and knows no better with verbs.
+    """
+    chosen, rest = root.parse_known_args(arguments)
+    files = getattr(chosen, "files", None)
+    if rest and (files is None or any(one.startswith("-") for one in rest)):
+        root.parse_args(arguments)  # says what is wrong
+    if rest and files is not None:
+        chosen.files = [*files, *rest]
+    return chosen
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
     try:
-        chosen = parser(commands()).parse_args(arguments)
+        chosen = _chosen(parser(commands()), arguments)
         command: Command = chosen.command
         code = command.run(chosen)
         sys.stdout.flush()

@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, cast
 
-from daqsvc.analysis.quality import count_bad
+from daqsvc.analysis.quality import complaints, count_bad
 from daqsvc.analysis.result import Instant, RotorAnalysis, Step
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def bank_analysis(recording: Recording, said: Statements) -> RotorAnalysis:
     source = str(recording.source)
     judged = [one for one in said.diagnoses if one.quality == "good"]
     poor = [one for one in said.diagnoses if one.quality != "good"]
-    for reason in dict.fromkeys(one.reason for one in poor):
-        quality = quality.with_problem(reason)
+    for complaint in complaints(one.reason for one in poor):
+        quality = quality.with_problem(complaint.describe())
     if not said.diagnoses:
         return RotorAnalysis.not_judged(
             source, "the recording is too short for the rotor bank: not one revolution", quality

@@ -318,11 +318,28 @@ def _innovations(subject: _Subject) -> Figure:
         linewidth=1.0,
         label=f"threshold {subject.analysis.threshold_nats:.1f} nats",
     )
+    for number, (first, last) in enumerate(_new_references(subject)):
+        label = "held against the changed machine" if number == 0 else None
+        lower.axvspan(first, last, color=_QUIET, alpha=0.2, linewidth=0, label=label)
     lower.set_yscale("log")
     lower.set_ylabel("evidence for a change in nats")
     _over_revolutions(lower, subject)
     _legend_below(lower)
     return figure
+
+
+def _new_references(subject: _Subject) -> list[tuple[int, int]]:
+    """From which to which revolution the test holds the machine against itself after a change."""
+    stretches: list[tuple[int, int]] = []
+    changed = False
+    for report in subject.trace.reports:
+        if report.state != "departed" or report.departed:
+            changed = False
+        elif report.evidence is not None:
+            begin = stretches.pop()[0] if changed else report.revolution - 1
+            stretches.append((begin, report.revolution))
+            changed = True
+    return stretches
 
 
 def _over_revolutions(axes: Axes, subject: _Subject) -> None:

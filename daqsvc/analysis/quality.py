@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from daqsvc.analysis.setup import RefusedError
 from daqsvc.diagnosis.probe_checks import clipped_at
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -32,6 +33,7 @@ _LEAST_CUT_OFF = 8
 _NO_MEAN = 1e-3
 """A mean position within this part of the 1X amplitude is none."""
 _MOST_UNUSABLE = 0.5
+_FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,6 +288,18 @@ class Complaint:
         if not again:
             return self.reason
         return f"{self.reason} (and {again} {'time' if again == 1 else 'times'} more)"
+
+
+def complaints(reasons: Iterable[str]) -> tuple[Complaint, ...]:
+    """Complaints by kind, as they came: those that differ in figures only are of one.
+
+    Args:
+        reasons: in order.
+    """
+    kinds: dict[str, Complaint] = {}
+    for reason in reasons:
+        kinds.setdefault(_FIGURES.sub("", reason), Complaint(reason)).times += 1
+    return tuple(kinds.values())
 
 
 def lacks_mean(samples: Floats) -> bool:

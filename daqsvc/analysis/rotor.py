@@ -7,7 +7,6 @@ the one that watches the machine live.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -50,7 +49,6 @@ _NO_MEAN = (
     "no mean position: AC-coupled probes? Static load and half of the evidence for stiffness loss cannot be "
     "seen"
 )
-_FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 _MOST_REFERENCE = 2000
 """Revolutions that the baseline grows to (`daqsvc.rotor.synchronous.departure`)."""
 _SEEN = 128
@@ -190,21 +188,19 @@ def _feed(
     progress: Callable[[int, int], None] | None,
 ) -> tuple[Complaint, ...]:
     """Hand the recording to the detector in windows; what it complains of, each kind once."""
-    complaints: dict[str, Complaint] = {}
+    reasons: list[str] = []
     length = max(1, round(_WINDOW_REVOLUTIONS * period_samples / detector.block)) * detector.block
     period_ns = NS_PER_S / rate_hz
     for begin in range(0, len(samples), length):
         part = samples[begin : begin + length].astype(np.float32)
         end = begin + len(part)
-        for said in detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns)):
-            if said.quality != "good":
-                # Complaints that differ in figures only are of one kind.
-                complaints.setdefault(_FIGURES.sub("", said.reason), Complaint(said.reason)).times += 1
+        said = detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns))
+        reasons += [one.reason for one in said if one.quality != "good"]
         if progress is not None:
             progress(end, len(samples))
         if detector.refused:
             raise RefusedError(detector.refused)
-    return tuple(complaints.values())
+    return checks.complaints(reasons)
 
 
 @dataclass(frozen=True, slots=True)

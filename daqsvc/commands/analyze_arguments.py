@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.analysis.acceleration import ACCELERATION_UNITS
 from daqsvc.commands.option_types import calibration_length, count, positive
-from daqsvc.commands.shared_arguments import TOLERANCE_PERCENT, add_channel_map, add_rotor
+from daqsvc.commands.shared_arguments import TOLERANCE_PERCENT, add_channel_map, add_rotor, unknown_channels
 from daqsvc.recording.channels import LENGTH_UNITS
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def misuse(arguments: argparse.Namespace, machine: str | None, recordings: Seque
     ]
     if known:
         return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
-    return _lacking(arguments, given)
+    return _lacking(arguments, given) or unknown_channels(arguments)
 
 
 def rotor_options(arguments: argparse.Namespace) -> dict[str, bool]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.option_types import calibration_length, positive
-from daqsvc.commands.shared_arguments import add_channel_map, add_rotor
+from daqsvc.commands.shared_arguments import add_channel_map, add_rotor, unknown_channels
 from daqsvc.recording.channels import LENGTH_UNITS
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _lacking(arguments: argparse.Namespace, recordings: int) -> str:
         )
     if (arguments.natural_frequency_hz is None) != (arguments.damping_ratio is None):
         return "--natural-frequency-hz and --damping-ratio go together; give both, or a run-up instead"
-    return ""
+    return unknown_channels(arguments)
 
 
 def _speeds(text: str) -> tuple[float, ...]:

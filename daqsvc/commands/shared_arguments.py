@@ -92,3 +92,15 @@ def add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: str
         help="sag of the shaft under its weight (default: g / omega^2; 0 if it stands upright)",
     )
     add("--ac-coupled", action="store_true", help="the probes have no mean position: do not look at it")
+
+
+def unknown_channels(arguments: argparse.Namespace) -> str:
+    """What is wrong with ``--map`` without a machine file; empty if nothing is."""
+    known = [*arguments.probes, *([arguments.keyphasor] if arguments.keyphasor is not None else [])]
+    unknown = [name for name in arguments.map if name not in known]
+    if not unknown:
+        return ""
+    return (
+        f"--map names {unknown[0]!r}, which --probes and --keyphasor do not; they name {', '.join(known)}: "
+        "write --map CHANNEL=VARIABLE for one of these"
+    )

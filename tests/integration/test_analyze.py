@@ -237,3 +237,28 @@ def test_finite_element_rotors_at_20_db(
         if group != {"normal"}:
             assert one["onset"]["revolution"] == pytest.approx(70, abs=1)
             assert one["departure"]["revolution"] <= 73
+
+
+def test_options_may_stand_between_recordings(
+    analyze: Callable[..., Any], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    files = [Orbit(seed=seed).save(tmp_path / f"{seed}.npz") for seed in (1, 2, 3)]
+    code, found, err = analyze(files[0], *OPTIONS, files[1], "--jobs", "1", files[2])
+    assert (code, err) == (0, "")
+    assert [one["recording"] for one in found] == [str(file) for file in files]
+    code, _, err = analyze(files[0], *OPTIONS, files[1], "--no-such-option")
+    assert code == 2
+    assert "unrecognized arguments" in err
+    assert "--no-such-option" in err
+    with pytest.raises(SystemExit):
+        main(["check", "one.toml", "two.toml"])
+    assert "unrecognized arguments: two.toml" in capsys.readouterr().err
+
+
+def test_a_map_of_no_channel_is_refused(analyze: Callable[..., Any], tmp_path: Path) -> None:
+    file = Orbit().save(tmp_path / "a.npz")
+    code, found, err = analyze(file, *OPTIONS, "--map", "z=x")
+    assert (code, found) == (2, [])
+    assert "--map names 'z', which --probes and --keyphasor do not; they name x, y" in err
+    code, (one,), _ = analyze(file, *OPTIONS, "--map", "x=y,y=x")
+    assert "turns against" in one["refused"]

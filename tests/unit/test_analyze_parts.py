@@ -8,7 +8,7 @@ import math
 import os
 import re
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -228,3 +228,38 @@ def test_each_sensor_of_a_level_detector_has_a_statement_of_its_own_and_the_wors
     assert worst(by_name("levels/shaft", diagnoses[:2], 100.0, {})) == ""
     (silent,) = by_name("levels/shaft", [], 100.0, {})
     assert silent.as_json()["worst"] is None
+
+
+def test_complaints_that_differ_in_figures_only_are_one_with_a_count() -> None:
+    reasons = [f"kph: no pulse for {n} revolutions at {3000 - n} rpm" for n in range(8, 43)]
+    first, other = quality.complaints(
+        [*reasons[:20], "x: gap of 4.5e-05 s", *reasons[20:], "x: gap of -0.1 s"]
+    )
+    assert first.describe() == "kph: no pulse for 8 revolutions at 2992 rpm (and 34 times more)"
+    assert other.describe() == "x: gap of 4.5e-05 s (and 1 time more)"
+
+
+def test_the_figure_shows_where_the_test_holds_a_changed_machine_against_itself() -> None:
+    from daqsvc.analysis.plots import _innovations, _new_references, _Subject
+
+    orbit = Orbit(300, change=0.8)
+    analysis = analyse(recorded(orbit), SETUP)
+    assert analysis.trace is not None
+    assert analysis.calibration is not None
+    subject = _Subject(
+        name="orbit",
+        probes=("x", "y"),
+        analysis=analysis,
+        trace=analysis.trace,
+        calibration=analysis.calibration,
+        xy=np.column_stack([orbit.x, orbit.y]),
+        rate_hz=RATE_HZ,
+        clearance_um=None,
+    )
+    ((first, last),) = _new_references(subject)
+    assert 81 + 8 < first < 81 + 60
+    assert last == 300
+    _, lower = _innovations(subject).axes
+    assert "held against the changed machine" in lower.get_legend_handles_labels()[1]
+    healthy = analyse(recorded(Orbit(120)), SETUP)
+    assert _new_references(replace(subject, analysis=healthy, trace=healthy.trace)) == []
