@@ -209,6 +209,11 @@ def analyse_orders(
             refused=str(error),
             orders=orders,
         )
+    if not baseline.speed_seen:
+        quality = quality.with_problem(
+            f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "
+            "turned at another speed, this comparison says nothing; check its speed"
+        )
     return OrderAnalysis(
         recording=name, baseline=baseline_name, setup=setup, quality=quality, orders=orders, change=change
     )

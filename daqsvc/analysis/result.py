@@ -275,6 +275,7 @@ def calibration_json(calibration: Calibration, reference_revolutions: int | None
         "snr_db": calibration.snr_db,
         "laval": calibration.laval,
         "reference_revolutions": grown.revolutions,
+        "smallest_change_um": grown.smallest_change_um,
         "verdict": grown.describe(),
     }
 

@@ -76,8 +76,10 @@ def test_a_calibration_stands_in_for_the_first_revolutions(
     assert [one["verdict"] for one in found] == ["normal", "unbalance"]
     # The baseline grows with the healthy recording; what it grows from is the file's in both.
     grown = [one["calibration"].pop("reference_revolutions") for one in found]
+    smallest = [one["calibration"].pop("smallest_change_um") for one in found]
     said = [one["calibration"].pop("verdict") for one in found]
     assert grown[0] > grown[1]
+    assert smallest[0] < smallest[1]
     assert said[0] != said[1]
     assert found[0]["calibration"] == found[1]["calibration"]
     assert found[1]["departure"]["revolution"] <= 2

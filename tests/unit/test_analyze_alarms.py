@@ -71,6 +71,8 @@ def test_a_second_fault_has_an_onset_of_its_own():
 def test_the_smallest_change_is_that_of_the_baseline_as_it_has_grown():
     grown, short = analysed(Orbit(600, seed=3)), analysed(Orbit(60))
     assert short.as_json()["calibration"]["reference_revolutions"] == 60
+    smallest = [one.as_json()["calibration"]["smallest_change_um"] for one in (short, grown)]
+    assert smallest[0] / smallest[1] == pytest.approx(10.0**0.5, rel=0.1)
     assert grown.as_json()["calibration"]["reference_revolutions"] == 600
     assert grown.as_json()["calibration"]["revolutions"] == 50
     assert "after 600 revolutions the smallest change" in grown.describe()

@@ -265,3 +265,18 @@ def test_probes_measure_no_acceleration(files: Path, capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit):
         main(["analyze", str(files / "again.csv"), "--probes", "X,Y", "--speed-rpm", "1500", "--unit", "g"])
     assert "proximity probes measure in m, mm, um, mil" in capsys.readouterr().err
+
+
+def test_a_healthy_run_without_orders_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    noise = 0.3 * np.random.default_rng(5).standard_normal((4000, 3))
+    for name, samples in (("quiet", noise), ("healthy", record(1)), ("today", record(2))):
+        np.savez(tmp_path / f"{name}.npz", **dict(zip("xyz", samples.T, strict=True)), fs=RATE_HZ)
+    problems = []
+    for baseline in ("quiet", "healthy"):
+        options = ["--channels", "x,y,z", "--speed-rpm", f"{RPM:g}", "--json"]
+        files = [str(tmp_path / "today.npz"), "--baseline", str(tmp_path / f"{baseline}.npz")]
+        assert main(["analyze", *files, *options]) == 0
+        problems.append(json.loads(capsys.readouterr().out)["data_quality"]["problems"])
+    assert len(problems[0]) == 1
+    assert "no order of 1500 rpm stands out of the healthy run" in problems[0][0]
+    assert problems[1] == []

@@ -33,6 +33,8 @@ LEAST_REVOLUTIONS = 20
 SPEED_TOLERANCE = 0.05
 """A baseline holds for speeds that differ by no more than this part: beyond, 1X itself is another."""
 
+_VISIBLE_NATS = 20.0
+"""Departure of about one false alarm in 10,000 revolutions."""
 _FLOOR = 0.002
 """Part of the 1X amplitude that no patience resolves: the sensor chain is not better than that."""
 _NOISE_FLOOR = 1e-3
@@ -144,6 +146,11 @@ class Calibration:
             amplitude_um=self.amplitude_um,
         )
 
+    @property
+    def smallest_change_um(self) -> float:
+        """The smallest change of a component that can be seen, at one false alarm in 10,000 revolutions."""
+        return math.sqrt(_VISIBLE_NATS * float(self.variance.mean()) / self.revolutions)
+
     def describe(self) -> str:
         """The verdict in words: what the model of this machine can and cannot separate."""
         said = []
@@ -164,10 +171,10 @@ class Calibration:
             said.append(
                 f"is no Laval rotor ({why}): generic mode, in which rub and unmodelled changes stay one group"
             )
-        smallest = math.sqrt(20.0 * float(self.variance.mean()) / self.revolutions)
+        smallest_um = self.smallest_change_um
         said.append(
             f"after {self.revolutions} revolutions the smallest change that can be seen is "
-            f"{smallest:.2g} um, {100.0 * smallest / max(self.amplitude_um, 1e-12):.1f} % of 1X"
+            f"{smallest_um:.2g} um, {100.0 * smallest_um / max(self.amplitude_um, 1e-12):.1f} % of 1X"
         )
         if self.rotor.natural_frequency_tolerance > 0.05 or self.fit_error is None:
             said.append(
