@@ -107,7 +107,7 @@ class IsolationRule:
         lowest = max(LOWEST_PER_BALL_MODE * model.modes_hz[2], LOWEST_HZ)
         highest = HIGHEST_PER_NYQUIST * rate_hz / 2.0
         self._kept = (frequency_hz > lowest) & (frequency_hz < highest)
-        self.lines_hz: Floats = frequency_hz[self._kept]
+        self.lines_hz: Floats = np.asarray(frequency_hz[self._kept], dtype=np.float64)
         self._to_displacement = 1.0 / np.diag(model.D)
         spectra = self._spectra(healthy)
         if len(spectra) < 4 * self._frame:
@@ -123,7 +123,7 @@ class IsolationRule:
         self, model: BearingModel, noise: Complexes, mismatch: float, rng: np.random.Generator
     ) -> None:
         """Quadratic forms of the log-likelihood of every race and size, over all lines at once."""
-        moments = _moments(model, np.asarray(self.lines_hz), mismatch, rng)
+        moments = _moments(model, self.lines_hz, mismatch, rng)
         s = 1j * self.lines_hz
         dip = np.abs(s / (s + CORNER_HZ)) ** 12 / (1.0 + (self.lines_hz / DIP_HZ) ** 2) ** 3
         smallest = _SMALLEST * float(np.median(np.trace(noise, axis1=1, axis2=2).real / dip))

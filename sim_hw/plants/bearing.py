@@ -25,8 +25,8 @@ OVERSAMPLING = 4
 ORDERS = {"outer": 3.5848, "inner": 5.4152, "ball": 4.7135, "cage": 0.3983}
 """Passing frequencies of a 6205 in shaft orders; the ball's is twice its spin: it meets both races."""
 BALL_DEPTH = 1.6
-"""Of a ball's dip over a race's. It meets either race at half the rate and is loaded for a third of the time; at
-this depth it shakes the machine as much as a fault of a race does."""
+"""Of a ball's dip over a race's. It meets either race at half the rate and is loaded for a third of the time;
+at this depth it shakes the machine as much as a fault of a race does."""
 RUN_IN_S = 0.1
 
 
