@@ -100,3 +100,16 @@ def test_a_whirl_as_large_as_1x_is_no_wrong_speed():
     orbit.y += 60.0 * np.sin(0.45 * angle)
     said = refused([orbit.x, orbit.y], SETUP)
     assert said is None or "turns at" not in said
+
+
+def test_a_calibrated_machine_is_not_judged_while_it_coasts_down():
+    steady = Orbit(120)
+    keyphasor = np.where(np.arange(len(steady.x)) % SAMPLES_PER_REV < 6, 5.0, 0.0)
+    samples = np.column_stack([steady.x, steady.y, keyphasor])
+    healthy = analyse(Recording(("x", "y", "k"), samples, RATE_HZ, Path("h"), nan_count=0), WITH_KEYPHASOR)
+    assert healthy.calibration is not None
+    xy, angle = record(noise_um=2.0)
+    down = [*(xy[::-1] * [1.0, -1.0]).T, pulses(angle[-1] - angle[::-1])]
+    said = refused(down, replace(WITH_KEYPHASOR, calibrations=(healthy.calibration,)), RUN_UP_RATE_HZ)
+    assert said is not None
+    assert re.match(r"the speed falls from \d+ to \d+ rpm: a run-up cannot be judged", said)
