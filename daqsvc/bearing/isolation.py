@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from daqsvc.bearing import hit
 from daqsvc.bearing.model import INNER, OUTER, BearingModel, BearingParameters
 from daqsvc.bearing.residual import CORNER_HZ
 
@@ -33,8 +34,6 @@ FRAME_S = 128 / 48_000
 LOWEST_PER_BALL_MODE, LOWEST_HZ = 0.2, 600.0
 """Lines below this share of the rolling elements' mode cannot tell the races apart."""
 HIGHEST_PER_NYQUIST = 2.0 / 3.0
-DIP_HZ = 2_500.0
-"""Bandwidth of the displacement as a rolling element passes a spall."""
 STANDS_OUT_NATS = 4.0
 """A frame counts as a hit if it is so much likelier with one than without."""
 DECIDES_NATS = 2.0
@@ -116,16 +115,14 @@ class IsolationRule:
                 f"{2.0 * (self._frame + 1) * self._frame / rate_hz:.1f} s or more are needed"
             )
         if len(self.lines_hz):
-            noise = np.einsum("tfi,tfj->fij", spectra, spectra.conj()) / len(spectra)
-            self._weigh(model, noise, mismatch, np.random.default_rng(seed))
+            self._weigh(model, hit.covariance(spectra), mismatch, np.random.default_rng(seed))
 
     def _weigh(
         self, model: BearingModel, noise: Complexes, mismatch: float, rng: np.random.Generator
     ) -> None:
         """Quadratic forms of the log-likelihood of every race and size, over all lines at once."""
         moments = _moments(model, self.lines_hz, mismatch, rng)
-        s = 1j * self.lines_hz
-        dip = np.abs(s / (s + CORNER_HZ)) ** 12 / (1.0 + (self.lines_hz / DIP_HZ) ** 2) ** 3
+        dip = hit.power(self.lines_hz, CORNER_HZ)
         smallest = _SMALLEST * float(np.median(np.trace(noise, axis1=1, axis2=2).real / dip))
         hits = (_SIZES * smallest)[:, None, None, None, None] * dip[:, None, None] * moments[None]
         precision = np.linalg.inv(noise + hits)
@@ -176,12 +173,7 @@ class IsolationRule:
 
     def _spectra(self, residual: Floats) -> Complexes:
         """Displacement spectra of the whole frames, complex128 ``[t, lines, 2]``."""
-        if len(residual) < self._frame:
-            return np.zeros((0, len(self.lines_hz), 2), dtype=np.complex128)
-        cut = np.lib.stride_tricks.sliding_window_view(residual, self._frame, axis=0)[:: self._frame // 2]
-        cut = cut[np.isfinite(cut).all(axis=(1, 2))]
-        spectra = np.fft.rfft(cut * np.hanning(self._frame), axis=2)[..., self._kept]
-        return np.asarray(spectra.swapaxes(1, 2) * self._to_displacement)
+        return hit.spectra(residual, self._frame)[:, self._kept] * self._to_displacement
 
 
 def _moments(

@@ -71,7 +71,7 @@ class TwoSensorMonitor:
     ) -> None:
         self._total = TwoSensorResidual(parameters, rate_hz)
         healthy = self._total.process(y, v)
-        self._detector = WhittleDetector(healthy, false_alarm_rate=false_alarm_rate)
+        self._detector = WhittleDetector(parameters, rate_hz, healthy, false_alarm_rate=false_alarm_rate)
         self._isolation = IsolationRule(parameters, rate_hz, healthy, mismatch=mismatch)
         ball_hz = BearingModel(parameters).modes_hz[2]
         corner_hz = min(max(UNITS_CORNER_PER_BALL_MODE * ball_hz, CORNER_HZ), 0.3 * rate_hz)

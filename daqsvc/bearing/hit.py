@@ -1,0 +1,51 @@
+"""What is known of a hit beforehand: its spectrum, and how frames of the residual are made and counted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.bearing.residual import ORDER
+
+if TYPE_CHECKING:
+    from daqsvc.bearing.model import Complexes, Floats
+
+DIP_HZ = 2_500.0
+"""Bandwidth of the displacement as a rolling element passes a spall."""
+INDEPENDENT = 1.0 / ((1.0 + 2.0 / 36.0) * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)))
+"""Of the lines of half-overlapping Hann frames: frames correlate by 1/6, neighbouring lines by 2/3 and 1/6."""
+
+
+def power(frequency_hz: Floats, corner_hz: float) -> Floats:
+    """Power spectrum of the dips of a hit in the residual, up to its size.
+
+    Args:
+        frequency_hz: float64 ``[n]``.
+        corner_hz: of the residual generator's high-pass.
+    """
+    s = 1j * frequency_hz
+    high_pass = np.abs(s / (s + corner_hz)) ** (2 * ORDER)
+    return np.asarray(high_pass / (1.0 + (frequency_hz / DIP_HZ) ** 2) ** 3, dtype=np.float64)
+
+
+def spectra(residual: Floats, frame: int) -> Complexes:
+    """Spectra of the whole half-overlapping Hann frames of a residual, those with NaN left out.
+
+    Args:
+        residual: float64 ``[n, 2]``.
+        frame: samples.
+
+    Returns:
+        complex128 ``[t, frame // 2 + 1, 2]``.
+    """
+    if len(residual) < frame:
+        return np.zeros((0, frame // 2 + 1, 2), dtype=np.complex128)
+    cut = np.lib.stride_tricks.sliding_window_view(residual, frame, axis=0)[:: frame // 2]
+    cut = cut[np.isfinite(cut).all(axis=(1, 2))]
+    return np.asarray(np.fft.rfft(cut * np.hanning(frame), axis=2).swapaxes(1, 2), dtype=np.complex128)
+
+
+def covariance(frames: Complexes) -> Complexes:
+    """Mean cross-spectrum of frames: complex128 ``[f, 2, 2]``."""
+    return np.asarray(np.einsum("tfi,tfj->fij", frames, frames.conj()) / len(frames), dtype=np.complex128)
