@@ -237,7 +237,7 @@ def calibrate(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
     _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)
-    _refuse_restless(restless, samples)
+    _refuse_restless(restless, samples, 0.0 if angle_assumed else amplitude * math.pi / samples)
     relative = restless / restless.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
     return Calibration(
@@ -347,11 +347,19 @@ def _refuse_unsteady(
     )
 
 
-def _refuse_restless(values: Floats, samples: float) -> None:
-    """Whether what does not repeat with the shaft comes or goes."""
+def _refuse_restless(values: Floats, samples: float, jitter_um: float) -> None:
+    """Whether what does not repeat with the shaft comes or goes.
+
+    Args:
+        values: float64 ``[R]``, unrest of every revolution, um^2.
+        samples: samples in a revolution.
+        jitter_um: what half a sample of doubt about the marks makes of the whirl.
+    """
     restless = most_restless_stretch(values, samples)
     usual = math.sqrt(float(np.median(values)) / 2.0)
     if restless.nats <= UNREST_NATS or abs(restless.by / max(usual, 1e-300) - 1.0) < _LEAST_UNREST:
+        return
+    if abs(restless.by**2 - usual**2) < jitter_um**2:
         return
     raise NotCalibratableError(
         f"not steady: noise and whirl that do not repeat with the shaft are {restless.by:.3g} um in "
