@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.residual import ORDER
+from daqsvc.bearing.kernels import ORDER
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import Complexes, Floats
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 DIP_HZ = 2_500.0
 """Bandwidth of the displacement as a rolling element passes a spall."""
 INDEPENDENT = 1.0 / ((1.0 + 2.0 / 36.0) * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)))
-"""Of the lines of half-overlapping Hann frames: frames correlate by 1/6, neighbouring lines by 2/3 and 1/6."""
+"""Of the lines of half-overlapping Hann frames: frames correlate by 1/6, lines by 2/3 and 1/6."""
 
 
 def power(frequency_hz: Floats, corner_hz: float) -> Floats:

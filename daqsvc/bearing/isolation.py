@@ -36,9 +36,12 @@ LOWEST_PER_BALL_MODE, LOWEST_HZ = 0.2, 600.0
 HIGHEST_PER_NYQUIST = 2.0 / 3.0
 STANDS_OUT_NATS = 4.0
 """A frame counts as a hit if it is so much likelier with one than without."""
+OF_THE_LARGE = 0.1
+"""And at least by this share of what the large hits are: the ringing after a hit, which a slightly wrong model
+leaves, looks like small hits of the other race."""
 DECIDES_NATS = 2.0
 """Taken off the ratio of every frame: noise alone makes frames lean to either side by as much."""
-OUTER_BELOW, INNER_ABOVE = 0.31, 0.9
+OUTER_BELOW, INNER_ABOVE = 0.32, 0.93
 """Shares of the evidence for the inner race that bound a ball's."""
 LEAST_NATS = 80.0
 """Evidence below which the verdict is left open."""
@@ -166,7 +169,11 @@ class IsolationRule:
         products = (*np.abs(spectra.transpose(2, 0, 1)) ** 2, cross.real, cross.imag)
         likelihood = -np.tensordot(np.concatenate(products, axis=1), self._forms, (1, 2)) - self._normaliser
         gain = likelihood.max(axis=1) - likelihood[:, 0]
-        gain = gain[gain.max(axis=1) > STANDS_OUT_NATS]
+        stands_out = gain.max(axis=1)
+        hits = stands_out > STANDS_OUT_NATS
+        if not hits.any():
+            return 0.0, 0.0, 0
+        gain = gain[stands_out > max(STANDS_OUT_NATS, OF_THE_LARGE * np.percentile(stands_out[hits], 95.0))]
         ratio = gain[:, INNER] - gain[:, OUTER]
         inner, outer = (np.maximum(side - DECIDES_NATS, 0.0).sum() for side in (ratio, -ratio))
         return float(inner), float(outer), len(ratio)
