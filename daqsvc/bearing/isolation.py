@@ -37,8 +37,8 @@ HIGHEST_PER_NYQUIST = 2.0 / 3.0
 STANDS_OUT_NATS = 4.0
 """A frame counts as a hit if it is so much likelier with one than without."""
 OF_THE_LARGE = 0.1
-"""And at least by this share of what the large hits are: the ringing after a hit, which a slightly wrong model
-leaves, looks like small hits of the other race."""
+"""And at least by this share of what the large hits are: the ringing after a hit, which a slightly wrong
+model leaves, looks like small hits of the other race."""
 DECIDES_NATS = 2.0
 """Taken off the ratio of every frame: noise alone makes frames lean to either side by as much."""
 OUTER_BELOW, INNER_ABOVE = 0.32, 0.93
