@@ -68,12 +68,17 @@ class TwoSensorResidual:
         self.corner_hz = corner_hz
         self._taps = chain_taps(parameters, corner_hz)
         self._stay, self._drive, self._feed = _discretise(self._taps, corner_hz, rate_hz)
-        self._direct = np.ascontiguousarray(self._taps[0])
-        self._rest = np.ascontiguousarray(self._drive[::-1].cumsum(axis=0)[::-1]) / (1.0 - self._stay)
         self.settling = math.ceil(_SETTLED / (2.0 * math.pi * corner_hz) * rate_hz)
         self._past = np.zeros((4, 3))
-        self._state = np.zeros((ORDER + 1, 2))
-        self._unsettled = np.full(1, -1, dtype=np.int64)
+        self._design = np.zeros(1, dtype=kernels.GENERATOR)
+        design = self._design[0]
+        design["stay"], design["settling"] = self._stay, self.settling
+        rest = self._drive[::-1].cumsum(axis=0)[::-1] / (1.0 - self._stay)
+        matrices = {"drive": self._drive, "rest": rest, "feed": self._feed, "direct": self._taps[0]}
+        for name, matrix in matrices.items():
+            design[name] = np.moveaxis(matrix, -1, 0).reshape(3, -1)
+        self._memory = np.zeros(1, dtype=kernels.MEMORY)
+        self.reset()
 
     def process(self, y: NDArray[np.floating], v: NDArray[np.floating] | None = None) -> Floats:
         """Take in a block.
@@ -93,29 +98,18 @@ class TwoSensorResidual:
                 f"bearing residual: accelerations {list(y.shape)} and force "
                 f"{None if v is None else list(v.shape)}; they must be [n, 2] (rotor, housing) and [n]"
             )
-        inputs = np.zeros((len(y), 3))
-        inputs[:, :2] = y
-        if v is not None:
-            inputs[:, 2] = v
+        inputs = np.empty((4 + len(y), 3))
+        inputs[:4] = self._past
+        inputs[4:, :2] = y
+        inputs[4:, 2] = 0.0 if v is None else v
         residual = np.empty((len(y), 2))
-        kernels.separate(
-            inputs,
-            self._stay,
-            self._drive,
-            self._feed,
-            self._direct,
-            self._rest,
-            self.settling,
-            self._past,
-            self._state,
-            self._unsettled,
-            residual,
-        )
+        kernels.separate(inputs, self._design, self._memory, residual)
+        self._past = inputs[len(y) :].copy()
         return residual
 
     def reset(self) -> None:
         """Forget everything: the next sample starts anew."""
-        self._unsettled[0] = -1
+        self._memory["unsettled"] = -1
 
     def response(self, frequency_hz: Floats) -> Complexes:
         """Response before discretisation, complex128 ``[n, 2, 3]``: residual, input (a_r, a_h, v)."""
@@ -132,7 +126,7 @@ class TwoSensorResidual:
             lead = ((1.0 - self._stay) * lead + drive) / (z - self._stay)[:, None, None]
         near, far = 2.0 * np.cos(np.angle(z)), 2.0 * np.cos(2.0 * np.angle(z))
         held = (WHOLE + NEAR * near + FAR * far)[:, None, None]
-        return np.asarray((held * (lead + self._feed) + self._direct) / z[:, None, None] ** DELAY)
+        return np.asarray((held * (lead + self._feed) + self._taps[0]) / z[:, None, None] ** DELAY)
 
 
 def inverse_in_integrations(parameters: BearingParameters) -> Floats:

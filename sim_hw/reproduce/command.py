@@ -32,8 +32,8 @@ class ReproduceCommand:
     help = "run the paper's experiments: figures, and what it states against what comes out"
     description = (
         "Run the paper's experiments from scratch, in less than two minutes. Writes its figures (fig4.png to "
-        "fig7.png) and a table of what the paper states against what was obtained (results.md, results.csv), "
-        "and prints the table."
+        "fig10.png) and a table of what the paper states against what was obtained (results.md, "
+        "results.csv), and prints the table."
     )
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sim_hw.reproduce.bearing.study import study as bearing_study
 from sim_hw.reproduce.rotor.study import study as rotor_study
 
 if TYPE_CHECKING:
@@ -28,4 +29,5 @@ class Study:
 
 STUDIES: tuple[Study, ...] = (
     Study("rub impact of a rotor that loses its damping (figs 4 to 7)", rotor_study),
+    Study("raceway faults of a rolling element bearing (figs 8 to 10)", bearing_study),
 )

@@ -24,7 +24,7 @@ from sim_hw.reproduce.rotor.detection import delays_rev, wrong_changes
 if TYPE_CHECKING:
     from pathlib import Path
 
-FIGURES = ["fig4.png", "fig5.png", "fig6.png", "fig7.png"]
+FIGURES = sorted(f"fig{number}.png" for number in range(4, 11))
 # Measured on another implementation of the same bank, 200 seeds: revolutions for F1, F1L2, F1L3 at 0 dB.
 KNOWN_DELAYS_REV = {"paper": (1.30, 0.94, 0.70), "cusum": (1.93, 2.06, 1.44)}
 
