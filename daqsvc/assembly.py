@@ -1,17 +1,12 @@
-"""From a machine file to the parts of a service: layouts, drivers, detectors, alarm rules."""
+"""From a machine file to the parts of a service: layouts, drivers, detectors."""
 
 from __future__ import annotations
 
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.events import Identity
-from daqsvc.alarms.rules import DiagnosisRule, LevelRule
-from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.assembly_rotor import healthy_rotor, rotor_bank, rotor_synchronous
 from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
-from daqsvc.publish.mqtt import MqttSettings
 from daqsvc.rotor.calibration.file import CalibrationFileError
 from daqsvc.settings.models import (
     Accelerometer,
@@ -44,11 +39,6 @@ _NS_PER_MS = 1_000_000
 
 class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there."""
-
-
-def identity(machine: MachineFile) -> Identity:
-    """Whose alarms these are."""
-    return Identity(machine.site, machine.box, machine.machine.name)
 
 
 def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
@@ -207,40 +197,3 @@ def _healthy_rotor(
         raise AssemblyError(
             f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(given.calibration)!r}: {error}"
         ) from error
-
-
-def alarm_rules(machine: MachineFile) -> list[LevelRule | DiagnosisRule]:
-    """One rule per alarm."""
-    rules: list[LevelRule | DiagnosisRule] = []
-    for alarm in machine.alarms:
-        if isinstance(alarm, LevelAlarm):
-            setpoint = Setpoint(
-                alarm.alert,
-                alarm.danger,
-                alarm.deadband,
-                round(alarm.on_delay_s * NS_PER_S),
-                round(alarm.off_delay_s * NS_PER_S),
-            )
-            rules.append(LevelRule(alarm.name, alarm.sensor, alarm.measure, setpoint, alarm.latching))
-        else:
-            rules.append(DiagnosisRule(alarm.name, alarm.detector, alarm.latching))
-    return rules
-
-
-def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
-    """How to reach the broker; None if the machine file has none."""
-    given = machine.mqtt
-    if given is None:
-        return None
-    return MqttSettings(
-        host=given.host,
-        port=given.port,
-        client_id=machine.mqtt_client_id,
-        tls=given.tls,
-        ca_file=None if given.ca_file is None else machine.resolve(given.ca_file),
-        username=given.username,
-        password_file=None if given.password_file is None else machine.resolve(given.password_file),
-        keepalive_s=given.keepalive_s,
-        topic_root=given.topic_root,
-        protocol=given.protocol,
-    )

@@ -13,14 +13,11 @@ import numpy as np
 from daqsvc import assembly
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
-from daqsvc.alarms.manager import AlarmManager
-from daqsvc.alarms.states import Level
+from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.assembly_alarms import alarm_rules, identity
+from daqsvc.assembly_mqtt import mqtt_settings
 from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.outbox.store import Outbox
-from daqsvc.publish.mqtt import MqttPublisher
-from daqsvc.publish.payloads import alarm_payload, diagnosis_payload, status_payload
-from daqsvc.publish.recall import recall
-from daqsvc.publish.topics import Topics
+from daqsvc.publish.payloads import diagnosis_payload, status_payload
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
@@ -28,9 +25,9 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
-    from daqsvc.alarms.events import AlarmEvent
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.publish.mqtt import MqttPublisher
     from daqsvc.settings.models import MachineFile
     from drivers.base import Driver
 
@@ -90,20 +87,17 @@ class Service:
         self.clock: Clock = clock or SystemClock()
         self.lag = LoopLag()
         self.ready = asyncio.Event()
-        self._identity = assembly.identity(machine)
+        self._identity = identity(machine)
         detectors = assembly.detectors(machine, store)
         self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
         self.drivers: list[Driver] = assembly.drivers(machine, self.clock, self._deliver)
         self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
-        self.alarms = AlarmManager(self._identity, assembly.alarm_rules(machine), self.clock)
-        self.outbox = Outbox(store / "outbox.sqlite", self.clock)
-        mqtt = assembly.mqtt_settings(machine)
-        self.publisher = (
-            None if mqtt is None else MqttPublisher(mqtt, machine.site, machine.box, self.outbox, self.clock)
-        )
-        root = "daqsvc" if mqtt is None else mqtt.topic_root
-        self._topics = Topics(root, machine.site, machine.box)
-        self._under_way: set[asyncio.Future[int]] = set()
+        self.desk = AlarmDesk(self._identity, alarm_rules(machine), store, self.clock, mqtt_settings(machine))
+
+    @property
+    def publisher(self) -> MqttPublisher | None:
+        """The way to the broker; None if the machine file has none."""
+        return self.desk.publisher
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
@@ -122,10 +116,10 @@ class Service:
                 await self._serve(stopped)
         finally:
             await _cancel([starting, stopped], DRAIN_S)
-            await self.outbox.close(CLOSE_S)
+            await self.desk.close(CLOSE_S)
 
     async def _start(self) -> None:
-        await self.outbox.open()
+        await self.desk.open()
         await self.pipeline.warm()
         await self._resume()
 
@@ -133,13 +127,11 @@ class Service:
         """Take over from the journal how the alarms stood when the service ended."""
         now_ns = self.clock.monotonic_ns()
         said = [s for detector in self.pipeline.detectors for s in detector.silent(0.0, now_ns)]
-        told = recall(await self.outbox.latest(), self._topics)
-        for event in self.alarms.resume(told, {s.detector: s.sensors for s in said}):
-            self._post(event)
+        await self.desk.resume({s.detector: s.sensors for s in said})
 
     async def _serve(self, stopped: asyncio.Task[Any]) -> None:
         helpers = [self._task(self.lag.watch(), "loop lag"), self._task(self._tell_status(), "status")]
-        publishing = None if self.publisher is None else self._task(self.publisher.run(), "mqtt")
+        publishing = None if self.publisher is None else self._task(self.desk.run(), "mqtt")
         pipeline = self._task(self.pipeline.run(), "pipeline")
         reading = [self._task(driver.run(), f"driver {driver.name}") for driver in self.drivers]
         everything = [*helpers, *reading, pipeline, stopped, *([publishing] if publishing else [])]
@@ -151,10 +143,9 @@ class Service:
             for ring in self.rings.values():
                 ring.close()
             await asyncio.wait([pipeline], timeout=DRAIN_S)
-            await self._settle()
-            if self.publisher is not None and publishing is not None:
-                self._publish_status()
-                await self.publisher.stop(GOODBYE_S)
+            await self.desk.settle(DRAIN_S)
+            self._publish_status()
+            await self.desk.stop(GOODBYE_S)
             await _cancel(everything, DRAIN_S)
 
     async def _until_stopped(self, stopped: asyncio.Task[Any], tasks: list[asyncio.Task[Any]]) -> None:
@@ -173,32 +164,10 @@ class Service:
         self.rings[block.stream].write(block)
 
     def _report(self, diagnosis: Diagnosis) -> None:
-        for event in self.alarms.take(diagnosis):
-            self._post(event)
+        self.desk.take(diagnosis)
         if self.publisher is not None:
             payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
             self.publisher.telemetry(f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload)
-
-    def _post(self, event: AlarmEvent) -> None:
-        loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
-        logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
-        committed = self.outbox.submit(
-            self._topics.alarm(event.identity.machine, event.alarm),
-            lambda sequence: alarm_payload(event, sequence).to_json(),
-            retain=True,
-        )
-        self._under_way.add(committed)
-        committed.add_done_callback(self._committed)
-
-    def _committed(self, committed: asyncio.Future[int]) -> None:
-        self._under_way.discard(committed)
-        if not committed.cancelled() and (error := committed.exception()) is not None:
-            logger.error("an alarm event never reached the disk: %s", error)
-
-    async def _settle(self) -> None:
-        """Wait until the events that are under way are on disk, for as long as the drain may take."""
-        if self._under_way:
-            await asyncio.wait(set(self._under_way), timeout=DRAIN_S)
 
     async def _tell_status(self) -> None:
         while True:
@@ -233,7 +202,7 @@ class Service:
             "buses": buses,
             "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
             "loop_lag_ms": self.lag.figures_ms(),
-            "outbox": asdict(self.outbox.counters),
+            "outbox": asdict(self.desk.outbox.counters),
             "mqtt": {} if self.publisher is None else _numbers(asdict(self.publisher.counters)),
         }
 

@@ -11,6 +11,7 @@ import pytest
 
 from daqsvc import assembly, cli
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.levels import LevelDetector
 from daqsvc.settings import load_machine_file, parse_machine_file
 
@@ -37,7 +38,7 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
     detectors = assembly.detectors(machine)
     assert any(isinstance(detector, LevelDetector) for detector in detectors)
-    assert [rule.alarm for rule in assembly.alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
+    assert [rule.alarm for rule in alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
     for detector in detectors:
         detector.warm()
 

@@ -10,6 +10,7 @@ from machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
 from run_ups import RATE_HZ, record
 
 from daqsvc import assembly
+from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.rotor.calibration.file import CalibrationRecord, save_calibration, save_record
 from daqsvc.rotor.calibration.run_up import fit_run_up
@@ -90,7 +91,7 @@ def test_ac_coupled_probes_are_known_by_their_sensors():
 def test_an_alarm_may_follow_it():
     given = machine()
     assert given.detectors == ("rotor-synchronous",)
-    assert next(rule.detector for rule in assembly.alarm_rules(given)) == "rotor-synchronous"
+    assert next(rule.detector for rule in alarm_rules(given)) == "rotor-synchronous"
 
 
 def test_both_rotor_detectors_watch_one_machine():

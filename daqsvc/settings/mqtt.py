@@ -1,0 +1,96 @@
+"""The broker that alarms and diagnoses go to."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
+from typing import Annotated, Literal
+from urllib.parse import SplitResult, urlsplit
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Section
+
+_DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
+
+
+def _split_url(url: str) -> SplitResult:
+    """The parts of a broker's address; the value is kept out of every message, it may hold a password."""
+    remedy = {"remedy": 'write "mqtts://broker.example:8883", or "mqtt://..." with insecure = true'}
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy) from None
+    if parts.username is not None or parts.password is not None:
+        raise PydanticCustomError(
+            "broker_url_secret",
+            "must not hold a user name or password",
+            {
+                "remedy": "take them out of the url, write username and password_file instead, "
+                "and change the password: it has been in a file that others can read"
+            },
+        )
+    if parts.scheme not in _DEFAULT_PORTS or not parts.hostname or port == 0:
+        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy)
+    if parts.path not in {"", "/"} or parts.query or parts.fragment:
+        raise PydanticCustomError(
+            "broker_url", "has something after host and port", {"remedy": "end the url after the port"}
+        )
+    return parts
+
+
+def _broker_url(url: str) -> str:
+    _split_url(url)
+    return url
+
+
+class Mqtt(Section):
+    """The broker that alarms and diagnoses go to.
+
+    A password never stands in the machine file, only the name of the file that holds it.
+    """
+
+    url: Annotated[
+        str,
+        AfterValidator(_broker_url),
+        Field(description="address of the broker", examples=["mqtts://broker.example:8883"]),
+    ]
+    insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
+    client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
+        default=None, description="how the broker knows this box; daqsvc-<site>-<box> if absent"
+    )
+    username: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="user at the broker"
+    )
+    password_file: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="file whose first line is the password"
+    )
+    ca_file: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="certificates (PEM) to trust in place of the system's"
+    )
+    keepalive_s: Annotated[int, Field(ge=1, le=65535)] = Field(
+        default=30, description="how soon the broker notices that the box is gone"
+    )
+    protocol: Literal["auto", "5", "3.1.1"] = Field(
+        default="auto", description="MQTT version; auto asks for 5 and takes 3.1.1 if that is refused"
+    )
+    topic_root: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
+        default="daqsvc", description="first part of every topic"
+    )
+
+    @property
+    def tls(self) -> bool:
+        """Whether the connection is encrypted and the broker's certificate verified."""
+        return urlsplit(self.url).scheme == "mqtts"
+
+    @property
+    def host(self) -> str:
+        """Host name or address of the broker."""
+        return urlsplit(self.url).hostname or ""
+
+    @property
+    def port(self) -> int:
+        """TCP port of the broker: as in the url, else 1883, with TLS 8883."""
+        parts = urlsplit(self.url)
+        return parts.port or _DEFAULT_PORTS[parts.scheme]
