@@ -6,6 +6,8 @@
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
+# Tests run side by side, one process a core; a file's tests stay together.
+WORKERS ?= auto
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
@@ -33,7 +35,7 @@ demo: $(READY)
 	@$(BIN)/daqsvc demo $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 check: $(READY)
 	@$(BIN)/ruff check .
