@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc import assembly
+from daqsvc import assembly, assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
@@ -90,7 +90,7 @@ class Service:
         self._identity = identity(machine)
         detectors = assembly.detectors(machine, store)
         self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
-        self.drivers: list[Driver] = assembly.drivers(machine, self.clock, self._deliver)
+        self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
         self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
         self.desk = AlarmDesk(self._identity, alarm_rules(machine), store, self.clock, mqtt_settings(machine))
 

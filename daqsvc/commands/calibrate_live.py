@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from daqsvc import assembly
+from daqsvc import assembly, assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.diagnosis.pipeline import Pipeline
@@ -87,7 +87,7 @@ class _Listener:
         capacity = max(round(_RING_S * stream.rate_hz), 4 * detector.block)
         self._ring = SampleRing(detector.stream, stream.layout.channel_names, capacity)
         self._reason = ""
-        self.drivers = assembly.drivers(machine, clock, self._deliver)
+        self.drivers = assembly_drivers.drivers(machine, clock, self._deliver)
         self.pipeline = Pipeline({detector.stream: self._ring}, [detector], self._report, clock)
 
     def _deliver(self, block: SampleBlock) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import aiomqtt
 import can
 
-from daqsvc import assembly
+from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
@@ -175,7 +175,7 @@ class Session:
 
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
         script = self.script
-        layout = assembly.frame_layout(service.machine, script.stream)
+        layout = assembly_drivers.frame_layout(service.machine, script.stream)
         node = self.node = CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults)
         pacer: Pacer
         if isinstance(clock, DrivenClock):

@@ -18,7 +18,7 @@ import pytest
 from machine_files import MACHINES
 from run_ups import ECCENTRICITY, OMEGA, RATE_HZ, record
 
-from daqsvc import assembly
+from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
 from daqsvc.commands.calibrate_live import calibrate_live
@@ -324,7 +324,7 @@ def machine_file(channel: str):
 async def test_the_live_bus_gives_the_same_machine() -> None:
     machine = machine_file("calibrate-live")
     channel = machine.buses["can0"].model_dump()["channel"]
-    layout = assembly.frame_layout(machine, "shaft")
+    layout = assembly_drivers.frame_layout(machine, "shaft")
     clock = SystemClock()
     told: list[tuple[int, int]] = []
     listening = asyncio.create_task(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daqsvc import assembly, cli
+from daqsvc import assembly, assembly_drivers, cli
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.levels import LevelDetector
@@ -22,7 +22,7 @@ FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"
 def test_frames_of_every_example_decode_to_the_sensors_units(file: Path) -> None:
     machine = load_machine_file(file)
     for name in machine.streams:
-        layout = assembly.frame_layout(machine, name)
+        layout = assembly_drivers.frame_layout(machine, name)
         middle = np.tile(layout.offset, (3, 1, 1)) + 5 * layout.scale
         index = layout.samples_per_frame * np.arange(3, dtype=np.int64)
         back = layout.decode(layout.encode(index, middle))
@@ -33,7 +33,7 @@ def test_frames_of_every_example_decode_to_the_sensors_units(file: Path) -> None
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
 def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     machine = load_machine_file(file)
-    made = assembly.drivers(machine, SystemClock(), lambda _: None)
+    made = assembly_drivers.drivers(machine, SystemClock(), lambda _: None)
     assert [driver.name for driver in made] == list(machine.buses)
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
     detectors = assembly.detectors(machine)
@@ -45,7 +45,7 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
 
 def test_a_probe_reads_micrometres_from_its_gap_voltage() -> None:
     machine = load_machine_file(next(file for file in FILES if file.stem == "laval-rig"))
-    layout = assembly.frame_layout(machine, "shaft")
+    layout = assembly_drivers.frame_layout(machine, "shaft")
     raw = dataclasses.replace(layout, scale=np.ones_like(layout.scale), offset=np.zeros_like(layout.offset))
     volts_per_count = machine.streams["shaft"].layout.channels[0].scale
     counts = np.full((1, layout.samples_per_frame, 3), -9.5 / volts_per_count)
@@ -60,7 +60,7 @@ def test_a_driver_that_is_not_installed_is_named() -> None:
     end = text.index("\n[", start + 1)
     machine = parse_machine_file(text[:start] + '[buses.can0]\ndriver = "profibus"\n' + text[end:], file)
     with pytest.raises(assembly.AssemblyError, match=r"'profibus': no such driver.*there are can"):
-        assembly.drivers(machine, SystemClock(), lambda _: None)
+        assembly_drivers.drivers(machine, SystemClock(), lambda _: None)
 
 
 def test_a_verb_that_cannot_be_loaded_is_left_out(
