@@ -8,7 +8,7 @@ entry point in the group ``daqsvc.drivers`` as a callable that takes a `BusPort`
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.acquisition.supervisor import Link
     from daqsvc.acquisition.timebase import TimeBaseState
-    from drivers.frames import FrameLayout
+
+LayoutT = TypeVar("LayoutT")
 
 StartPolicy = Literal["error", "retry", "ignore"]
 
@@ -28,18 +29,19 @@ class DeviceAbsentError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamSpec:
+class StreamSpec(Generic[LayoutT]):
     """One stream on a bus.
 
     Attributes:
         name: name of the stream in the machine file.
-        layout: where its counter and samples lie, in the sensors' physical units.
+        layout: where its counter and samples lie, in the sensors' physical units; of the kind that the
+            bus's driver knows, e.g. `drivers.frames.FrameLayout`.
         rate_hz: nominal sampling rate.
         reorder_window_ns: how long a gap may wait for a late frame.
     """
 
     name: str
-    layout: FrameLayout
+    layout: LayoutT
     rate_hz: float
     reorder_window_ns: int = 10_000_000
 
@@ -59,7 +61,7 @@ class BusPort:
 
     name: str
     options: Mapping[str, Any]
-    streams: Sequence[StreamSpec]
+    streams: Sequence[StreamSpec[Any]]
     clock: Clock
     deliver: Callable[[SampleBlock], None]
     start: StartPolicy = "retry"

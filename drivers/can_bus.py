@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
-    from drivers.frames import Decoded
+    from drivers.frames import Decoded, FrameLayout
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,9 @@ class CanDriver:
         self.link = Link(f"CAN bus {port.name!r} ({port.options['interface']} {port.options.get('channel')})")
         self.counters = BusCounters()
         self._port = port
-        self._specs = {(s.layout.frame_id, s.layout.extended): s for s in port.streams}
+        self._specs: dict[tuple[int, bool], StreamSpec[FrameLayout]] = {
+            (s.layout.frame_id, s.layout.extended): s for s in port.streams
+        }
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._backoff = Backoff()
         self._said: set[str] = set()
@@ -339,7 +341,7 @@ class _Reader(threading.Thread):
             self._stopping.set()
 
 
-def _assembler(spec: StreamSpec, port: BusPort) -> StreamAssembler:
+def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
     return StreamAssembler(
         spec.name,
         spec.rate_hz,
