@@ -1,0 +1,340 @@
+"""Commands from people on the box: a Unix socket in the store, and the client for it.
+
+A request is one line of JSON, and so is its answer; `Request` and `Answer` say what is in them. The socket
+is ``control.sock`` in the store's directory, mode 0600: only the service's own user and root may open it, and
+whoever may open it may command the alarms. Whatever a client sends or leaves unsent costs the service a
+counter and a few kilobytes at most.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import math
+import os
+import socket
+import stat
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.alarms.commands import CommandHandler
+
+log = logging.getLogger(__name__)
+
+SOCKET = "control.sock"
+MODE = 0o600
+LONGEST_PATH = 107
+"""Bytes that the address of a Unix socket has room for (sun_path less its end)."""
+LONGEST_LINE = 16 * 1024
+MOST_CLIENTS = 16
+PATIENCE_S = 10.0
+"""How long a client may take to finish a line, and to take its answer."""
+ANSWER_S = 20.0
+"""How long the client waits for the service: longer than that waits for its disk."""
+
+_REQUEST: Literal["daqsvc.control/1"] = "daqsvc.control/1"
+_ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
+
+
+class ControlError(Exception):
+    """The control socket cannot be used; the text names it and the remedy."""
+
+
+def _printable(text: str) -> str:
+    """Text that does to a terminal nothing but stand there."""
+    if not text.isprintable():
+        raise ValueError("must be printable, in one line")
+    return text
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number of seconds")
+    return value
+
+
+_Words = Annotated[str, AfterValidator(_printable)]
+
+
+class Request(BaseModel):
+    """What a person asks for."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
+
+    schema_: Literal["daqsvc.control/1"] = Field(alias="schema")
+    verb: Annotated[Verb, Field(strict=False)]
+    alarm: Annotated[_Words, Field(min_length=1, max_length=200)]
+    by: Annotated[_Words, Field(min_length=1, max_length=100)]
+    machine: Annotated[_Words, Field(max_length=200)] | None = None
+    occurrence: Annotated[_Words, Field(min_length=1, max_length=100)] | None = None
+    duration_s: Annotated[float, Field(gt=0), AfterValidator(_finite)] | None = None
+    reason: Annotated[_Words, Field(max_length=500)] = ""
+
+    def command(self) -> AlarmCommand:
+        """The command that it asks for."""
+        return AlarmCommand(
+            verb=self.verb,
+            alarm=self.alarm,
+            by=self.by,
+            occurrence=self.occurrence,
+            duration_s=self.duration_s,
+            reason=self.reason,
+        )
+
+
+class Answer(BaseModel):
+    """What came of it."""
+
+    model_config = ConfigDict(frozen=True, strict=True, populate_by_name=True)
+
+    schema_: Literal["daqsvc.control-answer/1"] = Field(_ANSWER, alias="schema")
+    accepted: bool
+    reason: str
+    events: Annotated[tuple[str, ...], Field(strict=False)] = ()
+
+
+@dataclass(slots=True)
+class ControlCounters:
+    """What came over the control socket; every figure only grows.
+
+    Attributes:
+        clients: connections taken.
+        clients_turned_away: connections beyond those that are served at a time.
+        clients_given_up: connections ended because the client was too slow, or went away in mid-line.
+        requests: requests that were handed on as commands.
+        malformed: lines that were no request: not JSON, of another schema, too long, for another machine.
+    """
+
+    clients: int = 0
+    clients_turned_away: int = 0
+    clients_given_up: int = 0
+    requests: int = 0
+    malformed: int = 0
+
+
+class ControlServer:
+    """Takes commands on the control socket of a store.
+
+    Args:
+        store: the store's directory; the caller holds the store, so that a socket found there is left over.
+        machine: name of the machine that the service watches.
+        obey: carries a command out.
+    """
+
+    def __init__(self, store: Path, machine: str, obey: CommandHandler) -> None:
+        self.path = store / SOCKET
+        self.counters = ControlCounters()
+        self._machine = machine
+        self._obey = obey
+        self._server: asyncio.Server | None = None
+        self._inode: int | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+
+    async def open(self) -> None:
+        """Begin to listen.
+
+        Raises:
+            ControlError: the path is too long for a socket, or taken by something else, or not writable.
+        """
+        listening, self._inode = await asyncio.to_thread(_bind, self.path)
+        self._server = await asyncio.start_unix_server(self._welcome, sock=listening, limit=LONGEST_LINE)
+
+    async def close(self) -> None:
+        """Stop listening, end every connection at once, and take the socket away."""
+        if self._server is None:
+            return
+        self._server.close()
+        for client in self._clients:
+            client.cancel()
+        if self._clients:
+            await asyncio.wait(set(self._clients))
+        await self._server.wait_closed()
+        self._server = None
+        await asyncio.to_thread(_remove, self.path, self._inode)
+
+    def _welcome(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._clients) >= MOST_CLIENTS:
+            self.counters.clients_turned_away += 1
+            writer.transport.abort()
+            return
+        self.counters.clients += 1
+        client = asyncio.create_task(self._serve(reader, writer), name="control client")
+        self._clients.add(client)
+        client.add_done_callback(self._clients.discard)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        source = _peer(writer)
+        try:
+            while (line := await _next_line(reader)) is not None:
+                answer = await self._answer(line, source)
+                writer.write(_json_line(answer))
+                async with asyncio.timeout(PATIENCE_S):
+                    await writer.drain()
+                if len(line) > LONGEST_LINE:
+                    return  # what follows is the rest of it, or of its kind
+        except (TimeoutError, ConnectionError, asyncio.IncompleteReadError):
+            self.counters.clients_given_up += 1
+        finally:
+            if writer.transport.get_write_buffer_size():
+                writer.transport.abort()
+            else:
+                writer.close()
+
+    async def _answer(self, line: bytes, source: str) -> Answer:
+        try:
+            request = parse_request(line, self._machine)
+        except ValueError as error:
+            self.counters.malformed += 1
+            return Answer(accepted=False, reason=f"{error}")
+        self.counters.requests += 1
+        outcome = await self._obey(request.command(), source)
+        return Answer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
+
+
+def parse_request(line: bytes, machine: str) -> Request:
+    """The request in a line to the service that watches ``machine``.
+
+    Raises:
+        ValueError: it is none; the text is one sentence that says why.
+    """
+    if len(line) > LONGEST_LINE:
+        raise ValueError(f"the request is longer than {LONGEST_LINE} bytes")
+    try:
+        request = Request.model_validate_json(line)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        where = ".".join(map(str, problem["loc"])) or "it"
+        raise ValueError(f"the request is not valid, {where}: {problem['msg']}") from None
+    if request.machine not in {None, machine}:
+        raise ValueError(f"this service watches {machine!r}, not {request.machine!r}")
+    return request
+
+
+def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOutcome:
+    """Have the service that runs on a store carry a command out; blocks.
+
+    Args:
+        store: the store's directory.
+        request: what to ask for.
+        timeout_s: how long to wait for the answer.
+
+    Raises:
+        ControlError: there is no service, it is somebody else's, or it does not answer.
+    """
+    path = store / SOCKET
+    _check_length(path)
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+            client.settimeout(timeout_s)
+            client.connect(os.fspath(path))
+            client.sendall(_json_line(request))
+            with client.makefile("rb") as answers:
+                answer = Answer.model_validate_json(answers.readline(LONGEST_LINE))
+    except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
+        raise ControlError(
+            f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
+        ) from None
+    except PermissionError:
+        raise ControlError(
+            f"the daqsvc of {store} takes commands from its own user and from root only: try again with sudo"
+        ) from None
+    except TimeoutError:
+        raise ControlError(
+            f"the daqsvc of {store} has not answered within {timeout_s:g} s; whether it has obeyed, "
+            "daqsvc alarms tells"
+        ) from None
+    except (OSError, ValidationError) as error:
+        raise ControlError(
+            f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); "
+            "whether it has obeyed, daqsvc alarms tells"
+        ) from None
+    return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
+
+
+async def _next_line(reader: asyncio.StreamReader) -> bytes | None:
+    """The next whole line, or more than `LONGEST_LINE` bytes of one that is too long; None at the end.
+
+    Raises:
+        TimeoutError: the client is too slow.
+        asyncio.IncompleteReadError: it went away in mid-line.
+    """
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            return await reader.readuntil(b"\n")
+    except asyncio.LimitOverrunError:
+        return b" " * (LONGEST_LINE + 1)
+    except asyncio.IncompleteReadError as end:
+        if end.partial:
+            raise
+        return None
+
+
+def _json_line(message: Request | Answer) -> bytes:
+    return json.dumps(message.model_dump(mode="json", by_alias=True)).encode("ascii") + b"\n"
+
+
+def _peer(writer: asyncio.StreamWriter) -> str:
+    """Who is at the other end, by the word of the kernel."""
+    connection = writer.get_extra_info("socket")
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    pid, uid, _ = struct.unpack("3i", credentials)
+    return f"local uid {uid} pid {pid}"
+
+
+def _bind(path: Path) -> tuple[socket.socket, int]:
+    """A socket that only this user can open, in place of one that was left over, and its inode; blocks."""
+    _check_length(path)
+    # The mode is set under another name, no longer than its own, and nobody can connect before `listen`.
+    draft = path.with_name(".control")
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    try:
+        _check_free(path)
+        draft.unlink(missing_ok=True)
+        made.bind(os.fspath(draft))
+        draft.chmod(MODE)
+        draft.rename(path)
+        return made, path.lstat().st_ino
+    except OSError as error:
+        made.close()
+        raise ControlError(
+            f"the control socket {path} cannot be made: {error.strerror or error}; "
+            "give the service a store that it may write in, on a file system that knows sockets"
+        ) from error
+    except BaseException:
+        made.close()
+        raise
+
+
+def _check_free(path: Path) -> None:
+    """Only a socket may be replaced: it is left over from a service that was killed."""
+    if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
+        raise ControlError(f"{path} is in the way of the control socket and is none; move it away")
+
+
+def _remove(path: Path, inode: int | None) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        if path.lstat().st_ino == inode:
+            path.unlink()
+
+
+def _check_length(path: Path) -> None:
+    length = len(os.fsencode(path))
+    if length > LONGEST_PATH:
+        raise ControlError(
+            f"the path of the control socket {path} has {length} bytes, at most {LONGEST_PATH} are possible: "
+            "choose a store with a shorter path"
+        )
+
+
+def _in_short(error: Exception) -> str:
+    return next(iter(f"{error}".splitlines()), type(error).__name__)

@@ -1,0 +1,268 @@
+"""The control socket: what it takes, what it refuses, and that no client can hurt the service."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import stat
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from brokers import eventually
+
+from daqsvc import control
+from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.control import ControlError, ControlServer, Request, ask
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+MACHINE = "laval-rig"
+RESET = Request(schema="daqsvc.control/1", verb=Verb.RESET, alarm="a", by="b")
+
+
+class Desk:
+    """Remembers what it was told, and obeys when it is let."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[AlarmCommand, str]] = []
+        self.may_answer = asyncio.Event()
+        self.may_answer.set()
+
+    async def __call__(self, command: AlarmCommand, source: str) -> CommandOutcome:
+        self.told.append((command, source))
+        await self.may_answer.wait()
+        if command.alarm == "nothing":
+            return CommandOutcome(accepted=False, reason="no alarm is named 'nothing'")
+        return CommandOutcome(accepted=True, events=("edge-1-17",))
+
+
+@contextlib.asynccontextmanager
+async def serving(store: Path, desk: Desk | None = None) -> AsyncIterator[ControlServer]:
+    server = ControlServer(store, MACHINE, desk or Desk())
+    await server.open()
+    try:
+        yield server
+    finally:
+        await server.close()
+
+
+def wish(**keys: Any) -> dict[str, Any]:
+    return {
+        "schema": "daqsvc.control/1",
+        "verb": "acknowledge",
+        "alarm": "rotor-fault",
+        "by": "ann",
+    } | keys
+
+
+async def say(server: ControlServer, line: bytes) -> dict[str, Any]:
+    reader, writer = await asyncio.open_unix_connection(server.path)
+    try:
+        writer.write(line)
+        async with asyncio.timeout(10):
+            answer: dict[str, Any] = json.loads(await reader.readline())
+        return answer
+    finally:
+        writer.close()
+
+
+async def test_a_request_becomes_a_command_with_the_kernels_word_for_who_asks(tmp_path: Path) -> None:
+    desk = Desk()
+    asked = wish(verb="shelve", duration_s=1800, reason="spare part on order", machine=MACHINE)
+    async with serving(tmp_path, desk) as server:
+        answer = await say(server, json.dumps(asked).encode() + b"\n")
+    assert answer == {
+        "schema": "daqsvc.control-answer/1",
+        "accepted": True,
+        "reason": "",
+        "events": ["edge-1-17"],
+    }
+    (told,) = desk.told
+    command = AlarmCommand(
+        verb=Verb.SHELVE, alarm="rotor-fault", by="ann", duration_s=1800.0, reason="spare part on order"
+    )
+    assert told == (command, f"local uid {os.getuid()} pid {os.getpid()}")
+
+
+async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -> None:
+    desk = Desk()
+    request = Request(
+        schema="daqsvc.control/1", verb=Verb.RESET, alarm="nothing", by="ann", occurrence="0d8c"
+    )
+    async with serving(tmp_path, desk):
+        outcome = await asyncio.to_thread(ask, tmp_path, request)
+    assert outcome == CommandOutcome(accepted=False, reason="no alarm is named 'nothing'")
+    assert desk.told[0][0] == request.command()
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (b"hello\n", "not valid"),
+        (b"\n", "not valid"),
+        (b"[]\n", "not valid"),
+        (b"\xff\xfe\n", "not valid"),
+        (b"null\n", "not valid"),
+        (wish(schema="daqsvc.control/2"), "schema"),
+        (wish(verb="delete"), "verb"),
+        (wish(verb=None), "verb"),
+        (wish(alarm=""), "alarm"),
+        (wish(alarm=7), "alarm"),
+        (wish(alarm="a" * 201), "alarm"),
+        (wish(by=""), "by"),
+        (wish(by="ann\x1b[2J"), "by"),
+        (wish(reason="one\ntwo"), "reason"),
+        (wish(reason="r" * 501), "reason"),
+        (wish(duration_s=-1), "duration_s"),
+        (wish(duration_s=float("nan")), "duration_s"),
+        (wish(duration_s=float("inf")), "duration_s"),
+        (wish(duration_s="1800"), "duration_s"),
+        (wish(colour="red"), "colour"),
+        (wish(machine="pump"), "this service watches 'laval-rig', not 'pump'"),
+        (b'{"a":' * 2000 + b"\n", "not valid"),
+        (b"x" * 20_000 + b"\n", "longer than 16384 bytes"),
+        (b"x" * 200_000, "longer than 16384 bytes"),
+    ],
+)
+async def test_what_is_no_request_is_refused_with_the_reason_counted_and_does_nothing(
+    line: bytes | dict[str, Any], why: str, tmp_path: Path
+) -> None:
+    desk = Desk()
+    async with serving(tmp_path, desk) as server:
+        sent = line if isinstance(line, bytes) else json.dumps(line).encode() + b"\n"
+        answer = await say(server, sent)
+        assert answer["accepted"] is False
+        assert why in answer["reason"]
+        assert len(answer["reason"].splitlines()) == 1
+        assert (server.counters.malformed, server.counters.requests) == (1, 0)
+        assert not desk.told
+        assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"], "the next one is served"
+
+
+async def test_a_client_may_ask_again_on_the_same_connection(tmp_path: Path) -> None:
+    async with serving(tmp_path) as server:
+        reader, writer = await asyncio.open_unix_connection(server.path)
+        for line in (b"hello\n", json.dumps(wish()).encode() + b"\n"):
+            writer.write(line)
+        answers = [json.loads(await reader.readline())["accepted"] for _ in range(2)]
+        writer.close()
+    assert answers == [False, True]
+
+
+async def test_half_a_request_is_not_obeyed_however_whole_it_looks(tmp_path: Path) -> None:
+    desk = Desk()
+    async with serving(tmp_path, desk) as server:
+        _, writer = await asyncio.open_unix_connection(server.path)
+        writer.write(json.dumps(wish()).encode())
+        writer.close()
+        await eventually(lambda: server.counters.clients_given_up == 1, "the client is given up")
+    assert not desk.told
+
+
+async def test_a_client_that_says_nothing_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "PATIENCE_S", 0.05)
+    async with serving(tmp_path) as server:
+        reader, writer = await asyncio.open_unix_connection(server.path)
+        writer.write(b'{"schema"')
+        assert await reader.read() == b""
+        assert server.counters.clients_given_up == 1
+        writer.close()
+
+
+async def test_a_client_that_never_reads_its_answers_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "PATIENCE_S", 0.2)
+    async with serving(tmp_path) as server:
+        with socket.socket(socket.AF_UNIX) as deaf:
+            deaf.setblocking(False)
+            deaf.connect(os.fspath(server.path))
+            with contextlib.suppress(OSError):
+                while not server.counters.clients_given_up:
+                    with contextlib.suppress(BlockingIOError):
+                        deaf.send(b"x\n" * 1000)
+                    await asyncio.sleep(0.001)
+        assert server.counters.clients_given_up == 1
+
+
+async def test_more_clients_than_are_served_at_a_time_are_turned_away(tmp_path: Path) -> None:
+    async with serving(tmp_path) as server:
+        many = range(control.MOST_CLIENTS)
+        writers = [(await asyncio.open_unix_connection(server.path))[1] for _ in many]
+        await eventually(lambda: server.counters.clients == control.MOST_CLIENTS, "all of them are in")
+        reader, writer = await asyncio.open_unix_connection(server.path)
+        assert await reader.read() == b""
+        assert server.counters.clients_turned_away == 1
+        for each in [*writers, writer]:
+            each.close()
+
+
+async def test_nothing_is_left_of_it_and_nobody_is_waited_for_when_it_closes(tmp_path: Path) -> None:
+    desk = Desk()
+    desk.may_answer.clear()
+    async with serving(tmp_path, desk) as server:
+        assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
+        idle_reader, idle_writer = await asyncio.open_unix_connection(server.path)
+        reader, writer = await asyncio.open_unix_connection(server.path)
+        writer.write(json.dumps(wish()).encode() + b"\n")
+        await eventually(lambda: desk.told, "the command has come")
+    assert not any(tmp_path.iterdir())  # noqa: ASYNC240
+    assert await reader.read() == await idle_reader.read() == b""
+    for each in (writer, idle_writer):
+        each.close()
+
+
+async def test_a_socket_that_a_killed_service_left_is_replaced(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(os.fspath(tmp_path / "control.sock"))
+    with pytest.raises(ControlError, match=r"no daqsvc runs on the store .* --store"):
+        await asyncio.to_thread(ask, tmp_path, RESET)
+    async with serving(tmp_path) as server:
+        assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
+
+
+async def test_what_is_in_the_way_and_no_socket_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "control.sock").write_text("precious")
+    with pytest.raises(ControlError, match=r"control\.sock is in the way"):
+        await ControlServer(tmp_path, MACHINE, Desk()).open()
+    assert (tmp_path / "control.sock").read_text() == "precious"
+
+
+async def test_a_path_that_no_socket_can_have_is_told_with_the_limit(tmp_path: Path) -> None:
+    store = tmp_path / ("long" * 30)
+    store.mkdir()
+    with pytest.raises(
+        ControlError, match="bytes, at most 107 are possible: choose a store with a shorter path"
+    ):
+        await ControlServer(store, MACHINE, Desk()).open()
+    with pytest.raises(ControlError, match="at most 107"):
+        ask(store, RESET)
+
+
+@pytest.mark.parametrize("answer", [b"", b"what?\n", b'{"accepted": true}'])
+async def test_a_service_that_dies_before_its_answer_is_told(answer: bytes, tmp_path: Path) -> None:
+    async def hang_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(answer)
+        writer.close()
+
+    server = await asyncio.start_unix_server(hang_up, tmp_path / "control.sock")
+    with pytest.raises(ControlError, match="whether it has obeyed, daqsvc alarms tells"):
+        await asyncio.to_thread(ask, tmp_path, RESET)
+    server.close()
+    await server.wait_closed()
+
+
+def test_a_service_that_does_not_answer_is_told(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as mute:
+        mute.bind(os.fspath(tmp_path / "control.sock"))
+        mute.listen()
+        with pytest.raises(ControlError, match=r"has not answered within 0\.05 s"):
+            ask(tmp_path, RESET, timeout_s=0.05)
