@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.alarms.events import AlarmEvent, EventKind
-from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError, Stimulus, shown, transition
+from daqsvc.alarms.chatter import ChatterWatch
+from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
+from daqsvc.alarms.states import (
+    AlarmState,
+    Hold,
+    Level,
+    RefusedError,
+    Stimulus,
+    shown,
+    strongest_first,
+    transition,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from daqsvc.alarms.chatter import ChatterLimit
     from daqsvc.alarms.events import Identity
     from daqsvc.alarms.rules import Finding
     from daqsvc.diagnosis.record import Diagnosis
@@ -23,15 +33,28 @@ class Instant(NamedTuple):
     wall_ns: int
 
 
+class Request(NamedTuple):
+    """Who asks for something, when, and why."""
+
+    by: str
+    at: Instant
+    reason: str = ""
+
+
 class AlarmStatus(NamedTuple):
     """How an alarm stands, for a view.
 
     Attributes:
         state: what consumers see.
-        level: how bad; of a latching alarm the worst since it was raised.
+        level: how bad; of a latching or chattering alarm the worst since it was raised.
         occurrence: id of the activation; None while the alarm is normal.
-        since: when the state or level last changed; None if they never have.
+        since: when something last changed; None if nothing ever has.
         message: the last event's sentence.
+        own_state: the state without its holds.
+        holds: what covers it, strongest first.
+        shelved_until_ns: end of shelving by the monotonic clock; None if not shelved.
+        chattering: whether its returns are held back.
+        first_out: whether it was the first of its group.
     """
 
     state: AlarmState
@@ -39,29 +62,44 @@ class AlarmStatus(NamedTuple):
     occurrence: str | None
     since: Instant | None
     message: str
+    own_state: AlarmState = AlarmState.NORMAL
+    holds: tuple[AlarmState, ...] = ()
+    shelved_until_ns: int | None = None
+    chattering: bool = False
+    first_out: bool = False
 
 
 class Alarm:
-    """The memory of one alarm. Every method that changes something returns the event that says so.
+    """The memory of one alarm. Every method that changes something returns the events that say so.
 
     Args:
         identity: whose alarm it is.
         name: name of the alarm.
         latching: whether it outlives its condition until it is reset.
         new_occurrence: gives an id that was never used before.
+        chatter: from when on it chatters; None never.
     """
 
     def __init__(
-        self, identity: Identity, name: str, *, latching: bool, new_occurrence: Callable[[], str]
+        self,
+        identity: Identity,
+        name: str,
+        *,
+        latching: bool,
+        new_occurrence: Callable[[], str],
+        chatter: ChatterLimit | None = None,
     ) -> None:
         self.name = name
+        self.doubts: tuple[Doubt, ...] = ()
         self._identity = identity
         self._latching = latching
         self._new_occurrence = new_occurrence
+        self._chatter = ChatterWatch(chatter)
         self._state = AlarmState.NORMAL
         self._level = Level.NORMAL
         self._found = ""
         self._holds: set[Hold] = set()
+        self._shelved_until_ns: int | None = None
         self._occurrence: str | None = None
         self._cause: Diagnosis | None = None
         self._since: Instant | None = None
@@ -69,8 +107,18 @@ class Alarm:
 
     @property
     def status(self) -> AlarmStatus:
-        """How the alarm stands."""
-        return AlarmStatus(self._shown, self._level, self._occurrence, self._since, self._message)
+        """How the alarm stands; of first-out it knows nothing."""
+        return AlarmStatus(
+            self._shown,
+            self._level,
+            self._occurrence,
+            self._since,
+            self._message,
+            self._state,
+            strongest_first(self._holds),
+            self._shelved_until_ns,
+            self._chatter.chattering,
+        )
 
     @property
     def _shown(self) -> AlarmState:
@@ -80,40 +128,69 @@ class Alarm:
         """Whether ``hold`` covers the state."""
         return hold in self._holds
 
-    def resume(self, told: AlarmEvent, found: str, since: Instant) -> None:
+    def resume(self, told: AlarmEvent, found: str, since: Instant, now: Instant) -> None:
         """Stand as the last event before a restart said.
 
         Args:
             told: that event.
             found: `Finding.identity` of what stood; empty if nobody knows.
             since: when it was, by the clocks as they are now.
+            now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
+                left of it at ``told`` is never exceeded.
         """
         self._state, self._level = told.own_state, told.to_level
-        self._holds = {Hold.SUPPRESSED} if told.to_state is AlarmState.SUPPRESSED else set()
+        self._holds = {Hold(state) for state in told.holds}
+        if told.shelved_until_wall_ns is not None:
+            left_ns = told.shelved_until_wall_ns - max(told.wall_ns, now.wall_ns)
+            self._shelved_until_ns = now.t_ns + max(left_ns, 0)
         self._occurrence = None if self._state is AlarmState.NORMAL else told.occurrence
-        self._found, self._cause = found, told.cause
+        self._found, self._cause, self.doubts = found, told.cause, told.doubts
+        self._chatter.resume(chattering=told.chattering)
         self._since, self._message = since, told.message
 
     def withdraw(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
         """Return to normal, from whatever state, because nobody will judge the alarm any more."""
         before = self._shown
-        self._holds = set()
+        self._holds, self._shelved_until_ns, self.doubts = set(), None, ()
+        self._chatter.resume(chattering=False)
         message = f"{self.name} returned to normal: {reason}"
-        returned = self._change(EventKind.RETURNED, AlarmState.NORMAL, Level.NORMAL, cause, at, message)
-        return replace(returned, from_state=before)
+        return self._change(
+            EventKind.RETURNED, AlarmState.NORMAL, Level.NORMAL, cause, Request("", at), message, before
+        )
 
-    def apply(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
-        """Take in what the rule finds; None if that is nothing new."""
-        if finding.level is Level.NORMAL:
-            if not self._state.is_active:
-                return None
-            state = transition(self._state, Stimulus.CLEAR, latching=self._latching)
-            if state.is_latched:
-                message = f"{self.name} latched at {self._level.label}: {finding.sentence}"
-                return self._change(EventKind.LATCHED, state, self._level, cause, at, message)
-            message = f"{self.name} returned to normal: {finding.sentence}"
-            return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, at, message)
+    def apply(self, finding: Finding, cause: Diagnosis, at: Instant) -> list[AlarmEvent]:
+        """Take in what the rule finds; no event if that is nothing new."""
+        events: list[AlarmEvent] = []
+        if self._chatter.chattering:
+            if self._chatter.quietens(finding.level, at.t_ns):
+                message = f"{self.name} is quiet again: {finding.sentence}"
+                events.append(self._event(EventKind.QUIET, cause, Request("", at), message))
+            elif finding.level < self._level:
+                return []
+        event = self._found_normal(finding, cause, at) or self._found_bad(finding, cause, at)
+        if event is None:
+            return events
+        events.append(event)
+        if event.kind in ANNUNCIATIONS and self._chatter.raised(at.t_ns):
+            message = f"{self.name} chatters: its returns are held back until it is quiet"
+            events.append(self._event(EventKind.CHATTERING, cause, Request("", at), message))
+        return events
 
+    def hold(self) -> None:
+        """Data are missing: everything stays, and no time counts."""
+        self._chatter.hold()
+
+    def _found_normal(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
+        if finding.level is not Level.NORMAL or not self._state.is_active:
+            return None
+        state = transition(self._state, Stimulus.CLEAR, latching=self._latching)
+        if state.is_latched:
+            message = f"{self.name} latched at {self._level.label}: {finding.sentence}"
+            return self._change(EventKind.LATCHED, state, self._level, cause, Request("", at), message)
+        message = f"{self.name} returned to normal: {finding.sentence}"
+        return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, Request("", at), message)
+
+    def _found_bad(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
         kind, level = self._worsening(finding)
         if kind is None:
             return None
@@ -123,10 +200,12 @@ class Alarm:
         stimulus = Stimulus.ESCALATE if kind is EventKind.ESCALATED else Stimulus.RAISE
         state = transition(self._state, stimulus, latching=self._latching)
         message = f"{self.name} {level.label}: {finding.sentence}"
-        return self._change(kind, state, level, cause, at, message)
+        return self._change(kind, state, level, cause, Request("", at), message)
 
     def _worsening(self, finding: Finding) -> tuple[EventKind | None, Level]:
         """What a finding that is not normal means here, and the level that it leads to."""
+        if finding.level is Level.NORMAL:
+            return None, self._level
         level = max(self._level, finding.level) if self._latching else finding.level
         if self._state.is_latched:
             return EventKind.RECURRED, level
@@ -140,48 +219,118 @@ class Alarm:
 
     def suppress(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
         """Cover the state because a sensor is not OK."""
-        return self._cover(EventKind.SUPPRESSED, {Hold.SUPPRESSED}, reason, cause, at)
+        before = self._cover(Hold.SUPPRESSED)
+        self.hold()
+        message = f"{self.name} suppressed: {reason}"
+        return self._event(EventKind.SUPPRESSED, cause, Request("", at), message, before)
 
     def unsuppress(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
         """Show the state again that was covered."""
-        return self._cover(EventKind.UNSUPPRESSED, set(), reason, cause, at)
+        before = self._uncover(Hold.SUPPRESSED)
+        message = f"{self.name} unsuppressed: {reason}"
+        return self._event(EventKind.UNSUPPRESSED, cause, Request("", at), message, before)
 
-    def _cover(
-        self, kind: EventKind, suppression: set[Hold], reason: str, cause: Diagnosis, at: Instant
-    ) -> AlarmEvent:
-        before = self._shown
-        self._holds = (self._holds - {Hold.SUPPRESSED}) | suppression
-        message = f"{self.name} {kind.value}: {reason}"
-        return self._event(kind, before, self._level, self._occurrence, cause, at, message)
+    def shelve(self, until_ns: int, request: Request, nothing: Diagnosis) -> AlarmEvent:
+        """Cover the state until ``until_ns`` by the monotonic clock, or change that time.
 
-    def acknowledge(self, at: Instant, by: str) -> AlarmEvent:
+        Args:
+            until_ns: when it uncovers itself.
+            request: who asks.
+            nothing: stands in for the cause of an alarm that has never been judged.
+        """
+        minutes = (until_ns - request.at.t_ns) / 60e9
+        before = self._cover(Hold.SHELVED)
+        self._shelved_until_ns = until_ns
+        message = f"{self.name} shelved for {minutes:.4g} min{_signed(request)}"
+        return self._event(EventKind.SHELVED, self._cause or nothing, request, message, before)
+
+    def unshelve(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+        """Show the state again before the shelving is over.
+
+        Raises:
+            RefusedError: it is not shelved.
+        """
+        self._expect(Hold.SHELVED, "unshelve")
+        before = self._uncover(Hold.SHELVED)
+        message = f"{self.name} unshelved{_signed(request)}"
+        return self._event(EventKind.UNSHELVED, self._cause or nothing, request, message, before)
+
+    def expire(self, at: Instant, nothing: Diagnosis) -> AlarmEvent | None:
+        """Show the state again if the shelving is over."""
+        if self._shelved_until_ns is None or at.t_ns < self._shelved_until_ns:
+            return None
+        before = self._uncover(Hold.SHELVED)
+        message = f"{self.name} unshelved: its time is over"
+        return self._event(EventKind.UNSHELVED, self._cause or nothing, Request("", at), message, before)
+
+    def bypass(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+        """Cover the state until somebody puts the alarm back into service.
+
+        Raises:
+            RefusedError: it is out of service already.
+        """
+        if self.is_held(Hold.OUT_OF_SERVICE):
+            raise RefusedError(f"cannot bypass {self.name}: it is out of service already")
+        before = self._cover(Hold.OUT_OF_SERVICE)
+        message = f"{self.name} taken out of service{_signed(request)}"
+        return self._event(EventKind.BYPASSED, self._cause or nothing, request, message, before)
+
+    def unbypass(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+        """Put the alarm back into service.
+
+        Raises:
+            RefusedError: it is in service.
+        """
+        self._expect(Hold.OUT_OF_SERVICE, "unbypass")
+        before = self._uncover(Hold.OUT_OF_SERVICE)
+        message = f"{self.name} put back into service{_signed(request)}"
+        return self._event(EventKind.UNBYPASSED, self._cause or nothing, request, message, before)
+
+    def acknowledge(self, request: Request) -> AlarmEvent:
         """A person has seen it.
 
         Raises:
             RefusedError: there is nothing to acknowledge, or the alarm is held.
         """
-        return self._obey(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, at, by)
+        return self._obey(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, request)
 
-    def reset(self, at: Instant, by: str) -> AlarmEvent:
+    def reset(self, request: Request) -> AlarmEvent:
         """A person lets go of a latched alarm.
 
         Raises:
             RefusedError: its condition stands, there is nothing to reset, or the alarm is held.
         """
-        return self._obey(Stimulus.RESET, EventKind.RESET, at, by)
+        return self._obey(Stimulus.RESET, EventKind.RESET, request)
 
-    def _obey(self, stimulus: Stimulus, kind: EventKind, at: Instant, by: str) -> AlarmEvent:
+    def _obey(self, stimulus: Stimulus, kind: EventKind, request: Request) -> AlarmEvent:
         cause = self._cause
         if self._holds or cause is None:
-            reason = f"it is {self._shown.value}" if self._holds else "it has never been raised"
+            reason = f"it is {self._shown.in_words}" if self._holds else "it has never been raised"
             raise RefusedError(f"cannot {stimulus.value} {self.name}: {reason}")
         try:
             state = transition(self._state, stimulus, latching=self._latching)
         except RefusedError as refusal:
             raise RefusedError(f"cannot {stimulus.value} {self.name}: {refusal}") from None
         level = Level.NORMAL if kind is EventKind.RESET else self._level
-        message = f"{self.name} {kind.value}" + (f" by {by}" if by else "")
-        return self._change(kind, state, level, cause, at, message, by)
+        message = f"{self.name} {kind.value}{_signed(request)}"
+        return self._change(kind, state, level, cause, request, message)
+
+    def _expect(self, hold: Hold, verb: str) -> None:
+        if not self.is_held(hold):
+            raise RefusedError(f"cannot {verb} {self.name}: it is not {hold.value.in_words}")
+
+    def _cover(self, hold: Hold) -> AlarmState:
+        """Lay ``hold`` over the state; what was seen before."""
+        before = self._shown
+        self._holds.add(hold)
+        return before
+
+    def _uncover(self, hold: Hold) -> AlarmState:
+        before = self._shown
+        self._holds.discard(hold)
+        if hold is Hold.SHELVED:
+            self._shelved_until_ns = None
+        return before
 
     def _change(
         self,
@@ -189,40 +338,56 @@ class Alarm:
         state: AlarmState,
         level: Level,
         cause: Diagnosis,
-        at: Instant,
+        request: Request,
         message: str,
-        by: str = "",
+        before: AlarmState | None = None,
     ) -> AlarmEvent:
-        before, level_before, occurrence = self._shown, self._level, self._occurrence
+        """Move to ``state`` and ``level``, and tell it."""
+        before, level_before, occurrence = before or self._shown, self._level, self._occurrence
         self._state, self._level, self._cause = state, level, cause
         if state is AlarmState.NORMAL:
-            self._occurrence = None
-        return self._event(kind, before, level_before, occurrence, cause, at, message, by)
+            self._occurrence, self._found = None, ""
+        return self._event(kind, cause, request, message, before, level_before, occurrence)
 
     def _event(
         self,
         kind: EventKind,
-        before: AlarmState,
-        level_before: Level,
-        occurrence: str | None,
         cause: Diagnosis,
-        at: Instant,
+        request: Request,
         message: str,
-        by: str = "",
+        before: AlarmState | None = None,
+        level_before: Level | None = None,
+        occurrence: str | None = None,
     ) -> AlarmEvent:
+        """The event of a change that has been made; what is not said before was as it is now."""
+        at = request.at
         self._since, self._message = at, message
+        until_ns = self._shelved_until_ns
         return AlarmEvent(
             identity=self._identity,
             alarm=self.name,
-            occurrence=occurrence,
+            occurrence=occurrence or self._occurrence,
             kind=kind,
-            from_state=before,
+            from_state=before or self._shown,
             to_state=self._shown,
-            from_level=level_before,
+            from_level=self._level if level_before is None else level_before,
             to_level=self._level,
             t_ns=at.t_ns,
             wall_ns=at.wall_ns,
             cause=cause,
             message=message,
-            by=by,
+            by=request.by,
+            reason=request.reason,
+            holds=strongest_first(self._holds),
+            covered=self._state if self._holds else None,
+            shelved_until_wall_ns=None if until_ns is None else at.wall_ns + until_ns - at.t_ns,
+            chattering=self._chatter.chattering,
+            found=self._found,
+            doubts=self.doubts,
         )
+
+
+def _signed(request: Request) -> str:
+    """Who asked and why, as the end of a sentence."""
+    by = f" by {request.by}" if request.by else ""
+    return by + (f": {request.reason}" if request.reason else "")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from daqsvc.alarms.states import AlarmState, Level
-    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.diagnosis.record import DataQuality, Diagnosis
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,40 @@ class EventKind(StrEnum):
     """A sensor that the alarm rests on is not OK: the alarm cannot speak."""
     UNSUPPRESSED = "unsuppressed"
     """Its sensors are good again: the alarm goes on from where it was."""
+    SHELVED = "shelved"
+    """A person has covered it for a stated time, or changed that time."""
+    UNSHELVED = "unshelved"
+    """That time is over, or a person has uncovered it."""
+    BYPASSED = "bypassed"
+    """A person has taken it out of service."""
+    UNBYPASSED = "unbypassed"
+    """A person has put it back into service."""
+    CHATTERING = "chattering"
+    """It comes and goes so often that its returns are held back until it is quiet."""
+    QUIET = "quiet"
+    """It no longer chatters."""
+
+
+ANNUNCIATIONS = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.RECURRED})
+"""Events that call for a person: what chatter and floods are counted by."""
+
+
+class Doubt(NamedTuple):
+    """What one detector has against a sensor, until it says good.
+
+    Attributes:
+        detector: name of the detector.
+        quality: what it said last, ``"missing"`` or ``"not_ok"``.
+        not_ok: whether it has said "not OK"; missing samples since then do not take that back.
+        reason: why, in words for a person.
+        sensors: the sensors that its statement rests on.
+    """
+
+    detector: str
+    quality: DataQuality
+    not_ok: bool
+    reason: str
+    sensors: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +97,17 @@ class AlarmEvent:
         wall_ns: wall-clock label of that instant, ns since the Unix epoch, UTC.
         cause: the diagnosis behind the event; for a person's action the last one that mattered.
         message: one sentence for a person.
-        by: who acknowledged or reset; empty if the data did it.
+        by: the person who asked for it; empty if the data or time did it.
+        reason: why, in that person's words.
+        holds: what covers the alarm after the event, strongest first.
+        covered: the alarm's own state under these; None if nothing covers it.
+        shelved_until_wall_ns: wall-clock label of the end of shelving, as it looks now; None if not shelved.
+        first_out: whether this alarm was the first of its group to stand since the group was normal.
+        chattering: whether its returns are held back because it comes and goes too often.
+        found: what is found, where a level can have several causes (`Finding.identity`).
+        doubts: of a quality alarm, what is said against the sensor.
+
+    The last event of an alarm holds all that a restart needs to know about it.
     """
 
     identity: Identity
@@ -79,11 +123,16 @@ class AlarmEvent:
     cause: Diagnosis
     message: str
     by: str = ""
+    reason: str = ""
+    holds: tuple[AlarmState, ...] = ()
+    covered: AlarmState | None = None
+    shelved_until_wall_ns: int | None = None
+    first_out: bool = False
+    chattering: bool = False
+    found: str = ""
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def own_state(self) -> AlarmState:
-        """The alarm's own state after the event: under a suppression, the one that it covers.
-
-        While an alarm is suppressed nothing moves it, so the event before a suppression tells the rest.
-        """
-        return self.from_state if self.kind is EventKind.SUPPRESSED else self.to_state
+        """The alarm's own state after the event, also under a hold."""
+        return self.to_state if self.covered is None else self.covered

@@ -1,32 +1,50 @@
-"""The alarms of one machine: takes diagnoses, gives the events that follow from them."""
+"""The alarms of one machine: takes diagnoses and commands, gives the events that follow from them."""
 
 from __future__ import annotations
 
+import math
 import uuid
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daqsvc.alarms.alarm import Alarm, Instant
-from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
-from daqsvc.alarms.rules import DiagnosisRule, Finding, LevelRule, Watch
-from daqsvc.alarms.states import AlarmState, Hold, Level
+from daqsvc.alarms.alarm import Alarm, Instant, Request
+from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.conditions import (
+    ALARM_FLOOD,
+    RESERVED,
+    TRIP_MULTIPLY,
+    is_condition,
+    no_statement,
+    statement,
+)
+from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
+from daqsvc.alarms.first_out import FirstOut
+from daqsvc.alarms.flood import FloodWatch
+from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
+from daqsvc.alarms.quality import PREFIXES, Doubts, quality_alarm
+from daqsvc.alarms.rules import Circumstances, DiagnosisRule, Finding, LevelRule
+from daqsvc.alarms.start_up import StartUpSignal
+from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.alarm import AlarmStatus
+    from daqsvc.alarms.commands import AlarmCommand
+    from daqsvc.alarms.rules import Rule, Watch
     from daqsvc.diagnosis.record import Diagnosis
 
-__all__ = ["AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
+__all__ = ["AlarmHandling", "AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
 
 
 class _Ruled:
     """An alarm with its rule, the rule's memory, and the sensors that it rests on."""
 
-    def __init__(self, alarm: Alarm, rule: LevelRule | DiagnosisRule) -> None:
+    def __init__(self, alarm: Alarm, rule: Rule) -> None:
         self.alarm = alarm
-        self.detector = rule.detector
+        self.rule = rule
         self.sensors = frozenset(rule.sensors)
         self.watch: Watch = rule.watch()
 
@@ -41,45 +59,72 @@ class AlarmManager:
 
     - Not OK suppresses every alarm that rests on the sensor, until a good statement comes.
     - Missing holds every state. It never clears anything.
+    - Shelved and out of service cover an alarm, which goes on behind the cover and is told of.
 
     Not thread-safe: one task takes the diagnoses of a machine in their order.
 
     Args:
         identity: whose alarms these are.
         rules: one per alarm.
-        clock: for the wall-clock label of events and the time of people's actions.
+        clock: for the wall-clock label of events, the time of people's actions and the end of shelving.
         new_occurrence: gives an id that was never used before; a random UUID by default.
+        handling: what holds for all alarms.
 
     Raises:
-        ValueError: two rules of the same name, or a name that belongs to the quality alarms.
+        ValueError: two rules of the same name, or a name that belongs to quality alarms or the service.
     """
 
     def __init__(
         self,
         identity: Identity,
-        rules: Sequence[LevelRule | DiagnosisRule],
+        rules: Sequence[Rule],
         clock: Clock,
         new_occurrence: Callable[[], str] = lambda: str(uuid.uuid4()),
+        handling: AlarmHandling | None = None,
     ) -> None:
+        self.counters = AlarmCounters()
         self._identity = identity
         self._clock = clock
         self._new_occurrence = new_occurrence
+        self._handling = handling or AlarmHandling()
         self._ruled: list[_Ruled] = []
         self._alarms: dict[str, Alarm] = {}
-        self._not_ok: dict[str, tuple[frozenset[str], str]] = {}
-        # By quality alarm and detector: what is said against it. It returns when nobody doubts any more.
-        self._doubts: dict[str, dict[str, Diagnosis]] = {}
+        self._conditions: set[str] = set()
+        self._doubts = Doubts()
+        self._start_up = StartUpSignal(self._handling.start_up)
+        self._flood = FloodWatch(self._handling.flood)
+        self._first_out = FirstOut({rule.alarm: rule.group for rule in rules})
         for rule in rules:
             if rule.alarm in self._alarms:
                 raise ValueError(f"two alarms are named {rule.alarm!r}; give each its own name")
-            if rule.alarm.startswith(("sensor-ok/", "detector-ok/")):
+            if rule.alarm.startswith(PREFIXES):
                 raise ValueError(f"alarm name {rule.alarm!r} is taken by the sensor checks; choose another")
+            if rule.alarm in RESERVED:
+                raise ValueError(f"alarm name {rule.alarm!r} is taken by the service; choose another")
             self._ruled.append(_Ruled(self._add(rule.alarm, latching=rule.latching), rule))
 
     @property
     def alarms(self) -> Mapping[str, AlarmStatus]:
-        """How every alarm stands by now, by name; a quality alarm appears when it is first raised."""
-        return MappingProxyType({name: alarm.status for name, alarm in self._alarms.items()})
+        """How every alarm stands by now, by name.
+
+        A quality alarm or a condition of the service appears when it is first raised.
+        """
+        return MappingProxyType(
+            {
+                name: alarm.status._replace(first_out=self._first_out.is_first(name))
+                for name, alarm in self._alarms.items()
+            }
+        )
+
+    @property
+    def conditions(self) -> frozenset[str]:
+        """The conditions of the service that have ever been raised, also before a restart."""
+        return frozenset(self._conditions)
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether the machine starts up, and limits are multiplied."""
+        return self._start_up.multiplies
 
     def take(self, diagnosis: Diagnosis) -> list[AlarmEvent]:
         """Take in a diagnosis and return what changed, in order; often nothing.
@@ -92,112 +137,130 @@ class AlarmManager:
                 f"a diagnosis of machine {diagnosis.machine!r} came to the alarms of "
                 f"{self._identity.machine!r}"
             )
-        at = self._instant(diagnosis.t_ns)
-        return list(self._events(diagnosis, at))
+        return self._tell(self._events(diagnosis, self._instant(diagnosis.t_ns)))
+
+    def tick(self) -> list[AlarmEvent]:
+        """What time alone brings: shelving ends, a flood ends, a start-up has lasted too long.
+
+        Call it about once a second. Missing data brings nothing: alarms wait for the next good statement.
+        """
+        return self._tell(self._timed(self._now()))
+
+    def condition(self, name: str, level: Level, sentence: str) -> list[AlarmEvent]:
+        """A condition of the service itself stands at ``level``; an event only if that is new.
+
+        Say it again as often as it is looked at, also when it is normal: after a restart it stands so long.
+
+        Args:
+            name: of the condition, e.g. ``"certificate/client"``.
+            level: how bad it is.
+            sentence: why, in words for a person.
+
+        Raises:
+            ValueError: the name belongs to an alarm.
+        """
+        return self._tell(self._stand(name, level, sentence, self._now()))
+
+    def obey(self, command: AlarmCommand) -> list[AlarmEvent]:
+        """Do what a person asks.
+
+        Raises:
+            RefusedError: there is no such alarm, or its state does not allow it; the text is the reason.
+        """
+        try:
+            event = self._obeyed(command)
+        except RefusedError:
+            self.counters.refused += 1
+            raise
+        self.counters.commands += 1
+        return self._tell([event])
 
     def resume(self, told: Iterable[AlarmEvent], speakers: Mapping[str, Sequence[str]]) -> list[AlarmEvent]:
         """Go on from where the alarms stood when the service ended; before the first diagnosis.
 
-        Every alarm takes over its state, level and occurrence, and holds them until a good diagnosis
+        Every alarm takes over its state, level, occurrence and holds, and holds them until a good diagnosis
         comes, which continues the occurrence or returns it. A suppression holds until whoever asked for
-        it says good. Delays begin anew.
+        it says good. Shelving goes on by the wall clock, but not for longer than was left. Delays begin
+        anew.
 
         Args:
-            told: the last event of each alarm.
+            told: the last event of each alarm, in the order in which they were told.
             speakers: the detectors that will make statements, with the sensors that these rest on.
 
         Returns:
             The events by which alarms return to normal that nobody will judge any more: the machine file
             no longer has them, or not what a quality alarm is about.
         """
+        told = list(told)
         for ruled in self._ruled:
-            ruled.sensors = frozenset(speakers.get(ruled.detector, ruled.sensors))
-        ruled_by_name = {ruled.alarm.name: ruled for ruled in self._ruled}
-        quality = {_quality_alarm(detector, sensors)[0] for detector, sensors in speakers.items()}
-        withdrawn: list[AlarmEvent] = []
-        for event in told:
-            ours = event.identity == self._identity
-            if ours and event.alarm in ruled_by_name:
-                self._resume_ruled(ruled_by_name[event.alarm], event)
-            elif event.to_state is AlarmState.NORMAL:
-                continue
-            elif ours and event.alarm in quality:
-                self._resume_quality(event, speakers)
-            else:
-                withdrawn.append(self._withdraw(event))
+            named = {sensor for d in ruled.rule.detectors for sensor in speakers.get(d, ())}
+            ruled.sensors = frozenset(named) or ruled.sensors
+        self._first_out.resume(event for event in told if event.identity == self._identity)
+        withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, speakers)]
         for ruled in self._ruled:
-            if ruled.alarm.is_held(Hold.SUPPRESSED) and self._not_ok_reason(ruled) is None:
-                # Whoever found a sensor bad is gone; then the alarm's own detector must find it good.
-                self._not_ok[ruled.detector] = (frozenset(), "a sensor was not OK before the restart")
+            if (
+                ruled.alarm.is_held(Hold.SUPPRESSED)
+                and self._doubts.silences(ruled.rule, ruled.sensors) is None
+            ):
+                # Whoever found a sensor bad is gone; then the alarm's own detectors must find it good.
+                for detector in ruled.rule.detectors:
+                    self._doubts.lose(detector, "a sensor was not OK before the restart")
         return withdrawn
 
-    def acknowledge(self, alarm: str, by: str = "") -> AlarmEvent:
-        """A person has seen the alarm.
+    def _tell(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
+        """Mark and count events as they come about, and say if they are a flood."""
+        told = [self._marked(event) for event in events]
+        now = self._now()
+        sentence = self._flood.sentence(now.t_ns)
+        if sentence is not None:
+            level = Level.ALERT if self._flood.flooding else Level.NORMAL
+            told += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]
+            self.counters.floods = self._flood.floods
+        return told
 
-        Raises:
-            KeyError: no alarm of that name.
-            RefusedError: the alarm's state does not allow it; the text is the reason.
-        """
-        return self._named(alarm).acknowledge(self._instant(self._clock.monotonic_ns()), by)
-
-    def reset(self, alarm: str, by: str = "") -> AlarmEvent:
-        """A person lets go of a latched alarm.
-
-        Raises:
-            KeyError: no alarm of that name.
-            RefusedError: its condition stands, or there is nothing to reset; the text is the reason.
-        """
-        return self._named(alarm).reset(self._instant(self._clock.monotonic_ns()), by)
+    def _marked(self, event: AlarmEvent) -> AlarmEvent:
+        self.counters.events += 1
+        self.counters.chattering += event.kind is EventKind.CHATTERING
+        if event.kind in ANNUNCIATIONS and event.alarm != ALARM_FLOOD:
+            self.counters.annunciations += 1
+            self._flood.called(self._clock.monotonic_ns())
+        return replace(event, first_out=self._first_out.marks(event))
 
     def _events(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
+        self._start_up.take(diagnosis)
         yield from self._quality(diagnosis, at)
-        for ruled in self._ruled:
+        followers = [ruled for ruled in self._ruled if diagnosis.detector in ruled.rule.detectors]
+        for ruled in followers:
             # A statement without data changes nothing, not even what an alarm is known to rest on.
-            if ruled.detector == diagnosis.detector and diagnosis.sensors and diagnosis.quality != "missing":
+            if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":
                 ruled.sensors = frozenset(diagnosis.sensors)
         yield from self._suppression(diagnosis, at)
-        for ruled in self._ruled:
-            if ruled.detector != diagnosis.detector:
-                continue
+        given = Circumstances(self._start_up.multiplies, frozenset(self._doubts.not_ok_sensors()))
+        for ruled in followers:
             if diagnosis.quality != "good" or ruled.alarm.is_held(Hold.SUPPRESSED):
-                ruled.watch.hold()
+                ruled.watch.hold(diagnosis)
+                ruled.alarm.hold()
                 continue
-            finding = ruled.watch.find(diagnosis)
-            event = None if finding is None else ruled.alarm.apply(finding, diagnosis, at)
-            if event is not None:
-                yield event
+            finding = ruled.watch.find(diagnosis, given)
+            if finding is not None:
+                yield from ruled.alarm.apply(finding, diagnosis, at)
 
     def _quality(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
-        """Raise, change or return the quality alarm of what the diagnosis rests on."""
-        name, subject = _quality_alarm(diagnosis.detector, diagnosis.sensors)
-        doubts = self._doubts.setdefault(name, {})
-        if diagnosis.quality == "good":
-            doubts.pop(diagnosis.detector, None)
-        else:
-            doubts[diagnosis.detector] = diagnosis
-        alarm = self._alarms.get(name)
-        if doubts:
-            alarm = alarm or self._add(name, latching=False)
-            worst = min(doubts.values(), key=lambda doubt: doubt.quality != "not_ok")
-            what = "cannot be judged" if worst.quality == "missing" else "not OK"
-            because = f": {worst.reason}" if worst.reason else ""
-            finding = Finding(Level.ALERT, worst.quality, f"{subject} {what}{because}")
-        elif alarm is not None:
-            finding = Finding(Level.NORMAL, "good", f"{subject} is good again")
-        else:
-            return
-        event = alarm.apply(finding, diagnosis, at)
-        if event is not None:
-            yield event
+        """Raise, change or return the quality alarms that the diagnosis bears on."""
+        for name in self._doubts.take(diagnosis):
+            doubts = self._doubts.of(name)
+            if name not in self._alarms:
+                if not doubts:
+                    continue
+                self._add(name, latching=False)
+            alarm = self._alarms[name]
+            alarm.doubts = doubts
+            yield from alarm.apply(self._doubts.finding(name), diagnosis, at)
 
     def _suppression(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         """Suppress what rests on a sensor that is not OK, and lift that when it is good again."""
-        if diagnosis.quality == "not_ok":
-            self._blame(diagnosis)
-        elif diagnosis.quality == "good":
-            self._not_ok.pop(diagnosis.detector, None)
         for ruled in self._ruled:
-            reason = self._not_ok_reason(ruled)
+            reason = self._doubts.silences(ruled.rule, ruled.sensors)
             if (reason is not None) == ruled.alarm.is_held(Hold.SUPPRESSED):
                 continue
             if reason is not None:
@@ -205,62 +268,115 @@ class AlarmManager:
             else:
                 yield ruled.alarm.unsuppress("its sensors are good again", diagnosis, at)
 
-    def _not_ok_reason(self, ruled: _Ruled) -> str | None:
-        """Why the alarm cannot speak: its own detector says so, or somebody blames one of its sensors."""
-        for detector, (sensors, reason) in self._not_ok.items():
-            if detector == ruled.detector or (len(sensors) == 1 and sensors <= ruled.sensors):
-                return reason
-        return None
+    def _timed(self, now: Instant) -> Iterator[AlarmEvent]:
+        for alarm in self._alarms.values():
+            expired = alarm.expire(now, no_statement(self._identity.machine, now))
+            if expired is not None:
+                yield expired
+        yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
+
+    def _stand(self, name: str, level: Level, sentence: str, at: Instant) -> list[AlarmEvent]:
+        if name in self._alarms and name not in self._conditions:
+            raise ValueError(f"condition {name!r} has the name of an alarm; put a / into it")
+        if name not in self._alarms:
+            if level is Level.NORMAL:
+                return []
+            self._add(name, latching=False)
+            self._conditions.add(name)
+        cause = statement(self._identity.machine, name, level, at)
+        return self._alarms[name].apply(Finding(level, "", sentence), cause, at)
+
+    def _obeyed(self, command: AlarmCommand) -> AlarmEvent:
+        alarm = self._alarms.get(command.alarm)
+        if alarm is None:
+            known = ", ".join(sorted(self._alarms)) or "none"
+            raise RefusedError(f"no alarm is named {command.alarm!r}; there are: {known}")
+        standing = alarm.status.occurrence
+        if command.occurrence is not None and command.occurrence != standing:
+            stands = "it is normal" if standing is None else f"now {standing} stands"
+            raise RefusedError(
+                f"cannot {command.verb} {alarm.name}: occurrence {command.occurrence} is over, {stands}"
+            )
+        now = self._now()
+        request, nothing = (
+            Request(command.by, now, command.reason),
+            no_statement(self._identity.machine, now),
+        )
+        match command.verb:
+            case Verb.ACKNOWLEDGE:
+                return alarm.acknowledge(request)
+            case Verb.RESET:
+                return alarm.reset(request)
+            case Verb.SHELVE:
+                return alarm.shelve(now.t_ns + self._shelving_ns(command), request, nothing)
+            case Verb.UNSHELVE:
+                return alarm.unshelve(request, nothing)
+            case Verb.BYPASS:
+                return alarm.bypass(request, nothing)
+            case Verb.UNBYPASS:
+                return alarm.unbypass(request, nothing)
+
+    def _shelving_ns(self, command: AlarmCommand) -> int:
+        longest_s, duration_s = self._handling.shelve_at_most_s, command.duration_s
+        if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
+            stated = "no time" if duration_s is None else f"{duration_s:g} s"
+            raise RefusedError(
+                f"cannot shelve {command.alarm} for {stated}; state a time above 0 and up to {longest_s:g} s"
+            )
+        return round(duration_s * 1e9)
+
+    def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
+        """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
+        ours, name = event.identity == self._identity, event.alarm
+        by_name = {ruled.alarm.name: ruled for ruled in self._ruled}
+        if ours and name in by_name:
+            self._resume_ruled(by_name[name], event)
+        elif event.own_state is AlarmState.NORMAL and not event.holds:
+            return True
+        elif ours and name in {quality_alarm(detector, sensors) for detector, sensors in speakers.items()}:
+            self._resume_unruled(event)
+            self._doubts.resume(doubt for doubt in event.doubts if doubt.detector in speakers)
+        elif ours and is_condition(event):
+            self._resume_unruled(event)
+            self._conditions.add(name)
+            if name == ALARM_FLOOD and event.own_state.is_active:
+                self._flood.resume(self._clock.monotonic_ns())
+        else:
+            return False
+        return True
 
     def _resume_ruled(self, ruled: _Ruled, event: AlarmEvent) -> None:
         level = event.to_level if event.own_state.is_active else Level.NORMAL
-        found = ruled.watch.resume(level, event.cause)
-        ruled.alarm.resume(event, found, self._since(event.wall_ns))
+        found = ruled.watch.resume(level, event)
+        ruled.alarm.resume(event, found, self._since(event.wall_ns), self._now())
 
-    def _resume_quality(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> None:
-        cause = event.cause
+    def _resume_unruled(self, event: AlarmEvent) -> None:
         alarm = self._add(event.alarm, latching=False)
-        alarm.resume(event, cause.quality, self._since(event.wall_ns))
-        if event.own_state.is_active and cause.quality != "good" and cause.detector in speakers:
-            self._doubts.setdefault(event.alarm, {})[cause.detector] = cause
-            # What has changed to missing was not OK before, and nobody has said since that it is good.
-            if cause.quality == "not_ok" or event.kind is EventKind.CHANGED:
-                self._blame(cause)
+        alarm.resume(event, event.found, self._since(event.wall_ns), self._now())
 
     def _withdraw(self, event: AlarmEvent) -> AlarmEvent:
         alarm = Alarm(event.identity, event.alarm, latching=False, new_occurrence=self._new_occurrence)
-        alarm.resume(event, "", self._since(event.wall_ns))
-        now = self._instant(self._clock.monotonic_ns())
-        return alarm.withdraw("the machine file no longer has it", event.cause, now)
+        alarm.resume(event, "", self._since(event.wall_ns), self._now())
+        return alarm.withdraw("the machine file no longer has it", event.cause, self._now())
 
     def _since(self, wall_ns: int) -> Instant:
         """An instant before the restart, by its label: the monotonic clock may have begun anew."""
         return Instant(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
 
-    def _blame(self, diagnosis: Diagnosis) -> None:
-        """Remember who says what is not OK, and why."""
-        reason = diagnosis.reason or "a sensor is not OK"
-        self._not_ok[diagnosis.detector] = (frozenset(diagnosis.sensors), reason)
-
     def _add(self, name: str, *, latching: bool) -> Alarm:
-        alarm = Alarm(self._identity, name, latching=latching, new_occurrence=self._new_occurrence)
+        alarm = Alarm(
+            self._identity,
+            name,
+            latching=latching,
+            new_occurrence=self._new_occurrence,
+            chatter=self._handling.chatter,
+        )
         self._alarms[name] = alarm
         return alarm
 
-    def _named(self, alarm: str) -> Alarm:
-        try:
-            return self._alarms[alarm]
-        except KeyError:
-            known = ", ".join(sorted(self._alarms)) or "none"
-            raise KeyError(f"no alarm is named {alarm!r}; there are: {known}") from None
+    def _now(self) -> Instant:
+        return self._instant(self._clock.monotonic_ns())
 
     def _instant(self, t_ns: int) -> Instant:
         """The wall-clock label of a monotonic time."""
         return Instant(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
-
-
-def _quality_alarm(detector: str, sensors: Sequence[str]) -> tuple[str, str]:
-    """The quality alarm that a statement bears on, and what it is about."""
-    if len(sensors) == 1:
-        return f"sensor-ok/{sensors[0]}", sensors[0]
-    return f"detector-ok/{detector}", detector

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -10,6 +11,7 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
+    from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.setpoints import Setpoint
     from daqsvc.diagnosis.record import Diagnosis
 
@@ -24,8 +26,12 @@ UNDETERMINED = "undetermined"
 DEPARTURE = "departure"
 """The decision of a detector that sees a change, but not yet of what."""
 
+MACHINE_GROUP = "machine"
+"""The first-out group of an alarm that names none: all alarms of the machine compete."""
+
 _IN_WORDS = {
     DEPARTURE: "a change, its cause not yet known",
+    "changed": "a change, its cause not yet known",
     "unmodelled": "an unmodelled change",
     "small_change": "a small change",
 }
@@ -46,27 +52,69 @@ class Finding(NamedTuple):
     sentence: str
 
 
+class Circumstances(NamedTuple):
+    """What else bears on a judgement.
+
+    Attributes:
+        starting: whether the machine starts up.
+        not_ok: sensors that somebody says are not OK.
+    """
+
+    starting: bool = False
+    not_ok: frozenset[str] = frozenset()
+
+
 class Watch(Protocol):
     """The memory of one rule."""
 
-    def find(self, diagnosis: Diagnosis) -> Finding | None:
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
         """What a good diagnosis says; None if it says nothing new and everything holds."""
         ...
 
-    def hold(self) -> None:
+    def hold(self, diagnosis: Diagnosis) -> None:
         """A diagnosis was not good: what was known stays known."""
         ...
 
-    def resume(self, level: Level, cause: Diagnosis) -> str:
+    def resume(self, level: Level, told: AlarmEvent) -> str:
         """Go on from before a restart.
 
         Args:
             level: the level that stood; normal if the condition was gone.
-            cause: the diagnosis behind the last event.
+            told: the last event.
 
         Returns:
-            `Finding.identity` of what stood; empty if ``cause`` does not tell.
+            `Finding.identity` of what stood; empty if ``told`` does not tell.
         """
+        ...
+
+
+class Rule(Protocol):
+    """What an alarm watches.
+
+    Attributes:
+        alarm: name of the alarm.
+        latching: whether the alarm outlives its condition until it is reset.
+        group: the first-out group that it competes in.
+        detectors: the detectors whose diagnoses feed it.
+        sensors: the sensors that it rests on before any diagnosis has named them.
+        spare: how many of these may be not OK before the alarm cannot speak.
+    """
+
+    @property
+    def alarm(self) -> str: ...  # noqa: D102  all six are described above
+    @property
+    def latching(self) -> bool: ...  # noqa: D102
+    @property
+    def group(self) -> str: ...  # noqa: D102
+    @property
+    def detectors(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def sensors(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def spare(self) -> int: ...  # noqa: D102
+
+    def watch(self) -> Watch:
+        """A fresh memory for this rule."""
         ...
 
 
@@ -80,6 +128,8 @@ class LevelRule:
         measure: key in `Diagnosis.statistics`, e.g. ``"rms"``.
         setpoint: the limits, in the unit of the measure.
         latching: whether the alarm outlives its condition until it is reset.
+        trip_multiply: factor on the limits while the machine starts up.
+        group: the first-out group that it competes in.
     """
 
     alarm: str
@@ -87,16 +137,23 @@ class LevelRule:
     measure: str
     setpoint: Setpoint
     latching: bool = False
+    trip_multiply: float = 1.0
+    group: str = MACHINE_GROUP
 
     @property
-    def detector(self) -> str:
+    def detectors(self) -> tuple[str, ...]:
         """The detector whose diagnoses feed this rule."""
-        return f"levels/{self.sensor}"
+        return (f"levels/{self.sensor}",)
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """The sensors that the rule rests on before any diagnosis has named them."""
         return (self.sensor,)
+
+    @property
+    def spare(self) -> int:
+        """None: without its sensor the alarm cannot speak."""
+        return 0
 
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
@@ -111,95 +168,160 @@ class DiagnosisRule:
         alarm: name of the alarm.
         detector: name of the detector; the level is the severity of its decision.
         latching: whether the alarm outlives its condition until it is reset.
+        evidence_nats: what is found must have at least this evidence (`decision_evidence`), where the
+            detector gives any; with less, everything holds. What is normal needs none.
+        group: the first-out group that it competes in.
     """
 
     alarm: str
     detector: str
     latching: bool = False
+    evidence_nats: float = 0.0
+    group: str = MACHINE_GROUP
+
+    @property
+    def detectors(self) -> tuple[str, ...]:
+        """The detector that the alarm follows."""
+        return (self.detector,)
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """None: the detector names its sensors in every diagnosis."""
         return ()
 
+    @property
+    def spare(self) -> int:
+        """None: the detector needs all of its sensors."""
+        return 0
+
     def watch(self) -> Watch:
         """A fresh memory for this rule."""
         return _DecisionWatch(self)
 
 
-class _LevelWatch:
-    def __init__(self, rule: LevelRule) -> None:
-        self._rule = rule
-        self._monitor = SetpointMonitor(rule.setpoint)
+def decision_evidence(diagnosis: Diagnosis) -> float | None:
+    """How much speaks for the decision, in nats; None if the detector does not say.
+
+    A detector that follows the lead of its decision over every other mode (``lead.M``) has the evidence of
+    the narrowest lead over a mode outside the group; while it only knows that the mode has been left, what
+    speaks against it (``cusum.M``, the most of the group). Any other states the evidence of each fault over
+    none.
+    """
+    evidence, decision = diagnosis.evidence, diagnosis.decision
+    among = {decision, *diagnosis.group}
+    leads = {name.removeprefix("lead."): nats for name, nats in evidence.items() if name.startswith("lead.")}
+    if leads and decision == DEPARTURE:
+        found = [evidence[f"cusum.{mode}"] for mode in among if f"cusum.{mode}" in evidence]
+        return _finite(max(found, default=math.nan))
+    if leads:
+        return _finite(min((nats for mode, nats in leads.items() if mode not in among), default=math.nan))
+    return _finite(max((evidence[mode] for mode in among if mode in evidence), default=math.nan))
+
+
+def _finite(nats: float) -> float | None:
+    return nats if math.isfinite(nats) else None
+
+
+class MeasureWatch:
+    """A measure of one sensor against a setpoint; says once if its detector does not have the measure.
+
+    Args:
+        alarm: name of the alarm.
+        measure: key in `Diagnosis.statistics`.
+        setpoint: the limits.
+        trip_multiply: factor on the limits while the machine starts up.
+    """
+
+    def __init__(self, alarm: str, measure: str, setpoint: Setpoint, trip_multiply: float) -> None:
+        self._alarm = alarm
+        self._measure = measure
+        self._trip_multiply = trip_multiply
         self._reported_absent = False
+        self.monitor = SetpointMonitor(setpoint)
+        self.setpoint = setpoint
 
-    def find(self, diagnosis: Diagnosis) -> Finding | None:
-        rule = self._rule
-        value = diagnosis.statistics.get(rule.measure)
-        if value is None:
-            self._monitor.hold()
-            if not self._reported_absent:
-                self._reported_absent = True
-                log.error(
-                    "alarm %s cannot be judged: %s measures %s, not %r; correct the alarm's measure",
-                    rule.alarm,
-                    diagnosis.detector,
-                    ", ".join(diagnosis.statistics) or "nothing",
-                    rule.measure,
-                )
-            return None
-        level = self._monitor.update(value, diagnosis.t_ns)
-        return Finding(level, "", self._sentence(diagnosis, value, level))
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> tuple[Level, float] | None:
+        """The level and the value; None, and everything holds, without the measure."""
+        value = diagnosis.statistics.get(self._measure)
+        if value is not None:
+            factor = self._trip_multiply if given.starting else 1.0
+            return self.monitor.update(value, diagnosis.t_ns, factor), value
+        self.monitor.hold()
+        if not self._reported_absent:
+            self._reported_absent = True
+            log.error(
+                "alarm %s cannot be judged: %s measures %s, not %r; correct the alarm's measure",
+                self._alarm,
+                diagnosis.detector,
+                ", ".join(diagnosis.statistics) or "nothing",
+                self._measure,
+            )
+        return None
 
-    def hold(self) -> None:
-        self._monitor.hold()
-
-    def resume(self, level: Level, cause: Diagnosis) -> str:  # noqa: ARG002  a level has one cause only
-        self._monitor.resume(level)
-        return ""
-
-    def _sentence(self, diagnosis: Diagnosis, value: float, level: Level) -> str:
-        rule = self._rule
-        unit = f" {diagnosis.units[rule.measure]}" if rule.measure in diagnosis.units else ""
-        measured = f"{rule.measure} of {rule.sensor} is {value:.4g}{unit}"
-        limit = rule.setpoint.limit(level)
+    def in_words(self, diagnosis: Diagnosis, sensor: str, value: float, level: Level) -> str:
+        """The value of ``sensor`` and the limit that makes ``level`` of it."""
+        unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
+        measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
+        limit = self.setpoint.limit(level)
         if limit is not None:
             return f"{measured}, {level.label} limit {limit:.4g}{unit}"
-        lowest = rule.setpoint.alert if rule.setpoint.alert is not None else rule.setpoint.danger
-        return f"{measured}, below its limit of {lowest:.4g}{unit}"
+        return f"{measured}, below its limit of {self.setpoint.lowest:.4g}{unit}"
+
+
+class _LevelWatch:
+    def __init__(self, rule: LevelRule) -> None:
+        self._sensor = rule.sensor
+        self._watch = MeasureWatch(rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply)
+
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
+        found = self._watch.find(diagnosis, given)
+        if found is None:
+            return None
+        level, value = found
+        return Finding(level, "", self._watch.in_words(diagnosis, self._sensor, value, level))
+
+    def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
+        self._watch.monitor.hold()
+
+    def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
+        self._watch.monitor.resume(level)
+        return ""
 
 
 class _DecisionWatch:
     def __init__(self, rule: DiagnosisRule) -> None:
-        self._detector = rule.detector
+        self._rule = rule
         self._group: tuple[str, ...] | None = None
 
-    def find(self, diagnosis: Diagnosis) -> Finding | None:
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:  # noqa: ARG002
         if diagnosis.decision == UNDETERMINED:
+            return None
+        level, evidence = Level.of(diagnosis.severity), decision_evidence(diagnosis)
+        if level is not Level.NORMAL and evidence is not None and evidence < self._rule.evidence_nats:
             return None
         if diagnosis.changed or self._group is None:
             # A group may flicker with the evidence from statement to statement; only what the detector itself
             # calls a change makes another finding of it.
             self._group = diagnosis.group
-        identity = _identity(diagnosis.decision, self._group)
-        return Finding(Level.of(diagnosis.severity), identity, self._sentence(diagnosis))
+        return Finding(level, _identity(diagnosis.decision, self._group), self._sentence(diagnosis, evidence))
 
-    def hold(self) -> None:
+    def hold(self, diagnosis: Diagnosis) -> None:
         """The detector itself holds its decision."""
 
-    def resume(self, level: Level, cause: Diagnosis) -> str:  # noqa: ARG002  it has no memory of levels
-        if cause.detector != self._detector:
-            return ""
-        self._group = cause.group
-        return _identity(cause.decision, cause.group)
+    def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  it has no memory of levels
+        if told.found:
+            self._group = tuple(told.found.split("|"))
+        return told.found
 
     @staticmethod
-    def _sentence(diagnosis: Diagnosis) -> str:
+    def _sentence(diagnosis: Diagnosis, evidence: float | None) -> str:
         decision = diagnosis.decision
         sentence = f"{diagnosis.detector} finds {_IN_WORDS.get(decision, decision)}"
         probability = diagnosis.probabilities.get(decision, 0.0)
         if probability > 0.5:  # a smaller one says less than the words
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
+        if evidence is not None:
+            sentence += f", evidence {evidence:.3g} nats"
         others = [mode for mode in diagnosis.group if mode != decision]
         if others:
             how = "possibly" if decision == DEPARTURE else "not told apart from"

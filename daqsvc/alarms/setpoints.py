@@ -44,6 +44,11 @@ class Setpoint:
                 f"delays are {self.on_delay_ns} ns on and {self.off_delay_ns} ns off; they cannot be negative"
             )
 
+    @property
+    def lowest(self) -> float:
+        """The limit that is reached first."""
+        return min(limit for limit in (self.alert, self.danger) if limit is not None)
+
     def limit(self, level: Level) -> float | None:
         """The limit at which ``level`` begins; None if it has none."""
         return {Level.NORMAL: None, Level.ALERT: self.alert, Level.DANGER: self.danger}[level]
@@ -69,8 +74,11 @@ class SetpointMonitor:
         """The level by all values so far."""
         return next((level for level, comparator in self._comparators if comparator.reached), Level.NORMAL)
 
-    def update(self, value: float, t_ns: int) -> Level:
+    def update(self, value: float, t_ns: int, factor: float = 1.0) -> Level:
         """Take in the value at ``t_ns`` (monotonic time of the data) and return the level.
+
+        ``factor`` multiplies the limits at which a level begins, never those at which it ends: it may keep
+        an alarm from being raised, but makes none return.
 
         NaN and minus infinity hold the level; plus infinity (an overflow) counts as exceeding.
         Time that runs backwards, as it can by a corrected time base, counts as none.
@@ -81,7 +89,7 @@ class SetpointMonitor:
         elapsed_ns = 0 if self._known_at_ns is None else max(t_ns - self._known_at_ns, 0)
         self._known_at_ns = t_ns
         for _, comparator in self._comparators:
-            comparator.update(value, elapsed_ns)
+            comparator.update(value, elapsed_ns, factor)
         return self.level
 
     def resume(self, level: Level) -> None:
@@ -105,8 +113,8 @@ class _Comparator:
         self._off_delay_ns = setpoint.off_delay_ns
         self._contrary_ns: int | None = None
 
-    def update(self, value: float, elapsed_ns: int) -> None:
-        contrary = value < self._leave_below if self.reached else value >= self._enter_at
+    def update(self, value: float, elapsed_ns: int, factor: float) -> None:
+        contrary = value < self._leave_below if self.reached else value >= factor * self._enter_at
         if not contrary:
             self._contrary_ns = None
             return

@@ -59,6 +59,11 @@ class AlarmState(StrEnum):
     OUT_OF_SERVICE = "out_of_service"
 
     @property
+    def in_words(self) -> str:
+        """The name in a sentence."""
+        return self.value.replace("_", " ")
+
+    @property
     def is_active(self) -> bool:
         """Whether the condition stands."""
         return self in _ACTIVE
@@ -80,6 +85,9 @@ class Hold(Enum):
     SUPPRESSED = AlarmState.SUPPRESSED
     OUT_OF_SERVICE = AlarmState.OUT_OF_SERVICE
 
+
+HOLDS = frozenset(hold.value for hold in Hold)
+"""The states that are covers and not an alarm's own."""
 
 _STRONGEST_FIRST = (Hold.OUT_OF_SERVICE, Hold.SUPPRESSED, Hold.SHELVED)
 
@@ -142,14 +150,19 @@ def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> Alar
     if after is not None:
         return after
     if stimulus is Stimulus.ACKNOWLEDGE:
-        raise RefusedError(f"there is nothing to acknowledge: it is {state.value}")
+        raise RefusedError(f"there is nothing to acknowledge: it is {state.in_words}")
     if stimulus is Stimulus.RESET:
         if state.is_active:
             raise RefusedError("its condition still stands; remove the cause, then reset")
-        raise RefusedError(f"there is nothing to reset: it is {state.value}")
+        raise RefusedError(f"there is nothing to reset: it is {state.in_words}")
     return state
+
+
+def strongest_first(holds: Collection[Hold]) -> tuple[AlarmState, ...]:
+    """The states that ``holds`` show, the one that consumers see first."""
+    return tuple(hold.value for hold in _STRONGEST_FIRST if hold in holds)
 
 
 def shown(state: AlarmState, holds: Collection[Hold]) -> AlarmState:
     """The state that consumers see: the strongest hold, or the alarm's own state if none covers it."""
-    return next((hold.value for hold in _STRONGEST_FIRST if hold in holds), state)
+    return next(iter(strongest_first(holds)), state)

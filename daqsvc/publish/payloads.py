@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 
 from daqsvc.acquisition.clock import iso_utc
-from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
-from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
+from daqsvc.alarms.states import HOLDS, AlarmState, Level
 from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
 
 if TYPE_CHECKING:
@@ -91,6 +91,16 @@ class PreviousPayload(_Payload):
     level: Severity
 
 
+class DoubtPayload(_Payload):
+    """What a detector has against a sensor."""
+
+    detector: str
+    quality: DataQuality = Field(description="what it said last")
+    not_ok: bool = Field(description="whether it said not_ok since it was last good")
+    reason: str
+    sensors: tuple[str, ...]
+
+
 class AlarmPayload(_Stamped):
     """One event of one alarm; the latest one is the alarm's state."""
 
@@ -105,7 +115,19 @@ class AlarmPayload(_Stamped):
     level: Severity
     previous: PreviousPayload
     message: str
-    by: str = Field(description="who acknowledged or reset; empty if the data did it")
+    by: str = Field(description="the person who asked for it; empty if the data or time did it")
+    reason: str = Field("", description="why, in that person's words")
+    holds: tuple[AlarmState, ...] = Field((), description="what covers the alarm, strongest first")
+    covered: AlarmState | None = Field(None, description="the state below; null if nothing covers it")
+    shelved_until_wall_ns: int | None = Field(None, description="when shelving ends; null if not shelved")
+    first_out: bool = Field(default=False, description="whether it stood first in its group")
+    chattering: bool = Field(
+        default=False, description="whether it comes and goes so often that returns are held"
+    )
+    found: str = Field("", description="what is found, joined with what it is not told apart from by |")
+    doubts: tuple[DoubtPayload, ...] = Field(
+        (), description="of a quality alarm: what is said against the sensor"
+    )
     cause: CausePayload
 
 
@@ -151,6 +173,14 @@ def alarm_payload(event: AlarmEvent, sequence: int) -> AlarmPayload:
         previous=PreviousPayload(state=event.from_state, level=event.from_level.label),
         message=event.message,
         by=event.by,
+        reason=event.reason,
+        holds=event.holds,
+        covered=event.covered,
+        shelved_until_wall_ns=event.shelved_until_wall_ns,
+        first_out=event.first_out,
+        chattering=event.chattering,
+        found=event.found,
+        doubts=tuple(DoubtPayload(**doubt._asdict()) for doubt in event.doubts),
         cause=CausePayload(**_statement(event.cause), monotonic_ns=event.cause.t_ns),
     )
 
@@ -164,8 +194,18 @@ def alarm_event(payload: bytes) -> AlarmEvent:
     told = AlarmPayload.model_validate_json(payload)
     state, previous = AlarmState(told.state), AlarmState(told.previous.state)
     kind = EventKind(told.kind)
-    unheard_of = {AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE}
-    if {state, previous} & unheard_of or (state is AlarmState.SUPPRESSED) != (kind is EventKind.SUPPRESSED):
+    holds, covered = tuple(map(AlarmState, told.holds)), told.covered and AlarmState(told.covered)
+    if kind is EventKind.SUPPRESSED and not holds:
+        # Before holds were told of one by one there was this one only, laid over the state before.
+        holds, covered = (AlarmState.SUPPRESSED,), previous
+    shown = holds[0] if holds else state
+    if (
+        not HOLDS.issuperset(holds)
+        or shown is not state
+        or (state in HOLDS) != (covered is not None)
+        or covered in HOLDS
+        or (AlarmState.SHELVED in holds) != (told.shelved_until_wall_ns is not None)
+    ):
         raise ValueError(f"an event {kind} from {previous} to {state} is none of this program's")
     return AlarmEvent(
         identity=Identity(told.site, told.box, told.machine),
@@ -181,6 +221,14 @@ def alarm_event(payload: bytes) -> AlarmEvent:
         cause=_diagnosis(told.machine, told.cause),
         message=told.message,
         by=told.by,
+        reason=told.reason,
+        holds=holds,
+        covered=covered,
+        shelved_until_wall_ns=told.shelved_until_wall_ns,
+        first_out=told.first_out,
+        chattering=told.chattering,
+        found=told.found,
+        doubts=tuple(Doubt(**dict(doubt)) for doubt in told.doubts),
     )
 
 

@@ -7,6 +7,7 @@ import logging
 import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import EventKind, Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
@@ -45,6 +46,16 @@ class Desk:
             sensors=(sensor,),
         )
 
+    def ask(self, verb, alarm, by="", **more):
+        events = self.manager.obey(AlarmCommand(verb=verb, alarm=alarm, by=by, **more))
+        return events[0]
+
+    def acknowledge(self, alarm, by=""):
+        return self.ask(Verb.ACKNOWLEDGE, alarm, by)
+
+    def reset(self, alarm, by=""):
+        return self.ask(Verb.RESET, alarm, by)
+
     def mode(self, decision, severity, quality="good", **more):
         return self.take(
             detector="rotor-bank",
@@ -77,7 +88,7 @@ def test_a_level_alarm_from_the_cradle_to_the_grave():
     [returned] = desk.rms(37.0)
     assert (returned.kind, returned.to_state) == (K.RETURNED, S.RETURNED_UNACKNOWLEDGED)
     assert returned.message.endswith("below its limit of 40 um")
-    acknowledged = desk.manager.acknowledge("vibration-x", by="ann")
+    acknowledged = desk.acknowledge("vibration-x", by="ann")
     assert (acknowledged.to_state, acknowledged.by) == (S.NORMAL, "ann")
     occurrences = {e.occurrence for e in (raised, escalated, lowered, returned, acknowledged)}
     assert len(occurrences) == 1
@@ -94,7 +105,7 @@ def test_each_activation_is_an_occurrence_of_its_own():
 def test_an_escalation_wants_to_be_acknowledged_again():
     desk = Desk(LEVEL)
     desk.rms(50.0)
-    assert desk.manager.acknowledge("vibration-x").to_state is S.ACTIVE_ACKNOWLEDGED
+    assert desk.acknowledge("vibration-x").to_state is S.ACTIVE_ACKNOWLEDGED
     [event] = desk.rms(70.0)
     assert (event.from_state, event.to_state) == (S.ACTIVE_ACKNOWLEDGED, S.ACTIVE_UNACKNOWLEDGED)
 
@@ -104,15 +115,15 @@ def test_a_latched_alarm_keeps_its_worst_level_and_refuses_reset_while_it_stands
     desk.rms(70.0)
     assert desk.rms(50.0) == []
     with pytest.raises(RefusedError, match="cannot reset vibration-x: its condition still stands"):
-        desk.manager.reset("vibration-x")
+        desk.reset("vibration-x")
     [latched] = desk.rms(0.0)
     assert (latched.kind, latched.to_state) == (K.LATCHED, S.LATCHED_UNACKNOWLEDGED)
     assert latched.to_level is Level.DANGER
     [again] = desk.rms(45.0)
     assert (again.kind, again.occurrence) == (K.RECURRED, latched.occurrence)
     desk.rms(0.0)
-    desk.manager.acknowledge("vibration-x")
-    reset = desk.manager.reset("vibration-x", by="bob")
+    desk.acknowledge("vibration-x")
+    reset = desk.reset("vibration-x", by="bob")
     assert (reset.to_state, reset.to_level, reset.by) == (S.NORMAL, Level.NORMAL, "bob")
 
 
@@ -169,7 +180,7 @@ def test_a_sensor_that_is_not_ok_suppresses_what_rests_on_it_and_nothing_else():
     assert desk.manager.alarms["vibration-y"].state is S.NORMAL
     assert desk.mode("F1L3", "danger") == []
     with pytest.raises(RefusedError, match="it is suppressed"):
-        desk.manager.acknowledge("vibration-x")
+        desk.acknowledge("vibration-x")
     events = desk.rms(30.0)
     assert kinds(events) == [
         ("sensor-ok/probe-x", K.RETURNED),
@@ -220,7 +231,7 @@ def test_wrong_wiring_is_refused():
     desk = Desk(LEVEL)
     with pytest.raises(ValueError, match="machine 'other'"):
         desk.take(machine="other", detector="levels/probe-x", decision="normal")
-    with pytest.raises(KeyError, match="vibration-x"):
-        desk.manager.acknowledge("vibration-z")
+    with pytest.raises(RefusedError, match="no alarm is named 'vibration-z'; there are: vibration-x"):
+        desk.acknowledge("vibration-z")
     with pytest.raises(RefusedError, match="never been raised"):
-        desk.manager.acknowledge("vibration-x")
+        desk.acknowledge("vibration-x")

@@ -82,6 +82,14 @@ def test_an_alarm_says_everything_that_the_event_knows():
         "monotonic_ns": 4_000_000_000,
         "message": "rotor-fault alert: rotor-bank finds F1",
         "by": "",
+        "reason": "",
+        "holds": [],
+        "covered": None,
+        "shelved_until_wall_ns": None,
+        "first_out": False,
+        "chattering": False,
+        "found": "",
+        "doubts": [],
     }
     assert cause["probabilities"] == {"N": 0.02, "F1": 0.98}
     assert cause["group"] == ["F1", "F1L2"]

@@ -1,0 +1,50 @@
+"""Conditions of the service itself: alarms that no detector feeds, such as a flood of alarms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.alarms.rules import UNDETERMINED
+from daqsvc.alarms.states import Level
+from daqsvc.diagnosis.record import Diagnosis
+
+if TYPE_CHECKING:
+    from daqsvc.alarms.alarm import Instant
+    from daqsvc.alarms.events import AlarmEvent
+
+SERVICE = "service"
+"""The "detector" of such conditions."""
+
+ALARM_FLOOD = "alarm-flood"
+TRIP_MULTIPLY = "trip-multiply"
+RESERVED = frozenset({ALARM_FLOOD, TRIP_MULTIPLY})
+"""Names that no alarm of a machine file may have; other conditions have a ``/`` in theirs, which none may."""
+
+
+def statement(machine: str, condition: str, level: Level, at: Instant) -> Diagnosis:
+    """The service's statement that ``condition`` stands at ``level``."""
+    return _statement(machine, condition, level, at)
+
+
+def no_statement(machine: str, at: Instant) -> Diagnosis:
+    """Stands in for the cause of an alarm that nobody has judged yet."""
+    return _statement(machine, UNDETERMINED, Level.NORMAL, at)
+
+
+def is_condition(event: AlarmEvent) -> bool:
+    """Whether the alarm of ``event`` is a condition of the service."""
+    return event.cause.detector == SERVICE and event.cause.decision == event.alarm
+
+
+def _statement(machine: str, decision: str, level: Level, at: Instant) -> Diagnosis:
+    return Diagnosis(
+        machine=machine,
+        detector=SERVICE,
+        t_ns=at.t_ns,
+        stream="",
+        first_index=0,
+        end_index=0,
+        decision=decision,
+        severity=level.label,
+        model="service/1",
+    )

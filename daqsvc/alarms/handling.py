@@ -1,0 +1,49 @@
+"""What holds for all alarms of a machine, and what they count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from daqsvc.alarms.chatter import ChatterLimit
+    from daqsvc.alarms.flood import FloodLimit
+    from daqsvc.alarms.start_up import StartUp
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmHandling:
+    """What holds for all alarms of a machine.
+
+    Attributes:
+        chatter: from when on an alarm chatters; None never.
+        flood: from when on alarms are a flood; None never.
+        start_up: how a start-up is recognised; None: limits are never multiplied.
+        shelve_at_most_s: the longest time that an alarm may be shelved for.
+    """
+
+    chatter: ChatterLimit | None = None
+    flood: FloodLimit | None = None
+    start_up: StartUp | None = None
+    shelve_at_most_s: float = 86_400.0
+
+
+@dataclass(slots=True)
+class AlarmCounters:
+    """What has happened since the service started.
+
+    Attributes:
+        events: all events.
+        annunciations: those that call for a person: raised, escalated, recurred.
+        chattering: how often an alarm began to chatter.
+        floods: how often alarms came faster than a person can attend to.
+        commands: what people asked for and got.
+        refused: what they asked for and did not get.
+    """
+
+    events: int = 0
+    annunciations: int = 0
+    chattering: int = 0
+    floods: int = 0
+    commands: int = 0
+    refused: int = 0

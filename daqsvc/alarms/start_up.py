@@ -1,0 +1,114 @@
+"""Trip multiply: while a machine starts up, some upper limits are raised by a factor, for a limited time.
+
+A shaft that runs through a critical speed vibrates more than it may at its working speed. The signal that it
+does so is a measure of a detector, as a rule the speed by the keyphasor, in a range or on the move.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daqsvc.alarms.states import Level
+
+if TYPE_CHECKING:
+    from daqsvc.diagnosis.record import Diagnosis
+
+_RATE_OVER_NS = 1_000_000_000
+"""A rate is taken over at least so long: from edge to edge a keyphasor's speed jitters."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartUp:
+    """How a start-up is recognised.
+
+    Attributes:
+        detector: the detector whose diagnoses hold the signal.
+        measure: key in `Diagnosis.statistics`, e.g. ``"speed"``.
+        between: the machine starts up while the measure lies in this range, in its unit; None: no such range.
+        change_per_s: it starts up while the measure changes at least so fast; None: no such rate.
+        at_most_ns: after so long limits are no longer multiplied, until the signal has been gone.
+
+    Raises:
+        ValueError: neither a range nor a rate is given, or one that cannot be.
+    """
+
+    detector: str
+    measure: str = "speed"
+    between: tuple[float, float] | None = None
+    change_per_s: float | None = None
+    at_most_ns: int = 120_000_000_000
+
+    def __post_init__(self) -> None:
+        if self.between is None and self.change_per_s is None:
+            raise ValueError("a start-up needs a range or a rate of its signal; it has neither")
+        if self.between is not None and not self.between[0] < self.between[1]:
+            raise ValueError(f"a start-up between {self.between[0]} and {self.between[1]} has no range")
+        if self.change_per_s is not None and not self.change_per_s > 0:
+            raise ValueError(f"a start-up at a change of {self.change_per_s} a second is always; state more")
+        if self.at_most_ns <= 0:
+            raise ValueError(f"a start-up of at most {self.at_most_ns} ns is none; state a positive time")
+
+
+class StartUpSignal:
+    """Follows the signal, by the time of the data.
+
+    Args:
+        start_up: how a start-up is recognised; None: this machine has none.
+    """
+
+    def __init__(self, start_up: StartUp | None) -> None:
+        self._start_up = start_up
+        self._since_ns: int | None = None
+        self._overrun = False
+        self._anchor: tuple[int, float] | None = None
+        self._moving = False
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether limits are multiplied now."""
+        return self._since_ns is not None and not self._overrun
+
+    def take(self, diagnosis: Diagnosis) -> None:
+        """Take in a diagnosis; one of another detector, or without the measure, says nothing."""
+        start_up = self._start_up
+        if start_up is None or diagnosis.detector != start_up.detector or diagnosis.quality == "not_ok":
+            return
+        value = diagnosis.statistics.get(start_up.measure, math.nan)
+        if not math.isfinite(value):
+            return
+        within = start_up.between is not None and start_up.between[0] <= value <= start_up.between[1]
+        if within or self._moves(value, diagnosis.t_ns, start_up.change_per_s):
+            if self._since_ns is None:
+                self._since_ns = diagnosis.t_ns
+        else:
+            self._since_ns, self._overrun = None, False
+
+    def overrun(self, now_ns: int) -> tuple[Level, str]:
+        """Whether the start-up has lasted too long by ``now_ns``, as a condition of the service.
+
+        From then on limits are no longer multiplied.
+        """
+        start_up = self._start_up
+        if start_up is None or self._since_ns is None:
+            return Level.NORMAL, "the start-up is over"
+        if now_ns - self._since_ns > start_up.at_most_ns:
+            self._overrun = True
+        if not self._overrun:
+            return Level.NORMAL, "the machine starts up"
+        return Level.ALERT, (
+            f"by {start_up.measure} of {start_up.detector} the machine has been starting up for more than "
+            f"{start_up.at_most_ns / 1e9:g} s; limits are no longer multiplied"
+        )
+
+    def _moves(self, value: float, t_ns: int, change_per_s: float | None) -> bool:
+        if change_per_s is None:
+            return False
+        if self._anchor is None or t_ns < self._anchor[0]:
+            self._anchor = (t_ns, value)
+        since_ns, before = self._anchor
+        if t_ns - since_ns >= _RATE_OVER_NS:
+            self._moving = abs(value - before) >= change_per_s * (t_ns - since_ns) / 1e9
+            self._anchor = (t_ns, value)
+        return self._moving
