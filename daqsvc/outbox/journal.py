@@ -1,35 +1,48 @@
-"""The SQLite file of the outbox: synchronous, used by one thread.
-
-Sequence numbers are never used twice on a box. A healthy file knows its highest number
-(``AUTOINCREMENT``). A new file, be it the first or the successor of a corrupt one, starts above both
-
-- the wall clock in milliseconds since 1970, far above any number that was counted up from an earlier
-  start, and
-- the mark in the side file ``<name>.sequence``, which is always ahead of what was used, in case the
-  wall clock was set back.
-"""
+"""The SQLite file of the alarms: synchronous, used by one thread."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
-import os
 import sqlite3
-from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING
 
+from daqsvc.outbox.files import (
+    connect,
+    corruption,
+    is_corrupt,
+    is_full,
+    make_directory,
+    pragma,
+    set_aside,
+    sync_directory,
+    take_possession,
+    used_bytes,
+)
+from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum
+from daqsvc.outbox.sequence import SequenceMark
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
     from typing import BinaryIO
 
+    from daqsvc.outbox.limits import OutboxLimits
+    from daqsvc.outbox.messages import Draft
+
 log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 1
-MARK_STEP = 1024
-TRIM_EVERY = 1000
-NS_PER_MS = 1_000_000
+SCHEMA_VERSION = 2
+
+TRIM_EVERY = 256
+"""Messages marked as sent from one look at the limits to the next."""
+
+TRIM_AT_MOST = 8 * TRIM_EVERY
+"""Messages deleted at a time, so that no commit takes long; far more than come in between."""
+
+SLACK_PAGES = 2048
+"""Free pages of the file that are kept for what comes, 8 MiB; more are given back to the disk."""
 
 _SCHEMA = """
 CREATE TABLE messages (
@@ -37,65 +50,55 @@ CREATE TABLE messages (
     topic TEXT NOT NULL,
     payload BLOB NOT NULL,
     retain INTEGER NOT NULL,
-    sent INTEGER NOT NULL DEFAULT 0
+    sent INTEGER NOT NULL DEFAULT 0,
+    wall_ns INTEGER NOT NULL DEFAULT 0,
+    checksum INTEGER
 );
 CREATE INDEX unsent ON messages (sequence) WHERE NOT sent;
-CREATE INDEX retained ON messages (topic, sequence) WHERE retain;
 """
 
-_LATEST = "(SELECT max(sequence) FROM messages WHERE retain GROUP BY topic)"
+_SCHEMA_2 = """
+CREATE INDEX sent ON messages (sequence) WHERE sent;
+CREATE TABLE latest (topic TEXT PRIMARY KEY, sequence INTEGER NOT NULL) WITHOUT ROWID;
+"""
 
+_FROM_1_TO_2 = f"""
+ALTER TABLE messages ADD COLUMN wall_ns INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE messages ADD COLUMN checksum INTEGER;
+DROP INDEX retained;
+{_SCHEMA_2}
+"""
 
-class OutboxError(Exception):
-    """The outbox cannot do what it was asked to; the text names the file and the remedy."""
+_FILL_LATEST = """
+INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP BY topic
+"""
 
+_INSERT = """
+INSERT INTO messages (sequence, topic, payload, retain, wall_ns, checksum) VALUES (?, ?, ?, ?, ?, ?)
+"""
 
-@dataclass(frozen=True, slots=True)
-class OutboxMessage:
-    """A message that is on disk.
-
-    Attributes:
-        sequence: its number, never used twice.
-        topic: MQTT topic.
-        payload: the bytes to publish.
-        retain: whether the broker keeps it as the latest of its topic.
-    """
-
-    sequence: int
-    topic: str
-    payload: bytes
-    retain: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Draft:
-    """A message on its way to the disk, whose payload wants to know its number."""
-
-    topic: str
-    payload_of_sequence: Callable[[int], bytes]
-    retain: bool
+_IS_LATEST = "SELECT sequence FROM latest"
 
 
 class Journal:
-    """Messages by sequence number, sent or not.
+    """Messages by sequence number, sent or not; how the numbers go on is told in `outbox.sequence`.
 
     Args:
         path: the SQLite file; its directory is created.
         wall_ns: wall clock, ns since the Unix epoch.
-        keep_sent: how many messages to keep at most once they are sent. The latest retained message of
-            each topic is kept for good, and what is not sent is never dropped.
+        limits: how much is kept of what is sent.
     """
 
-    def __init__(self, path: Path, wall_ns: Callable[[], int], keep_sent: int) -> None:
+    def __init__(self, path: Path, wall_ns: Callable[[], int], limits: OutboxLimits) -> None:
         self.path = path
         self.quarantined = 0
-        self._mark_path = path.with_name(path.name + ".sequence")
+        self.vanished = 0
+        self._mark = SequenceMark(path.with_name(path.name + ".sequence"))
         self._wall_ns = wall_ns
-        self._keep_sent = keep_sent
+        self._limits = limits
         self._connection: sqlite3.Connection | None = None
         self._lock: BinaryIO | None = None
         self._next = 0
-        self._mark = 0
         self._sent_since_trim = 0
 
     @property
@@ -103,91 +106,156 @@ class Journal:
         """The highest number used so far."""
         return self._next - 1
 
+    def hold(self) -> None:
+        """Create the directory and keep other processes out of it, until `close`.
+
+        Raises:
+            OutboxError: the directory cannot be used, or another process uses it.
+        """
+        try:
+            make_directory(self.path.parent)
+            self._lock = take_possession(self.path.with_name(self.path.name + ".lock"))
+        except OSError as error:
+            raise self._unusable(error) from error
+
     def open(self) -> None:
         """Open or create the file; a corrupt one is set aside.
 
         Raises:
             OutboxError: the directory or file cannot be used.
         """
+        if self._lock is None:
+            self.hold()
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._take_possession()
-            self._mark = self._read_mark()
+            self._mark.read()
             try:
                 self._connect()
             except sqlite3.DatabaseError as error:
                 if not is_corrupt(error):
                     raise
                 self.quarantine(error)
+            self._tidy()
         except (OSError, sqlite3.Error) as error:
-            raise OutboxError(
-                f"cannot open the outbox {self.path}: {error}; "
-                f"give the service a directory that it may write in, with space left"
-            ) from error
+            raise self._unusable(error) from error
 
-    def _take_possession(self) -> None:
-        """Keep other processes out: two writers would give the same numbers and fight at the broker.
+    def _unusable(self, error: Exception) -> OutboxError:
+        return OutboxError(
+            f"cannot open the outbox {self.path}: {error}; "
+            f"give the service a directory that it may write in, with space left"
+        )
 
-        The system gives the lock back however this process ends.
-        """
-        lock = self.path.with_name(self.path.name + ".lock").open("ab")
+    def _tidy(self) -> None:
+        """Trim, and have the file itself tell where the numbers go on; on a full disk, both can wait."""
+        connection = self._open_connection()
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            raise OutboxError(
-                f"another daqsvc uses the store {self.path.parent}; "
-                "stop it, or give this one a directory of its own"
-            ) from None
-        except BaseException:
-            lock.close()
-            raise
-        self._lock = lock
+            with _transaction(connection):
+                connection.execute("DELETE FROM sqlite_sequence WHERE name = 'messages'")
+                connection.execute(
+                    "INSERT INTO sqlite_sequence VALUES ('messages', ?)", (self.last_sequence,)
+                )
+                self._trim(connection)
+        except sqlite3.OperationalError as error:
+            if not is_full(error):
+                raise
+            log.warning("outbox %s: %s; the journal is not trimmed", self.path, error)
 
     def quarantine(self, error: sqlite3.DatabaseError) -> None:
-        """Set a corrupt file aside and begin a new one."""
+        """Set a corrupt file aside and begin a new one with what can still be read of it.
+
+        Raises:
+            sqlite3.Error: the new file cannot be written.
+            OSError: the corrupt one cannot be set aside.
+        """
         if self._connection is not None:
             with contextlib.suppress(sqlite3.Error):  # it is given up anyway
                 self._connection.close()
             self._connection = None
-        stamp = self._wall_ns() // NS_PER_MS
-        aside = self.path.with_name(f"{self.path.name}.corrupt-{stamp}")
-        for suffix in ("", "-wal", "-shm"):
-            part = self.path.with_name(self.path.name + suffix)
-            if part.exists():
-                part.rename(aside.with_name(aside.name + suffix))
-        self.quarantined += 1
-        log.error("outbox %s is corrupt (%s); set aside as %s, starting a new one", self.path, error, aside)
+        aside = None
+        if self.path.exists():
+            aside = set_aside(self.path, self._wall_ns())
+            self.quarantined += 1
+            log.error(
+                "outbox %s is corrupt (%s); set aside as %s, starting a new one", self.path, error, aside
+            )
         self._connect()
+        if aside is not None:
+            self._salvage(aside)
+        self._tidy()
 
     def _connect(self) -> None:
-        connection = sqlite3.connect(self.path, isolation_level=None, timeout=5.0)
+        connection = connect(self.path, synchronous="FULL")
         try:
-            self._next = 1 + self._prepare(connection)
+            stored = self._prepare(connection)
+            sync_directory(self.path.parent)
         except BaseException:
             connection.close()
             raise
         self._connection = connection
+        gone = self._mark.vanished(stored)
+        if gone:
+            self.vanished += gone
+            log.error(
+                "outbox %s ends with message %d, but numbers up to %d were used: %d messages are gone from "
+                "the disk; it was damaged, or is an older copy",
+                self.path,
+                stored,
+                (stored or 0) + gone,
+                gone,
+            )
+        self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
 
-    def _prepare(self, connection: sqlite3.Connection) -> int:
-        """Set the connection up, check the file, and return the highest number in use."""
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-        if verdict != "ok":
-            raise _corruption(str(verdict))
-        version = connection.execute("PRAGMA user_version").fetchone()[0]
-        if version not in (0, SCHEMA_VERSION):
+    def _prepare(self, connection: sqlite3.Connection) -> int | None:
+        """Bring the tables up to date; the highest number that the file knows, None if it is new."""
+        version = pragma(connection, "user_version")
+        if version not in {0, 1, SCHEMA_VERSION}:
             raise OutboxError(
                 f"outbox {self.path} has schema version {version}, this program knows {SCHEMA_VERSION}; "
                 f"update the program or move the file away"
             )
-        if version == 0:
+        if version < SCHEMA_VERSION:
+            statements = _SCHEMA + _SCHEMA_2 if version == 0 else _FROM_1_TO_2 + _FILL_LATEST + ";"
+            now = f"UPDATE messages SET wall_ns = {self._wall_ns()};"  # noqa: S608  a number
             connection.executescript(
-                f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;"
+                f"BEGIN IMMEDIATE; {statements} {now} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;"
             )
         used = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'messages'").fetchone()
-        return int(used[0]) if used else max(self._mark, self._wall_ns() // NS_PER_MS)
+        return int(used[0]) if used else None
+
+    def _salvage(self, aside: Path) -> None:
+        """Copy from a corrupt file every message that can be read and has kept its checksum."""
+        connection = self._open_connection()
+        opened = contextlib.closing(sqlite3.connect(aside, isolation_level=None))
+        with opened as broken, _transaction(connection):
+            # From both ends, so that one bad page does not hide what lies behind it.
+            for order in ("ASC", "DESC"):
+                connection.executemany(
+                    "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)",
+                    self._readable(broken, order, aside.stat().st_size),
+                )
+            connection.execute(_FILL_LATEST)
+        count = connection.execute("SELECT count(*) FROM messages").fetchone()[0]
+        log.warning("outbox %s: %d messages were saved from the corrupt file", self.path, count)
+
+    def _readable(self, broken: sqlite3.Connection, order: str, size: int) -> Iterator[tuple[object, ...]]:
+        try:
+            rows = broken.execute(
+                "SELECT sequence, topic, payload, retain, sent, wall_ns, checksum "  # noqa: S608  constants only
+                f"FROM messages NOT INDEXED ORDER BY sequence {order}"
+            )
+            # A file whose pages point at each other must not be read for ever.
+            for row in islice(rows, size // 16):
+                sequence, topic, payload, retain, sent, wall_ns, told = row
+                sound = (
+                    isinstance(topic, str)
+                    and isinstance(payload, bytes)
+                    and {retain, sent} <= {0, 1}
+                    and isinstance(wall_ns, int)
+                    and sequence < self._next
+                )
+                if sound and told == checksum(sequence, topic, payload):
+                    yield row
+        except (sqlite3.Error, ValueError, OverflowError) as error:
+            log.info("outbox %s: the corrupt file could be read up to a point (%s)", self.path, error)
 
     def commit(self, drafts: Sequence[Draft], sent: Iterable[int]) -> tuple[list[int | Exception], int]:
         """Write drafts and mark others as sent, in one durable transaction.
@@ -200,37 +268,59 @@ class Journal:
             sqlite3.Error: nothing was written; try again with the same drafts.
             OSError: likewise, from the side file.
         """
+        connection = self._open_connection()
         outcomes: list[int | Exception] = []
         rows = []
+        latest = {}
+        wall_ns = self._wall_ns()
         sequence = self._next
         for draft in drafts:
             try:
-                payload = draft.payload_of_sequence(sequence)
+                m = draft.message(sequence)
             except Exception as error:  # noqa: BLE001  the caller's own function; it goes back to the caller
                 outcomes.append(error)
                 continue
-            rows.append((sequence, draft.topic, payload, draft.retain))
+            rows.append(
+                (m.sequence, m.topic, m.payload, m.retain, wall_ns, checksum(m.sequence, m.topic, m.payload))
+            )
+            if m.retain:
+                latest[m.topic] = m.sequence
             outcomes.append(sequence)
             sequence += 1
-        self._advance_mark(sequence)
-
-        connection = self._open_connection()
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            connection.executemany(
-                "INSERT INTO messages (sequence, topic, payload, retain) VALUES (?, ?, ?, ?)", rows
-            )
+        if rows:
+            self._mark.advance(sequence - 1)
+        with _transaction(connection):
+            connection.executemany(_INSERT, rows)
+            connection.executemany("INSERT OR REPLACE INTO latest VALUES (?, ?)", latest.items())
             marked = connection.executemany(
                 "UPDATE messages SET sent = 1 WHERE sequence = ? AND NOT sent", [(s,) for s in sent]
             ).rowcount
-            self._trim(connection, marked)
-            connection.execute("COMMIT")
-        except BaseException:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
-            raise
-        self._next = sequence
-        return outcomes, marked
+            self._sent_since_trim += max(marked, 0)
+            if self._sent_since_trim >= TRIM_EVERY:
+                self._trim(connection)
+        if rows:
+            self._next = sequence
+            self._mark.note(sequence - 1)
+        return outcomes, max(marked, 0)
+
+    def make_room(self) -> int:
+        """Delete, on a full disk, messages that the broker has: their room takes what comes.
+
+        Returns:
+            How many were deleted.
+
+        Raises:
+            sqlite3.Error: not even that is possible.
+        """
+        connection = self._open_connection()
+        with _transaction(connection):
+            return connection.execute(
+                f"""
+                DELETE FROM messages WHERE sequence IN
+                (SELECT sequence FROM messages WHERE sent AND sequence NOT IN ({_IS_LATEST})
+                 ORDER BY sequence LIMIT {TRIM_EVERY})
+                """  # noqa: S608  constants only
+            ).rowcount
 
     def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that are not sent, in order, at most ``limit``."""
@@ -238,11 +328,11 @@ class Journal:
 
     def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, if it is sent, in order."""
-        return self._select(f"WHERE sent AND sequence IN {_LATEST} ORDER BY sequence")
+        return self._select(f"WHERE sent AND sequence IN ({_IS_LATEST}) ORDER BY sequence")
 
     def latest(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, sent or not, in order."""
-        return self._select(f"WHERE sequence IN {_LATEST} ORDER BY sequence")
+        return self._select(f"WHERE sequence IN ({_IS_LATEST}) ORDER BY sequence")
 
     def unsent(self) -> int:
         """How many messages are not sent."""
@@ -256,73 +346,68 @@ class Journal:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
+            try:
+                self._mark.settle(self._next - 1)
+            except OSError as error:
+                log.warning("outbox mark of %s cannot be written: %s; numbers may jump", self.path, error)
+            self._mark.close()
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
     def _open_connection(self) -> sqlite3.Connection:
         if self._connection is None:
+            if self._lock is None:
+                raise OutboxError(f"outbox {self.path} is not open; call open() first")
             self._connect()
         if self._connection is None:
-            raise OutboxError(f"outbox {self.path} is not open; call open() first")
+            raise OutboxError(f"outbox {self.path} cannot be opened again")
         return self._connection
 
     def _select(self, where: str, *parameters: int) -> list[OutboxMessage]:
         rows = self._open_connection().execute(
-            f"SELECT sequence, topic, payload, retain FROM messages {where}",  # noqa: S608  constants only
+            f"SELECT sequence, topic, payload, retain, checksum FROM messages {where}",  # noqa: S608  constants only
             parameters,
         )
-        return [
-            OutboxMessage(sequence, topic, payload, bool(retain)) for sequence, topic, payload, retain in rows
-        ]
+        messages = []
+        for sequence, topic, payload, retain, told in rows:
+            # Files of the first version have no checksums.
+            if told is not None and told != checksum(sequence, topic, payload):
+                raise corruption(f"message {sequence} has changed on the disk")
+            messages.append(OutboxMessage(sequence, topic, payload, bool(retain)))
+        return messages
 
-    def _trim(self, connection: sqlite3.Connection, marked: int) -> None:
-        self._sent_since_trim += marked
-        if self._sent_since_trim < min(TRIM_EVERY, self._keep_sent + 1):
-            return
+    def _trim(self, connection: sqlite3.Connection) -> None:
+        """Delete the oldest of what is sent and beyond the limits; a bounded amount of work."""
         self._sent_since_trim = 0
-        connection.execute(
-            """
-            DELETE FROM messages WHERE sent
-            AND sequence <= (SELECT sequence FROM messages WHERE sent
-                             ORDER BY sequence DESC LIMIT 1 OFFSET ?)
-            AND sequence NOT IN (SELECT max(sequence) FROM messages WHERE retain GROUP BY topic)
-            """,
-            (self._keep_sent,),
-        )
-
-    def _read_mark(self) -> int:
-        try:
-            return int(self._mark_path.read_text(encoding="ascii"))
-        except FileNotFoundError:
-            return 0
-        except ValueError:
-            log.warning(
-                "outbox mark %s is not a number; sequence numbers start by the wall clock", self._mark_path
-            )
-            return 0
-
-    def _advance_mark(self, sequence: int) -> None:
-        """Keep the mark ahead of every number in use, durably, before the number is used."""
-        if sequence <= self._mark:
-            return
-        mark = sequence + MARK_STEP
-        draft = self._mark_path.with_name(self._mark_path.name + ".new")
-        with draft.open("w", encoding="ascii") as file:
-            file.write(str(mark))
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(self._mark_path)
-        self._mark = mark
+        oldest_ns = self._wall_ns() - self._limits.alarms_keep_ns
+        newest = connection.execute(
+            "SELECT sequence FROM messages WHERE sent ORDER BY sequence DESC LIMIT 1 OFFSET ?",
+            (self._limits.alarms_keep_at_least,),
+        ).fetchone()
+        spare_from = newest[0] if newest else 0
+        for _ in range(TRIM_AT_MOST // TRIM_EVERY):
+            rows = connection.execute(
+                "SELECT sequence, wall_ns FROM messages "  # noqa: S608  constants only
+                f"WHERE sent AND sequence NOT IN ({_IS_LATEST}) ORDER BY sequence LIMIT {TRIM_EVERY}"
+            ).fetchall()
+            if used_bytes(connection) <= self._limits.alarms_max_bytes:
+                rows = [(s, wall_ns) for s, wall_ns in rows if s <= spare_from and wall_ns < oldest_ns]
+            if not rows:
+                break
+            connection.executemany("DELETE FROM messages WHERE sequence = ?", [(s,) for s, _ in rows])
+        if pragma(connection, "freelist_count") > SLACK_PAGES:
+            connection.execute(f"PRAGMA incremental_vacuum({SLACK_PAGES // 8})").fetchall()
 
 
-def is_corrupt(error: Exception) -> bool:
-    """Whether an error says that the file itself is broken, rather than the disk full or busy."""
-    code = getattr(error, "sqlite_errorcode", None)
-    return code is not None and code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-
-
-def _corruption(verdict: str) -> sqlite3.DatabaseError:
-    error = sqlite3.DatabaseError(verdict)
-    error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
-    return error
+@contextlib.contextmanager
+def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """All or nothing, durable when it ends."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise

@@ -1,0 +1,69 @@
+"""What the outbox has done, for the status that the service publishes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(slots=True)
+class TelemetryCounters:
+    """What became of telemetry since the outbox was opened.
+
+    Attributes:
+        accepted: messages taken in.
+        sent: messages that the broker has taken.
+        depth: messages kept for the broker.
+        dropped_full: the oldest ones, dropped because the limit in bytes was reached or the disk nearly full.
+        dropped_old: messages dropped because they were too old.
+        dropped_disk: messages that a broken or unwritable file cost, as far as they could be counted.
+        write_errors: transactions that failed.
+        quarantined: corrupt files set aside.
+        in_memory: 1 while the file cannot be used and telemetry is kept in memory, else 0.
+    """
+
+    accepted: int = 0
+    sent: int = 0
+    depth: int = 0
+    dropped_full: int = 0
+    dropped_old: int = 0
+    dropped_disk: int = 0
+    write_errors: int = 0
+    quarantined: int = 0
+    in_memory: int = 0
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped for whatever reason."""
+        return self.dropped_full + self.dropped_old + self.dropped_disk
+
+
+@dataclass(slots=True)
+class OutboxCounters:
+    """What the outbox has done since it was opened.
+
+    Attributes:
+        appended: messages committed.
+        sent: messages that the broker has acknowledged.
+        depth: messages on disk that the broker has not acknowledged.
+        waiting: messages in memory that are not on disk yet.
+        write_errors: transactions that failed and were tried again.
+        read_errors: reads that failed and were tried again.
+        quarantined: corrupt files set aside.
+        vanished: numbers that had been given to messages on disk which the file no longer knew when it
+            was opened: it was damaged, or is an older copy.
+        refused: messages refused because too many waited in memory for a disk that cannot be written.
+        lost: messages that never reached the disk because the outbox was closed while it could not write.
+        telemetry: what became of telemetry.
+    """
+
+    appended: int = 0
+    sent: int = 0
+    depth: int = 0
+    waiting: int = 0
+    write_errors: int = 0
+    read_errors: int = 0
+    quarantined: int = 0
+    vanished: int = 0
+    refused: int = 0
+    lost: int = 0
+    telemetry: TelemetryCounters = field(default_factory=TelemetryCounters)

@@ -1,0 +1,182 @@
+"""Files of the outbox: durable names, one owner, connections that are checked, the corrupt set aside."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+from typing import TYPE_CHECKING
+
+from daqsvc.outbox.messages import OutboxError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import BinaryIO
+
+SIDE_FILES = ("", "-wal", "-shm")
+"""Suffixes of the files that make up one SQLite database."""
+
+WAL_PAGES = 1000
+"""Pages in the write-ahead log from which on they are moved to the database: about 4 MiB."""
+
+WAL_MAX_BYTES = 8 * 1024 * 1024
+"""The write-ahead log is cut to this when it starts anew."""
+
+ASIDE_KEPT = 3
+"""Corrupt files that are kept; a failing disk must not fill itself with them."""
+
+NS_PER_MS = 1_000_000
+
+
+def sync_directory(directory: Path) -> None:
+    """Make new, renamed and deleted names in ``directory`` survive a power cut."""
+    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def make_directory(directory: Path) -> None:
+    """Create ``directory`` and what is missing above it, durably."""
+    if directory.is_dir():
+        return
+    make_directory(directory.parent)
+    directory.mkdir(exist_ok=True)
+    sync_directory(directory.parent)
+
+
+def replace_durably(path: Path, content: bytes) -> None:
+    """Give ``path`` a new content: after a power cut it has either the old or the new one, whole."""
+    draft = path.with_name(path.name + ".new")
+    with draft.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)
+    sync_directory(path.parent)
+
+
+def take_possession(path: Path) -> BinaryIO:
+    """Keep other processes out of the store: two writers would give the same numbers and fight at the broker.
+
+    The system gives the lock back however this process ends.
+
+    Args:
+        path: the lock file.
+
+    Raises:
+        OutboxError: another process has it.
+    """
+    lock = path.open("ab")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        raise OutboxError(
+            f"another daqsvc uses the store {path.parent}; stop it, or give this one a directory of its own"
+        ) from None
+    except BaseException:
+        lock.close()
+        raise
+    return lock
+
+
+def connect(path: Path | str, *, synchronous: str) -> sqlite3.Connection:
+    """A connection for one writer, the file checked.
+
+    Args:
+        path: the database; ``":memory:"`` for one without a file.
+        synchronous: ``"FULL"`` to have each commit on the disk, ``"OFF"`` to leave it to the system.
+
+    Raises:
+        sqlite3.Error: the file is corrupt (see `is_corrupt`) or cannot be used.
+    """
+    connection = sqlite3.connect(path, isolation_level=None, timeout=5.0)
+    try:
+        # Before anything is written: it decides how a new file is laid out.
+        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute(f"PRAGMA synchronous = {synchronous}")
+        connection.execute(f"PRAGMA wal_autocheckpoint = {WAL_PAGES}")
+        connection.execute(f"PRAGMA journal_size_limit = {WAL_MAX_BYTES}")
+        _check(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _check(connection: sqlite3.Connection) -> None:
+    verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if verdict != "ok":
+        raise corruption(str(verdict))
+
+
+def pragma(connection: sqlite3.Connection, name: str) -> int:
+    """The value of a numeric pragma."""
+    value: int = connection.execute(f"PRAGMA {name}").fetchone()[0]
+    return value
+
+
+def used_bytes(connection: sqlite3.Connection) -> int:
+    """What the database needs on the disk, but for free pages and the write-ahead log."""
+    pages = pragma(connection, "page_count") - pragma(connection, "freelist_count")
+    return pages * pragma(connection, "page_size")
+
+
+def free_bytes(directory: Path) -> int:
+    """What this process may still write on the disk of ``directory``."""
+    disk = os.statvfs(directory)
+    return disk.f_bavail * disk.f_frsize
+
+
+def set_aside(path: Path, wall_ns: int) -> Path:
+    """Rename a corrupt database; the oldest of more than `ASIDE_KEPT` such files are deleted.
+
+    Returns:
+        The new name.
+    """
+    stamp = wall_ns // NS_PER_MS
+    while (aside := path.with_name(f"{path.name}.corrupt-{stamp}")).exists():
+        stamp += 1
+    for suffix in SIDE_FILES:
+        part = path.with_name(path.name + suffix)
+        if part.exists():
+            part.rename(aside.with_name(aside.name + suffix))
+    earlier = [
+        old for old in path.parent.glob(f"{path.name}.corrupt-*") if not old.name.endswith(SIDE_FILES[1:])
+    ]
+    for old in sorted(earlier, key=lambda old: old.stat().st_mtime_ns)[:-ASIDE_KEPT]:
+        if old != aside:
+            delete(old)
+    sync_directory(path.parent)
+    return aside
+
+
+def delete(path: Path) -> None:
+    """Delete a database."""
+    for suffix in SIDE_FILES:
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
+def is_corrupt(error: Exception) -> bool:
+    """Whether an error says that the file itself is broken, rather than the disk full or busy."""
+    return _primary_code(error) in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+
+
+def is_full(error: Exception) -> bool:
+    """Whether an error says that there is no room left on the disk."""
+    return _primary_code(error) == sqlite3.SQLITE_FULL
+
+
+def corruption(verdict: str) -> sqlite3.DatabaseError:
+    """The error that says that a file is corrupt."""
+    error = sqlite3.DatabaseError(verdict)
+    error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+    return error
+
+
+def _primary_code(error: Exception) -> int | None:
+    code = getattr(error, "sqlite_errorcode", None)
+    return None if code is None else code & 0xFF

@@ -1,0 +1,34 @@
+"""How much the outbox may keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MIB = 1024 * 1024
+NS_PER_DAY = 86_400 * 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutboxLimits:
+    """Bounds of the two classes of messages. What is not sent of the alarms has none but the disk.
+
+    Attributes:
+        alarms_max_bytes: size of the alarms' file from which on the oldest messages that the broker has are
+            deleted. The latest retained message of each topic, and what is not sent, is always kept.
+        alarms_keep_ns: age by the wall clock from which on messages that the broker has are deleted.
+        alarms_keep_at_least: so many of the newest messages are kept whatever their age, so that a wall
+            clock that is wrong for a while does not cost the history.
+        alarms_waiting_max: messages that may wait in memory while the disk cannot be written; further ones
+            are refused, loudly. One takes about 4 KiB, so that 16,384 of them take about 64 MiB.
+        telemetry_max_bytes: size of the telemetry's file from which on the oldest messages are dropped.
+        telemetry_max_age_ns: age from which on a telemetry message is dropped.
+        reserve_bytes: free space that telemetry leaves on the disk to the alarms.
+    """
+
+    alarms_max_bytes: int = 256 * MIB
+    alarms_keep_ns: int = 90 * NS_PER_DAY
+    alarms_keep_at_least: int = 1000
+    alarms_waiting_max: int = 16_384
+    telemetry_max_bytes: int = 64 * MIB
+    telemetry_max_age_ns: int = NS_PER_DAY
+    reserve_bytes: int = 64 * MIB

@@ -1,0 +1,75 @@
+"""What the outbox holds, and what it raises."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class OutboxError(Exception):
+    """The outbox cannot do what it was asked to; the text names the file and the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxMessage:
+    """A message that is on disk.
+
+    Attributes:
+        sequence: its number, never used twice.
+        topic: MQTT topic.
+        payload: the bytes to publish.
+        retain: whether the broker keeps it as the latest of its topic.
+    """
+
+    sequence: int
+    topic: str
+    payload: bytes
+    retain: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetryMessage:
+    """A message that may be dropped: the oldest first if there is no room, all when they are too old.
+
+    Attributes:
+        number: its place in the order; grows while the service runs.
+        topic: MQTT topic.
+        payload: the bytes to publish.
+        expires_ns: when it is of no use any more, on the monotonic clock.
+    """
+
+    number: int
+    topic: str
+    payload: bytes
+    expires_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A message on its way to the disk, whose payload wants to know its number."""
+
+    topic: str
+    payload_of_sequence: Callable[[int], bytes]
+    retain: bool
+
+    def message(self, sequence: int) -> OutboxMessage:
+        """The message under this number.
+
+        Raises:
+            TypeError: the payload is not bytes.
+            Exception: whatever the payload's own function raises.
+        """
+        payload = self.payload_of_sequence(sequence)
+        if not isinstance(payload, bytes):
+            raise TypeError(f"the payload for {self.topic} is of type {type(payload).__name__}; give bytes")
+        self.topic.encode()  # or the database refuses it later, for all others of the commit as well
+        return OutboxMessage(sequence, self.topic, payload, self.retain)
+
+
+def checksum(number: int, topic: str, payload: bytes) -> int:
+    """CRC-32 over what must not change on the disk; `PRAGMA quick_check` sees no flipped bit in a payload."""
+    return zlib.crc32(payload, zlib.crc32(f"{number} {topic}\n".encode()))

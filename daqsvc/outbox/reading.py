@@ -1,0 +1,175 @@
+"""The journal of alarms for other processes: read-only, while the service runs and while it does not.
+
+Nothing is created or changed in the store. That matters: a file that an administrator's command leaves
+behind there belongs to the administrator, and the service could not open it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from daqsvc.outbox.files import pragma
+from daqsvc.outbox.journal import SCHEMA_VERSION
+from daqsvc.outbox.messages import OutboxError, checksum
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+JOURNAL_NAME = "outbox.sqlite"
+"""What the service calls the journal in its store."""
+
+_COLUMNS = "sequence, topic, payload, retain, sent, wall_ns, checksum"
+
+
+@dataclass(frozen=True, slots=True)
+class JournalEntry:
+    """A message of the journal.
+
+    Attributes:
+        sequence: its number.
+        topic: MQTT topic.
+        payload: the bytes published, or to be published.
+        retain: whether it is a state, of which the latest of each topic counts.
+        sent: whether the broker has acknowledged it.
+        wall_ns: when it was written, ns since the Unix epoch by the wall clock of then.
+    """
+
+    sequence: int
+    topic: str
+    payload: bytes
+    retain: bool
+    sent: bool
+    wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class JournalView:
+    """What the journal told at one moment.
+
+    Attributes:
+        latest: the latest state of each topic, in order.
+        history: the newest messages, the newest last.
+        unsent: how many messages the broker has not acknowledged.
+        damaged: messages left out because they have changed on the disk.
+    """
+
+    latest: tuple[JournalEntry, ...]
+    history: tuple[JournalEntry, ...]
+    unsent: int
+    damaged: int
+
+
+def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -> JournalView:
+    """Read the journal of a service; blocks.
+
+    Args:
+        store: the service's directory.
+        history: how many messages of the past at most.
+        topic: only messages on this topic count; None for all.
+
+    Raises:
+        OutboxError: there is none, or it cannot be read; the text says what to do.
+    """
+    path = store / JOURNAL_NAME
+    try:
+        with _opened(path) as connection:
+            connection.execute("BEGIN")  # all that follows tells of one moment
+            return _view(path, connection, history, topic)
+    except FileNotFoundError:
+        raise OutboxError(
+            f"there is no journal {path}: the service has not run with this store yet, or keeps it "
+            f"elsewhere; see `directory` in [store] of its machine file"
+        ) from None
+    except PermissionError as error:
+        raise OutboxError(
+            f"the journal {path} may not be read: {error.strerror}; run this as the service's user or as root"
+        ) from error
+    except (sqlite3.Error, OSError) as error:
+        raise OutboxError(
+            f"the journal {path} cannot be read: {error}; the service sets a corrupt one aside when it starts"
+        ) from error
+
+
+def _view(path: Path, connection: sqlite3.Connection, history: int, topic: str | None) -> JournalView:
+    version = pragma(connection, "user_version")
+    if version != SCHEMA_VERSION:
+        raise OutboxError(
+            f"the journal {path} has schema version {version}, this program reads {SCHEMA_VERSION}; "
+            + (
+                "use the program that the service runs"
+                if version > SCHEMA_VERSION
+                else "start the service once"
+            )
+        )
+    wanted, parameters = ("", []) if topic is None else ("WHERE topic = ?", [topic])
+    newest = connection.execute(
+        f"SELECT {_COLUMNS} FROM messages {wanted} ORDER BY sequence DESC LIMIT ?",  # noqa: S608  constants only
+        [*parameters, history],
+    ).fetchall()
+    latest = connection.execute(
+        f"SELECT {_COLUMNS} FROM messages WHERE sequence IN "  # noqa: S608  constants only
+        f"(SELECT sequence FROM latest {wanted}) ORDER BY sequence",
+        parameters,
+    ).fetchall()
+    unsent = connection.execute("SELECT count(*) FROM messages WHERE NOT sent").fetchone()[0]
+    sound_latest, sound_history = _sound(latest), _sound(reversed(newest))
+    bad = {row[0] for row in [*latest, *newest]} - {e.sequence for e in [*sound_latest, *sound_history]}
+    return JournalView(tuple(sound_latest), tuple(sound_history), unsent, len(bad))
+
+
+def _sound(rows: Iterable[tuple[int, str, bytes, int, int, int, int | None]]) -> list[JournalEntry]:
+    return [
+        JournalEntry(sequence, topic, payload, bool(retain), bool(sent), wall_ns)
+        for sequence, topic, payload, retain, sent, wall_ns, told in rows
+        if told is None or told == checksum(sequence, topic, payload)
+    ]
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """A connection that leaves no trace.
+
+    A service that runs, or was killed, leaves a write-ahead log and its index beside the journal: these are
+    read as they are. Without a log, all there is stands in the file itself. A log without an index (a copy, a
+    read-only file system) can only be read where an index can be made: in a copy.
+
+    Raises:
+        OSError: a file is not there or must not be read.
+        sqlite3.Error: it cannot be opened.
+    """
+    path.open("rb").close()  # SQLite would not say why it cannot
+    log, index = (path.with_name(path.name + suffix) for suffix in ("-wal", "-shm"))
+    if not log.exists() or log.stat().st_size == 0:
+        with contextlib.closing(_connect(path, "immutable=1")) as connection:
+            yield connection
+        return
+    log.open("rb").close()
+    if index.exists():
+        connection = _connect(path, "mode=ro")
+        try:
+            connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        except sqlite3.OperationalError:
+            connection.close()  # the index cannot be used here; what follows does without
+        else:
+            with contextlib.closing(connection):
+                yield connection
+            return
+    with tempfile.TemporaryDirectory(prefix="daqsvc-") as copies:
+        copy = Path(copies) / path.name
+        for part in (path, log):
+            shutil.copyfile(part, copy.with_name(part.name))
+        with contextlib.closing(_connect(copy, "mode=rw")) as connection:
+            yield connection
+
+
+def _connect(path: Path, how: str) -> sqlite3.Connection:
+    return sqlite3.connect(
+        f"file:{quote(str(path.absolute()))}?{how}", uri=True, isolation_level=None, timeout=5.0
+    )
