@@ -5,25 +5,41 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import ssl
 import threading
 from typing import TYPE_CHECKING, Any
 
 import aiomqtt
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import AsyncIterator
 
-    from paho.mqtt.client import Client, DisconnectFlags
-    from paho.mqtt.properties import Properties
+    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
     from paho.mqtt.reasoncodes import ReasonCode
 
-# paho and aiomqtt tell about every broken connection; the publisher does that once, in its own words.
+# paho and aiomqtt tell about every broken connection, and about every message above ten under way; the
+# publisher says once, in its own words, what matters of it.
 _LIBRARY_LOG = logging.getLogger(f"{__name__}.library")
 _LIBRARY_LOG.setLevel(logging.CRITICAL)
 
 CONSENT_S = 5.0
 """How long the broker may take to accept or refuse a connection."""
+
+PUBACK_S = 10.0
+"""How long the broker may take to acknowledge a message."""
+
+INCOMING = 64
+"""Messages from the broker that may wait to be looked at; a flood of them is dropped and counted."""
+
+LARGEST_PACKET = 1 << 20
+"""Bytes of the largest packet that an MQTT 5 broker may send to the box."""
+
+_SESSION_TAKEN_OVER = 142
+_FAILURE = 128
 
 
 class NoConsentError(aiomqtt.MqttError):
@@ -34,29 +50,12 @@ class PublishRefusedError(aiomqtt.MqttError):
     """The broker has answered a publication with a reason why it will not take it (MQTT 5 only)."""
 
 
-def tls_context(ca_file: Path | None) -> ssl.SSLContext:
-    """A context that verifies the broker's certificate and host name; reads files.
-
-    Args:
-        ca_file: certificate authorities in PEM; None for those of the system.
-
-    Raises:
-        OSError: the file cannot be read, or holds no certificate.
-    """
-    context = ssl.create_default_context(cafile=ca_file)
-    context.sslsocket_class = _TidySocket
-    return context
+class SilentBrokerError(aiomqtt.MqttError):
+    """The connection stands, but no acknowledgement came over it in time."""
 
 
-class _TidySocket(ssl.SSLSocket):
-    """Closes itself when the handshake fails; paho would leave it to the garbage collector."""
-
-    def do_handshake(self, block: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        try:
-            super().do_handshake(block)
-        except BaseException:
-            self.close()
-            raise
+class TakenOverError(aiomqtt.MqttError):
+    """Another client has connected with the same client id."""
 
 
 class Connection(aiomqtt.Client):
@@ -69,20 +68,37 @@ class Connection(aiomqtt.Client):
       the end of the process.
     - A connection that ends before the broker's consent is an error at once, not after a time limit.
     - `deliver` raises on a negative PUBACK, which the base class takes for a good one, and when the
-      connection is lost.
+      connection is lost. It keeps to the in-flight window of the broker, if that is the smaller one.
     - `abandon` lets go of a connection that cannot be closed politely.
 
     Args:
         hostname: of the broker.
         port: of the broker.
         in_flight: how many messages may wait for their PUBACK at a time.
+        protocol: MQTT version.
         options: further arguments of `aiomqtt.Client`.
     """
 
-    def __init__(self, hostname: str, port: int, *, in_flight: int, **options: Any) -> None:
-        super().__init__(hostname, port, logger=_LIBRARY_LOG, max_inflight_messages=in_flight, **options)
-        self.pending_calls_threshold = in_flight
-        self._refused: asyncio.Future[ReasonCode] = self._loop.create_future()
+    def __init__(
+        self, hostname: str, port: int, *, in_flight: int, protocol: aiomqtt.ProtocolVersion, **options: Any
+    ) -> None:
+        self.is_mqtt5 = protocol is aiomqtt.ProtocolVersion.V5
+        if self.is_mqtt5:
+            options["properties"] = _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET)
+        super().__init__(
+            hostname,
+            port,
+            logger=_LIBRARY_LOG,
+            protocol=protocol,
+            max_inflight_messages=in_flight,
+            max_queued_incoming_messages=INCOMING,
+            **options,
+        )
+        self.overlooked = 0
+        self._in_flight = in_flight
+        self._window = asyncio.Semaphore(in_flight)
+        self._acknowledgements: dict[int, asyncio.Future[ReasonCode]] = {}
+        self._disconnected.add_done_callback(self._give_up)
         self._abandoned = False
 
     async def open(self) -> None:
@@ -97,27 +113,104 @@ class Connection(aiomqtt.Client):
         threading.Thread(target=self._reach, args=(reached,), name="mqtt-connect", daemon=True).start()
         try:
             await reached
-            await self._first_of(self._connected, CONSENT_S)
-        except BaseException:
+            async with asyncio.timeout(CONSENT_S):
+                await self._connected
+        except BaseException as error:
             self.abandon()
+            if isinstance(error, TimeoutError):
+                raise NoConsentError(f"the broker did not answer within {CONSENT_S:g} s") from error
             raise
 
-    async def deliver(self, topic: str, payload: bytes, *, retain: bool) -> None:
+    async def deliver(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        retain: bool,
+        expiry_s: float | None = None,
+        correlation: bytes | None = None,
+    ) -> None:
         """Publish with QoS 1 and wait for the PUBACK.
 
+        Args:
+            topic: MQTT topic.
+            payload: the bytes.
+            retain: whether the broker shall keep it as the latest of its topic.
+            expiry_s: when the broker shall drop it undelivered (MQTT 5 only); None for never.
+            correlation: what the asker wants to see again in the answer (MQTT 5 only).
+
         Raises:
-            PublishRefusedError: the broker will not take it.
-            aiomqtt.MqttError: the connection is lost, or no PUBACK came in time.
+            PublishRefusedError: the broker will not take it; the connection stands.
+            SilentBrokerError: no PUBACK came in time.
+            aiomqtt.MqttError: the connection is lost.
         """
-        publication = asyncio.ensure_future(self.publish(topic, payload, qos=1, retain=retain))
-        try:
-            await self._first_of(publication, None)
-        finally:
-            publication.cancel()
+        async with self._window:
+            if self._disconnected.done():
+                raise self._loss()
+            info = self._client.publish(topic, payload, 1, retain, self._told(expiry_s, correlation))
+            if info.rc != 0:
+                raise aiomqtt.MqttCodeError(info.rc, "could not publish")
+            acknowledged = self._loop.create_future()
+            self._acknowledgements[info.mid] = acknowledged
+            try:
+                async with asyncio.timeout(PUBACK_S):
+                    answer: ReasonCode = await acknowledged
+            except TimeoutError:
+                raise SilentBrokerError(f"no PUBACK within {PUBACK_S:g} s") from None
+            finally:
+                self._acknowledgements.pop(info.mid, None)
+        if answer.is_failure:
+            raise PublishRefusedError(f"the broker refuses messages: {answer}")
+
+    async def watch(self, *topics: str, fresh_only: bool = False) -> list[str]:
+        """Subscribe with QoS 1.
+
+        Args:
+            topics: topic filters.
+            fresh_only: leave out what is retained at the broker (MQTT 5 only).
+
+        Returns:
+            Those that the broker does not grant.
+
+        Raises:
+            aiomqtt.MqttError: the connection is lost, or no SUBACK came in time.
+        """
+        refused = []
+        for topic in topics:
+            if self.is_mqtt5:
+                never = SubscribeOptions.RETAIN_DO_NOT_SEND
+                handling = never if fresh_only else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
+                options = SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=handling)
+                granted = await self.subscribe(topic, options=options)
+            else:
+                granted = await self.subscribe(topic, qos=1)
+            if any(_value(code) >= _FAILURE for code in granted):
+                refused.append(topic)
+        return refused
+
+    async def incoming(self) -> AsyncIterator[aiomqtt.Message]:
+        """What the broker sends for the subscriptions.
+
+        Raises:
+            aiomqtt.MqttError: the connection is lost.
+        """
+        async for message in self.messages:
+            yield message
+
+    @property
+    def shown_certificate(self) -> bytes | None:
+        """The broker's certificate, DER; None without TLS."""
+        wire = self._client.socket()
+        return wire.getpeercert(binary_form=True) if isinstance(wire, ssl.SSLSocket) else None
 
     async def lost(self) -> None:
-        """Wait until the connection is lost, however it ends."""
+        """Wait until the connection is lost.
+
+        Raises:
+            aiomqtt.MqttError: it is, however it ended.
+        """
         await asyncio.wait({self._disconnected})
+        raise self._loss()
 
     async def close(self, timeout_s: float) -> None:
         """Say goodbye to the broker, which drops the last will; let go after ``timeout_s`` at most."""
@@ -134,18 +227,29 @@ class Connection(aiomqtt.Client):
             if future.done() and not future.cancelled():
                 future.exception()  # looked at, so that asyncio does not report it as never retrieved
 
-    async def _first_of(self, wanted: asyncio.Future[None], timeout_s: float | None) -> None:
-        """Wait for ``wanted`` unless the connection ends, the broker refuses, or time runs out."""
-        ends: set[asyncio.Future[Any]] = {wanted, self._refused, self._disconnected}
-        await asyncio.wait(ends, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
-        if wanted.done():
-            wanted.result()
-        elif self._refused.done():
-            raise PublishRefusedError(f"the broker refuses messages: {self._refused.result()}")
-        elif self._disconnected.done():
-            raise aiomqtt.MqttError(f"connection lost: {self._disconnected.exception() or 'closed'}")
-        else:
-            raise NoConsentError(f"the broker did not answer within {timeout_s:g} s")
+    def _told(self, expiry_s: float | None, correlation: bytes | None) -> Properties | None:
+        """What MQTT 5 can say about a message."""
+        if not self.is_mqtt5 or (expiry_s is None and correlation is None):
+            return None
+        told: dict[str, Any] = {}
+        if expiry_s is not None:
+            told["MessageExpiryInterval"] = max(math.ceil(expiry_s), 1)
+        if correlation is not None:
+            told["CorrelationData"] = correlation
+        return _properties(PacketTypes.PUBLISH, **told)
+
+    def _loss(self) -> aiomqtt.MqttError:
+        """Why the connection has ended."""
+        error = self._disconnected.exception() if self._disconnected.done() else None
+        if _value(getattr(error, "rc", None)) == _SESSION_TAKEN_OVER:
+            return TakenOverError("another client has connected with the same client_id")
+        return aiomqtt.MqttError(f"connection lost: {error or 'closed'}")
+
+    def _give_up(self, _disconnected: object) -> None:
+        """Nothing that is under way will be acknowledged any more."""
+        for waiting in self._acknowledgements.values():
+            if not waiting.done():
+                waiting.set_exception(self._loss())
 
     def _reach(self, reached: asyncio.Future[None]) -> None:
         """The blocking part, on a thread of its own."""
@@ -166,13 +270,37 @@ class Connection(aiomqtt.Client):
         else:
             reached.set_result(None)
 
-    def _on_publish(
-        self, client: Client, userdata: Any, mid: int, reason_code: ReasonCode, properties: Properties
+    def _on_connect(
+        self,
+        client: Client,
+        userdata: Any,
+        flags: ConnectFlags,
+        reason_code: ReasonCode,
+        properties: Properties | None = None,
     ) -> None:
-        if not reason_code.is_failure:
-            super()._on_publish(client, userdata, mid, reason_code, properties)
-        elif not self._refused.done():
-            self._refused.set_result(reason_code)
+        # paho does not keep to the broker's window, and the broker ends a connection that exceeds it.
+        least = min(getattr(properties, "ReceiveMaximum", self._in_flight), self._in_flight)
+        if not self._connected.done() and least < self._in_flight:
+            self._window = asyncio.Semaphore(least)
+        super()._on_connect(client, userdata, flags, reason_code, properties)
+
+    def _on_message(self, client: Client, userdata: Any, message: MQTTMessage) -> None:
+        if self._queue.full():
+            self.overlooked += 1
+        else:
+            super()._on_message(client, userdata, message)
+
+    def _on_publish(
+        self,
+        client: Client,  # noqa: ARG002
+        userdata: Any,  # noqa: ARG002
+        mid: int,
+        reason_code: ReasonCode,
+        properties: Properties,  # noqa: ARG002
+    ) -> None:
+        waiting = self._acknowledgements.get(mid)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(reason_code)
 
     def _on_disconnect(
         self,
@@ -186,3 +314,16 @@ class Connection(aiomqtt.Client):
             self._connected.set_exception(NoConsentError("the broker closed the connection at once"))
             return
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
+
+
+def _properties(packet: int, **values: Any) -> Properties:
+    made = Properties(packet)  # type: ignore[no-untyped-call]
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
+def _value(code: object) -> int:
+    """The number of a reason code, whatever dress paho gives it; 0 for none."""
+    number = getattr(code, "value", code)
+    return number if isinstance(number, int) else 0

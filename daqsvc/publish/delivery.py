@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daqsvc.outbox.store import Outbox, OutboxMessage
+    from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.outbox.store import Outbox
     from daqsvc.publish.connection import Connection
 
 IN_FLIGHT = 20
@@ -32,7 +33,7 @@ class Delivery:
         base: what the topics of this box begin with; retained states of others are left alone.
         stopping: ends the delivery as soon as nothing is left.
         on_sent: called for each message handed to the broker.
-        on_acknowledged: called for each PUBACK.
+        on_acknowledged: called with each message for which a PUBACK came.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class Delivery:
         base: str,
         stopping: asyncio.Event,
         on_sent: Callable[[], None],
-        on_acknowledged: Callable[[], None],
+        on_acknowledged: Callable[[OutboxMessage], None],
     ) -> None:
         self._outbox = outbox
         self._connection = connection
@@ -51,7 +52,7 @@ class Delivery:
         self._on_sent = on_sent
         self._on_acknowledged = on_acknowledged
         self._ready: deque[OutboxMessage] = deque()
-        self._under_way: deque[tuple[int, asyncio.Task[None]]] = deque()
+        self._under_way: deque[tuple[OutboxMessage, asyncio.Task[None]]] = deque()
         self._arriving: asyncio.Task[list[OutboxMessage]] | None = None
         self._read_to = 0
 
@@ -87,7 +88,7 @@ class Delivery:
         while self._ready and len(self._under_way) < IN_FLIGHT:
             message = self._ready.popleft()
             delivery = self._connection.deliver(message.topic, message.payload, retain=message.retain)
-            self._under_way.append((message.sequence, asyncio.create_task(delivery)))
+            self._under_way.append((message, asyncio.create_task(delivery)))
             self._on_sent()
 
     async def _wait(self, stopping: asyncio.Task[Any]) -> None:
@@ -107,8 +108,8 @@ class Delivery:
             self._read_to = self._ready[-1].sequence
             self._arriving = None
         while self._under_way and self._under_way[0][1].done():
-            sequence, task = self._under_way[0]
+            message, task = self._under_way[0]
             task.result()
             self._under_way.popleft()
-            self._outbox.mark_sent(sequence)
-            self._on_acknowledged()
+            self._outbox.mark_sent(message.sequence)
+            self._on_acknowledged(message)

@@ -1,107 +1,69 @@
-"""The publisher: alarms from the outbox at least once and in order, telemetry as it comes."""
+"""The publisher: keeps a connection to one broker, through outages, rotations and rivals."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
-from dataclasses import dataclass
+from dataclasses import asdict
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import aiomqtt
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
-from daqsvc.publish.connection import Connection, NoConsentError, tls_context
-from daqsvc.publish.delivery import IN_FLIGHT, Delivery
+from daqsvc.publish.certificates import certificate, voucher
+from daqsvc.publish.command_intake import CommandIntake
+from daqsvc.publish.connection import (
+    PUBACK_S,
+    Connection,
+    NoConsentError,
+    PublishRefusedError,
+    SilentBrokerError,
+    TakenOverError,
+)
+from daqsvc.publish.counters import PublishCounters
+from daqsvc.publish.credentials import read_credentials
+from daqsvc.publish.delivery import IN_FLIGHT
+from daqsvc.publish.home_assistant_link import HomeAssistantLink
 from daqsvc.publish.payloads import availability_payload
+from daqsvc.publish.session import CredentialsReplacedError, Session
+from daqsvc.publish.settings import MqttSettings
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
-    import ssl
-    from collections.abc import Coroutine
-    from pathlib import Path
+    from collections.abc import Coroutine, Mapping
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import CommandHandler
     from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.credentials import Credentials
+
+__all__ = ["MqttPublisher", "MqttSettings", "PublishCounters"]
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
 STABLE_S = 10.0
-"""A connection that lasted this long has earned a quick first retry."""
+"""A connection that was of use for this long has earned a quick first retry."""
 
 FIRST_RETRY_NS = 800_000_000
 """Ceiling of the first wait after a loss."""
 
+TAKEN_OVER_S = 60.0
+"""Least wait after another client has come with the same client id: two that fight help nobody."""
+
 GOODBYE_S = 0.3
 """What saying goodbye may take of the time to stop."""
+
+NS_PER_DAY = 86_400 * NS_PER_S
 
 _UNSUPPORTED_PROTOCOL_VERSION = 132
 
 
-@dataclass(frozen=True, slots=True)
-class MqttSettings:
-    """How to reach the broker.
-
-    Attributes:
-        host: host name or address of the broker.
-        port: TCP port.
-        tls: whether to use TLS; the broker's certificate and host name are always verified.
-        ca_file: certificate authorities in PEM; None for those of the system.
-        client_id: MQTT client id, unique at the broker.
-        username: None for an anonymous connection.
-        password_file: file with the password; read again for every connection.
-        keepalive_s: MQTT keep-alive.
-        topic_root: first part of every topic.
-        protocol: MQTT version; ``"auto"`` asks for 5 and takes 3.1.1 if the broker knows no better.
-    """
-
-    host: str
-    port: int
-    client_id: str
-    tls: bool = False
-    ca_file: Path | None = None
-    username: str | None = None
-    password_file: Path | None = None
-    keepalive_s: int = 30
-    topic_root: str = "daqsvc"
-    protocol: Literal["auto", "5", "3.1.1"] = "auto"
-
-
-@dataclass(slots=True)
-class PublishCounters:
-    """What the publisher has done.
-
-    Attributes:
-        connected: whether there is a connection now.
-        connections: how many there have been.
-        published: QoS 1 messages handed to the broker, repeats included.
-        acknowledged: QoS 1 messages for which a PUBACK came.
-        telemetry_sent: QoS 0 messages handed to the broker.
-        telemetry_dropped: QoS 0 messages dropped: the oldest ones because there was no broker, or what
-            was left when the publisher stopped.
-    """
-
-    connected: bool = False
-    connections: int = 0
-    published: int = 0
-    acknowledged: int = 0
-    telemetry_sent: int = 0
-    telemetry_dropped: int = 0
-
-    def count_published(self) -> None:
-        """One more was handed to the broker."""
-        self.published += 1
-
-    def count_acknowledged(self) -> None:
-        """One more PUBACK came."""
-        self.acknowledged += 1
-
-
 class MqttPublisher:
-    """Publishes the outbox and telemetry to one broker, through its outages.
+    """Publishes the outbox to one broker, through its outages, and takes commands from there.
 
     `run` is the one task of it. Connecting, waiting and keep-alive go by real time, whatever clock the
     data has: the broker is real.
@@ -111,8 +73,8 @@ class MqttPublisher:
         site: name of the site.
         box: name of the box.
         outbox: what must reach the broker; open while `run` runs.
-        clock: for the time in the availability payload.
-        telemetry_limit: telemetry messages that may wait for a broker; then the oldest is dropped.
+        clock: for the time in what the publisher itself says, and the age of commands and telemetry.
+        commands: carries out the commands that `MqttSettings.commands` allows; None takes none.
     """
 
     def __init__(
@@ -123,16 +85,20 @@ class MqttPublisher:
         outbox: Outbox,
         clock: Clock,
         *,
-        telemetry_limit: int = 1000,
+        commands: CommandHandler | None = None,
     ) -> None:
         self.counters = PublishCounters()
         self.topics = Topics(settings.topic_root, site, box)
         self._settings = settings
         self._outbox = outbox
         self._clock = clock
-        self._telemetry: deque[tuple[str, bytes]] = deque()
-        self._telemetry_limit = telemetry_limit
-        self._telemetry_arrived = asyncio.Event()
+        self._intake: CommandIntake | None = None
+        if settings.commands is not None and commands is not None:
+            self._intake = CommandIntake(settings.commands, self.topics, commands, clock)
+        self._home_assistant: HomeAssistantLink | None = None
+        if settings.home_assistant is not None:
+            self._home_assistant = HomeAssistantLink(settings.home_assistant, self.topics, clock)
+        self._expiry: dict[str, int] = {}
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._outage_reported = False
         self._protocol = (
@@ -142,39 +108,65 @@ class MqttPublisher:
         self._stop_at_s = 0.0
         self._running: asyncio.Future[None] | None = None
 
+    @property
+    def certificate_expiry(self) -> Mapping[str, int]:
+        """When certificates end, as wall clock in ns since 1970, as far as they have been seen.
+
+        ``client`` is the box's own, ``ca`` the authority of `MqttSettings.ca_file` that vouches for the
+        broker, ``broker`` what the broker has shown.
+        """
+        return MappingProxyType(self._expiry)
+
+    def figures(self) -> dict[str, Any]:
+        """What the publisher has done, in numbers, for the status; without TLS or commands none of these."""
+        figures: dict[str, Any] = {
+            name: int(value) if isinstance(value, bool) else value
+            for name, value in asdict(self.counters).items()
+        }
+        if self._intake is not None:
+            figures["commands"] = asdict(self._intake.counters)
+        if self._expiry:
+            now_ns = self._clock.wall_ns()
+            figures["certificates"] = {
+                name: {
+                    "not_after_seconds": not_after_ns // NS_PER_S,
+                    "days_left": round((not_after_ns - now_ns) / NS_PER_DAY, 2),
+                }
+                for name, not_after_ns in self._expiry.items()
+            }
+        return figures
+
     def telemetry(self, topic: str, payload: bytes) -> None:
-        """Publish with QoS 0 when there is a broker; never waits.
+        """Publish by the outbox's lower class; never waits.
 
         Args:
             topic: below the box, e.g. ``"status"`` or ``"laval-rig/diagnosis/rotor-bank"``.
             payload: the bytes.
+
+        Raises:
+            OutboxError: the outbox is not open.
         """
-        if self._running is not None and self._running.done():
-            self.counters.telemetry_dropped += 1
-            return
-        if len(self._telemetry) >= self._telemetry_limit:
-            self._telemetry.popleft()
-            self.counters.telemetry_dropped += 1
-        self._telemetry.append((f"{self.topics.base}/{topic}", payload))
-        self._telemetry_arrived.set()
+        self._outbox.telemetry(
+            f"{self.topics.base}/{topic}", payload, expiry_s=self._settings.telemetry_expiry_s
+        )
 
     async def run(self) -> None:
         """Publish until `stop`: connect, serve, and connect again after each loss."""
         self._running = asyncio.get_running_loop().create_future()
         try:
             while not self._stopping.is_set():
-                connection = await self._unless_stopping(self._connect())
-                if connection is None:
-                    await self._unless_stopping(asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
+                made = await self._unless_stopping(self._connect())
+                if made is None:
+                    await self._wait(self._backoff.next_ns() / NS_PER_S)
                     continue
+                connection, credentials = made
                 try:
-                    await self._serve(connection)
+                    await self._serve(connection, credentials)
                 finally:
                     self.counters.connected = False
+                    self.counters.overlooked += connection.overlooked
                     connection.abandon()
         finally:
-            self.counters.telemetry_dropped += len(self._telemetry)
-            self._telemetry.clear()
             self._running.set_result(None)
 
     async def stop(self, deadline_s: float = 1.0) -> None:
@@ -185,25 +177,26 @@ class MqttPublisher:
         """
         self._stop_at_s = asyncio.get_running_loop().time() + deadline_s
         self._stopping.set()
-        self._telemetry_arrived.set()
         if self._running is not None:
             await asyncio.wait({self._running})
 
-    async def _connect(self) -> Connection | None:
+    async def _connect(self) -> tuple[Connection, Credentials] | None:
         """A connection at which the box is known as online; None after a failure."""
         try:
-            connection = Connection(
-                self._settings.host, self._settings.port, in_flight=IN_FLIGHT, **await self._options()
-            )
+            credentials = await asyncio.to_thread(read_credentials, self._settings)
+            if credentials.own is not None:
+                self._expiry["client"] = credentials.own.not_after_ns
+            connection = self._connection(credentials)
             await connection.open()
             try:
+                self._see(connection, credentials)
                 await connection.deliver(
                     self.topics.availability, self._availability("online", "connected"), retain=True
                 )
             except BaseException:
                 connection.abandon()
                 raise
-        except (aiomqtt.MqttError, OSError) as error:
+        except (aiomqtt.MqttError, OSError, ValueError) as error:
             if not self._falls_back(error):
                 self._report_outage(str(error))
             return None
@@ -214,81 +207,70 @@ class MqttPublisher:
             log.warning("MQTT broker %s is back", self._name)
         else:
             log.info("connected to MQTT broker %s", self._name)
-        return connection
+        return connection, credentials
 
-    async def _options(self) -> dict[str, Any]:
-        """What a connection needs; certificates and password as the files are now."""
+    def _connection(self, credentials: Credentials) -> Connection:
         settings = self._settings
-        password, context = await asyncio.to_thread(_read_credentials, settings)
-        return {
-            "identifier": settings.client_id,
-            "username": settings.username,
-            "password": password,
-            "tls_context": context,
-            "keepalive": settings.keepalive_s,
-            "protocol": self._protocol,
-            "will": aiomqtt.Will(
+        return Connection(
+            settings.host,
+            settings.port,
+            in_flight=IN_FLIGHT,
+            protocol=self._protocol,
+            identifier=settings.client_id,
+            username=settings.username,
+            password=credentials.password,
+            tls_context=credentials.context,
+            keepalive=settings.keepalive_s,
+            will=aiomqtt.Will(
                 self.topics.availability, self._availability("offline", "connection lost"), qos=1, retain=True
             ),
-        }
-
-    async def _serve(self, connection: Connection) -> None:
-        """Publish over one connection until it is lost or the publisher stops."""
-        since_s = asyncio.get_running_loop().time()
-        delivery = Delivery(
-            self._outbox,
-            connection,
-            self.topics.base,
-            self._stopping,
-            on_sent=self.counters.count_published,
-            on_acknowledged=self.counters.count_acknowledged,
         )
-        drain = asyncio.create_task(delivery.run(), name="mqtt-outbox")
-        telemetry = asyncio.create_task(self._send_telemetry(connection), name="mqtt-telemetry")
-        lost = asyncio.create_task(connection.lost(), name="mqtt-lost")
-        tasks = {drain, telemetry, lost}
+
+    def _see(self, connection: Connection, credentials: Credentials) -> None:
+        """Note how long the broker's certificate and the one that vouches for it last."""
+        der = connection.shown_certificate
+        if der is None:
+            return
+        shown = certificate(der)
+        self._expiry["broker"] = shown.not_after_ns
+        authority = voucher(shown, credentials.trusted)
+        if authority is not None:
+            self._expiry["ca"] = authority.not_after_ns
+
+    async def _serve(self, connection: Connection, credentials: Credentials) -> None:
+        """Publish over one connection until it is lost or the publisher stops."""
+        session = Session(
+            connection,
+            credentials,
+            settings=self._settings,
+            topics=self.topics,
+            outbox=self._outbox,
+            clock=self._clock,
+            counters=self.counters,
+            intake=self._intake,
+            home_assistant=self._home_assistant,
+            stopping=self._stopping,
+        )
+        since_s = asyncio.get_running_loop().time()
         try:
-            await self._unless_stopping(asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED))
-            if self._stopping.is_set() and not lost.done():
-                await self._hand_over({drain, telemetry}, lost)
-                await self._say_goodbye(connection)
-                return
-        finally:
-            for task in tasks:
-                task.cancel()
-            outcomes = await asyncio.gather(*tasks, return_exceptions=True)
-        reason = "connection lost"
-        for outcome in outcomes:
-            if isinstance(outcome, (aiomqtt.MqttError, OSError)):
-                reason = str(outcome)
-            elif isinstance(outcome, Exception):
-                raise outcome
-        self._report_outage(reason)
-        if asyncio.get_running_loop().time() - since_s > STABLE_S:
-            self._backoff.reset()
-        await self._unless_stopping(asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
-
-    async def _hand_over(self, left: set[asyncio.Task[None]], lost: asyncio.Task[None]) -> None:
-        """Let the tasks finish what is left, for as long as the connection lives and the time allows."""
-        while left and not lost.done() and (patience_s := self._left_s() - GOODBYE_S) > 0:
-            await asyncio.wait({*left, lost}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED)
-            left = {task for task in left if not task.done()}
-
-    async def _send_telemetry(self, connection: Connection) -> None:
-        """Send telemetry as it comes, until the publisher stops and nothing is left."""
-        while True:
-            while not self._telemetry:
-                if self._stopping.is_set():
-                    return
-                self._telemetry_arrived.clear()
-                await self._telemetry_arrived.wait()
-            topic, payload = self._telemetry.popleft()
-            try:
-                await connection.publish(topic, payload, qos=0)
-            except (aiomqtt.MqttError, asyncio.CancelledError):
-                self.counters.telemetry_dropped += 1
-                raise
-            self.counters.telemetry_sent += 1
+            await session.run(lambda: self._left_s() - GOODBYE_S)
+        except CredentialsReplacedError:
+            log.info("credentials for MQTT broker %s were replaced; connecting again", self._name)
+            await connection.close(GOODBYE_S)
+        except TakenOverError:
+            self._report_rival()
+            await self._wait(TAKEN_OVER_S + self._backoff.next_ns() / NS_PER_S)
+        except (aiomqtt.MqttError, OSError) as error:
+            self._report_outage(str(error))
+            of_use_s = asyncio.get_running_loop().time() - since_s
+            if isinstance(error, SilentBrokerError):
+                # Connected but deaf: the time that it took to notice was no use to anybody.
+                of_use_s -= PUBACK_S
+            if of_use_s > STABLE_S and not isinstance(error, PublishRefusedError):
+                self._backoff.reset()
+            await self._wait(self._backoff.next_ns() / NS_PER_S)
+        else:
+            await self._say_goodbye(connection)
 
     async def _say_goodbye(self, connection: Connection) -> None:
         """Publish that the box goes offline; if that fails, the last will says so."""
@@ -302,6 +284,9 @@ class MqttPublisher:
             log.warning("MQTT broker %s did not take the goodbye: %s; the last will tells", self._name, error)
         else:
             await connection.close(max(self._left_s(), GOODBYE_S / 2))
+
+    async def _wait(self, wait_s: float) -> None:
+        await self._unless_stopping(asyncio.sleep(wait_s))
 
     async def _unless_stopping(self, work: Coroutine[Any, Any, _T]) -> _T | None:
         """The result of ``work``; None if the publisher is told to stop before."""
@@ -345,11 +330,11 @@ class MqttPublisher:
             self._outage_reported = True
             log.warning("MQTT broker %s is away: %s; trying again until it is back", self._name, reason)
 
-
-def _read_credentials(settings: MqttSettings) -> tuple[str | None, ssl.SSLContext | None]:
-    """The password and a TLS context from the files as they are now; blocks."""
-    password = None
-    if settings.password_file is not None:
-        password = settings.password_file.read_text(encoding="utf-8").rstrip("\r\n")
-    context = tls_context(settings.ca_file) if settings.tls else None
-    return password, context
+    def _report_rival(self) -> None:
+        self._outage_reported = True
+        log.error(
+            "another client has connected to MQTT broker %s as client_id %r and so ended this connection; "
+            "give each box its own box name, or its own mqtt.client_id. Trying again in about a minute",
+            self._name,
+            self._settings.client_id,
+        )

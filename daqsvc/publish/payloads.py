@@ -30,7 +30,9 @@ Number = Annotated[float | None, BeforeValidator(_finite_or_none)]
 WholeOrNumber = Annotated[int | float | None, BeforeValidator(_finite_or_none)]
 
 
-class _Payload(BaseModel):
+class Payload(BaseModel):
+    """What all payloads have in common."""
+
     model_config = ConfigDict(
         frozen=True,
         populate_by_name=True,
@@ -43,7 +45,9 @@ class _Payload(BaseModel):
         return self.model_dump_json(by_alias=True).encode()
 
 
-class _Stamped(_Payload):
+class Stamped(Payload):
+    """A payload that says whose it is and when it was true."""
+
     site: str
     box: str
     time: str = Field(description="ISO 8601, UTC, microseconds; a label, the wall clock may step")
@@ -51,7 +55,7 @@ class _Stamped(_Payload):
     monotonic_ns: int = Field(description="the same instant on the box's monotonic clock; orders events")
 
 
-class WindowPayload(_Payload):
+class WindowPayload(Payload):
     """Which samples a statement rests on: absolute sample indices of the stream."""
 
     stream: str
@@ -59,7 +63,7 @@ class WindowPayload(_Payload):
     end_index: int = Field(description="one past the last sample")
 
 
-class _Statement(_Payload):
+class _Statement(Payload):
     detector: str
     decision: str
     severity: Severity
@@ -84,14 +88,14 @@ class CausePayload(_Statement):
     monotonic_ns: int = Field(description="when the last sample of the window was taken")
 
 
-class PreviousPayload(_Payload):
+class PreviousPayload(Payload):
     """How the alarm stood before the event."""
 
     state: AlarmState
     level: Severity
 
 
-class DoubtPayload(_Payload):
+class DoubtPayload(Payload):
     """What a detector has against a sensor."""
 
     detector: str
@@ -101,7 +105,7 @@ class DoubtPayload(_Payload):
     sensors: tuple[str, ...]
 
 
-class AlarmPayload(_Stamped):
+class AlarmPayload(Stamped):
     """One event of one alarm; the latest one is the alarm's state."""
 
     schema_: Literal["daqsvc.alarm/1"] = Field("daqsvc.alarm/1", alias="schema")
@@ -131,7 +135,7 @@ class AlarmPayload(_Stamped):
     cause: CausePayload
 
 
-class DiagnosisPayload(_Stamped, _Statement):
+class DiagnosisPayload(Stamped, _Statement):
     """One statement of one detector."""
 
     schema_: Literal["daqsvc.diagnosis/1"] = Field("daqsvc.diagnosis/1", alias="schema")
@@ -142,14 +146,14 @@ class Figures(RootModel[dict[str, "WholeOrNumber | Figures"]]):
     """Numbers by name, or groups of them."""
 
 
-class StatusPayload(_Stamped):
+class StatusPayload(Stamped):
     """Figures of the service itself, nested by what they belong to."""
 
     schema_: Literal["daqsvc.status/1"] = Field("daqsvc.status/1", alias="schema")
     figures: Figures
 
 
-class AvailabilityPayload(_Stamped):
+class AvailabilityPayload(Stamped):
     """Whether the box is there; in a last will, the time is that of the connection that it belongs to."""
 
     schema_: Literal["daqsvc.availability/1"] = Field("daqsvc.availability/1", alias="schema")
@@ -254,27 +258,14 @@ def status_payload(site: str, box: str, figures: Mapping[str, Any], clock: Clock
     Raises:
         pydantic.ValidationError: a figure is neither a number nor a mapping of numbers.
     """
-    return StatusPayload(**_now(site, box, clock), figures=Figures.model_validate(figures))
+    return StatusPayload(**stamp_now(site, box, clock), figures=Figures.model_validate(figures))
 
 
 def availability_payload(
     site: str, box: str, state: Literal["online", "offline"], reason: str, clock: Clock
 ) -> AvailabilityPayload:
     """The payload that says whether the box is there, and why."""
-    return AvailabilityPayload(**_now(site, box, clock), state=state, reason=reason)
-
-
-def json_schemas() -> dict[str, dict[str, Any]]:
-    """The JSON Schema (2020-12) of every payload, by the value of its ``schema`` key."""
-    models: dict[str, type[_Payload]] = {
-        "daqsvc.alarm/1": AlarmPayload,
-        "daqsvc.diagnosis/1": DiagnosisPayload,
-        "daqsvc.status/1": StatusPayload,
-        "daqsvc.availability/1": AvailabilityPayload,
-    }
-    return {
-        name: model.model_json_schema(by_alias=True, mode="serialization") for name, model in models.items()
-    }
+    return AvailabilityPayload(**stamp_now(site, box, clock), state=state, reason=reason)
 
 
 def _stamp(site: str, box: str, t_ns: int, wall_ns: int) -> dict[str, Any]:
@@ -287,7 +278,8 @@ def _stamp(site: str, box: str, t_ns: int, wall_ns: int) -> dict[str, Any]:
     }
 
 
-def _now(site: str, box: str, clock: Clock) -> dict[str, Any]:
+def stamp_now(site: str, box: str, clock: Clock) -> dict[str, Any]:
+    """The keys of `Stamped` as of now."""
     return _stamp(site, box, clock.monotonic_ns(), clock.wall_ns())
 
 

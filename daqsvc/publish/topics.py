@@ -41,11 +41,28 @@ class Topics:
 
     def alarm(self, machine: str, alarm: str) -> str:
         """Every event of one alarm, in order; the latest is retained."""
-        return f"{self.base}/{_safe(machine)}/alarms/{_safe(alarm)}"
+        return f"{self.alarm_prefix(machine)}{_safe(alarm)}"
+
+    def alarm_prefix(self, machine: str) -> str:
+        """What the topics of all alarms of a machine begin with."""
+        return f"{self.base}/{_safe(machine)}/alarms/"
 
     def diagnosis(self, machine: str, detector: str) -> str:
         """Every diagnosis of one detector."""
         return f"{self.base}/{_safe(machine)}/diagnosis/{_safe(detector)}"
+
+    def summary(self, machine: str) -> str:
+        """How all alarms of a machine stand; retained."""
+        return f"{self.base}/{_safe(machine)}/summary"
+
+    @property
+    def commands(self) -> str:
+        """Filter for the commands to every machine of the box."""
+        return f"{self.base}/+/commands/+"
+
+    def command(self, machine: str, verb: str) -> str:
+        """Where a command to a machine is expected."""
+        return f"{self.base}/{_safe(machine)}/commands/{_safe(verb)}"
 
 
 def _safe(name: str) -> str:

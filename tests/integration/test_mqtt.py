@@ -161,37 +161,40 @@ async def test_telemetry_arrives_and_is_not_retained(broker, outbox):
 
 async def test_a_publisher_that_stops_hands_over_the_telemetry_that_waits(broker, outbox, monkeypatch):
     port, protocol = broker
-    publish = Connection.publish
+    deliver = Connection.deliver
 
     async def at_leisure(self, topic, *arguments, **options):
-        if options["qos"] == 0:
-            await asyncio.sleep(0.005)
-        await publish(self, topic, *arguments, **options)
+        if "status" in topic:
+            await asyncio.sleep(0.01)
+        await deliver(self, topic, *arguments, **options)
 
-    monkeypatch.setattr(Connection, "publish", at_leisure)
+    monkeypatch.setattr(Connection, "deliver", at_leisure)
     async with Consumer(port) as live:
         async with publishing(outbox, port, protocol) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
             for number in range(20):
                 publisher.telemetry("status", json.dumps({"number": number}).encode())
-        assert (publisher.counters.telemetry_sent, publisher.counters.telemetry_dropped) == (20, 0)
+        assert publisher.counters.telemetry_sent == 20
         await eventually(lambda: len(live.on("/status")) == 20, "all of it arrives")
         await eventually(lambda: live.on("/availability")[-1].payload["state"] == "offline", "the goodbye")
 
 
-async def test_telemetry_that_a_stopped_publisher_cannot_send_is_counted(outbox):
-    settings = MqttSettings("127.0.0.1", free_port(), "c")
-    publisher = MqttPublisher(settings, "lab", "edge-1", outbox, CLOCK)
-    running = asyncio.create_task(publisher.run())
-    publisher.telemetry("status", b"{}")
-    publisher.telemetry("status", b"{}")
-    await asyncio.sleep(0)
-    await publisher.stop()
-    await running
-    assert publisher.counters.telemetry_dropped == 2
-    publisher.telemetry("status", b"{}")
-    assert publisher.counters.telemetry_dropped == 3
+@pytest.mark.mosquitto
+async def test_telemetry_that_found_no_broker_waits_for_the_next_start(tmp_path):
+    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
+    await outbox.open()
+    async with publishing(outbox, free_port()) as publisher:
+        for number in range(3):
+            publisher.telemetry("status", json.dumps({"number": number}).encode())
     assert publisher.counters.telemetry_sent == 0
+    await outbox.close()
+    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
+    await outbox.open()
+    with running_mosquitto(tmp_path) as mosquitto:
+        async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port):
+            await eventually(lambda: len(live.on("/status")) == 3, "it arrives")
+    assert [message.payload["number"] for message in live.on("/status")] == [0, 1, 2]
+    await outbox.close()
 
 
 async def test_the_last_will_speaks_for_a_cut_connection(broker, outbox):
@@ -358,20 +361,3 @@ async def test_an_old_broker_is_met_with_the_old_protocol(outbox, monkeypatch):
     monkeypatch.setattr("daqsvc.publish.connection.CONSENT_S", 0.3)
     async with EmbeddedBroker() as embedded, publishing(outbox, embedded.port, "auto") as publisher:
         await eventually(lambda: publisher.counters.connected, "connected by MQTT 3.1.1")
-
-
-@pytest.mark.mosquitto
-async def test_telemetry_without_a_broker_drops_the_oldest_and_counts(tmp_path, outbox):
-    with running_mosquitto(tmp_path) as mosquitto:
-        publisher = MqttPublisher(
-            MqttSettings("127.0.0.1", mosquitto.port, "c"), "lab", "edge-1", outbox, CLOCK, telemetry_limit=3
-        )
-        for number in range(10):
-            publisher.telemetry("status", json.dumps({"number": number}).encode())
-        assert publisher.counters.telemetry_dropped == 7
-        async with Consumer(mosquitto.port) as live:
-            running = asyncio.create_task(publisher.run())
-            await eventually(lambda: len(live.on("/status")) == 3, "the newest arrive")
-            await publisher.stop()
-            await running
-    assert [message.payload["number"] for message in live.on("/status")] == [7, 8, 9]

@@ -18,8 +18,8 @@ from daqsvc.publish.payloads import (
     AvailabilityPayload,
     DiagnosisPayload,
     StatusPayload,
-    json_schemas,
 )
+from daqsvc.publish.schemas import json_schemas
 from daqsvc.service import Service
 from daqsvc.settings import load_machine_file
 from sim_hw.plants import rotor as plant

@@ -1,0 +1,246 @@
+"""Commands from the broker: looked at, authorised, carried out by somebody else, answered.
+
+Whoever may publish below ``<box>/<machine>/commands/<verb>`` may ask for that; which verbs are taken at all
+stands in the machine file. So the broker's access list says who, and the box says what.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections import OrderedDict
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from pydantic import ValidationError
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.payloads import stamp_now
+
+if TYPE_CHECKING:
+    import aiomqtt
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.publish.settings import CommandSettings
+    from daqsvc.publish.topics import Topics
+
+log = logging.getLogger(__name__)
+
+REMEMBERED = 4096
+"""Ids of commands that are remembered, to refuse a command that comes again."""
+
+QUIET_NS = 10 * NS_PER_S
+"""After one refusal has been logged, further ones are not for so long."""
+
+_SHOWN_ID = 64
+_SHOWN_FAULTS = 500
+
+
+class CommandRefusedError(Exception):
+    """A command that is not even looked at by the alarms; the text says why."""
+
+
+@dataclass(slots=True)
+class CommandCounters:
+    """What became of the commands that came over the broker.
+
+    Attributes:
+        accepted: carried out.
+        refused: refused by the alarms, e.g. a reset while the condition stands.
+        malformed: too large, not JSON, or not a command of a known version.
+        unauthorised: for a machine or a verb that the machine file does not allow.
+        stale: too old, from the future, retained at the broker, or here for the second time.
+        unanswered: answers that the broker did not take.
+    """
+
+    accepted: int = 0
+    refused: int = 0
+    malformed: int = 0
+    unauthorised: int = 0
+    stale: int = 0
+    unanswered: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Where the answer to a command goes, and what it is.
+
+    Attributes:
+        topic: the sender's response topic (MQTT 5), or the command's own with ``/response``.
+        payload: a `ResponsePayload` in JSON.
+        correlation: what the sender wants to see again (MQTT 5).
+    """
+
+    topic: str
+    payload: bytes
+    correlation: bytes | None
+
+
+class CommandIntake:
+    """Takes the commands that come over the broker.
+
+    Args:
+        settings: what is allowed.
+        topics: the box.
+        handler: carries out what is allowed.
+        clock: its wall clock tells how old a command is.
+    """
+
+    def __init__(
+        self, settings: CommandSettings, topics: Topics, handler: CommandHandler, clock: Clock
+    ) -> None:
+        self.counters = CommandCounters()
+        self._settings = settings
+        self._topics = topics
+        self._handler = handler
+        self._clock = clock
+        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._quiet_until_ns = clock.monotonic_ns()
+
+    async def take(self, message: aiomqtt.Message) -> Answer:
+        """Carry out the command of a message, or refuse it; the answer says which.
+
+        Args:
+            message: on a topic that `Topics.commands` matches.
+        """
+        topic = str(message.topic)
+        machine, _, verb = topic.removeprefix(f"{self._topics.base}/").split("/")
+        asked = bytes(message.payload)
+        try:
+            command = self._command(machine, verb, asked, retained=message.retain)
+        except CommandRefusedError as refusal:
+            self._log(topic, refusal)
+            outcome = CommandOutcome(accepted=False, reason=str(refusal))
+        else:
+            outcome = await self._handler(command, f"mqtt {topic}")
+            if outcome.accepted:
+                self.counters.accepted += 1
+            else:
+                self.counters.refused += 1
+        response = ResponsePayload(
+            **stamp_now(self._topics.site, self._topics.box, self._clock),
+            id=_id_of(asked[: self._settings.max_bytes]),
+            machine=machine,
+            verb=verb,
+            accepted=outcome.accepted,
+            reason=outcome.reason,
+            events=outcome.events,
+        )
+        return Answer(self._answer_topic(message), response.to_json(), _correlation(message))
+
+    def _log(self, topic: str, refusal: CommandRefusedError) -> None:
+        """Say it, but not for each of a flood: the counters and the answers tell of the others."""
+        now_ns = self._clock.monotonic_ns()
+        loud = now_ns >= self._quiet_until_ns
+        log.log(logging.WARNING if loud else logging.DEBUG, "command on %r refused: %s", topic, refusal)
+        if loud:
+            self._quiet_until_ns = now_ns + QUIET_NS
+
+    def _command(self, machine: str, verb: str, asked: bytes, *, retained: bool) -> AlarmCommand:
+        """What is asked.
+
+        Raises:
+            CommandRefusedError: it is not to be carried out.
+        """
+        allowed = ", ".join(sorted(self._settings.allow)) or "nothing"
+        if machine not in self._settings.machines:
+            self.counters.unauthorised += 1
+            raise CommandRefusedError(
+                f"this box takes no commands for machine {machine!r}; it watches "
+                f"{', '.join(self._settings.machines)}"
+            )
+        if verb not in self._settings.allow:
+            self.counters.unauthorised += 1
+            raise CommandRefusedError(
+                f"{verb!r} is not allowed over MQTT; allowed: {allowed}. Add it to mqtt.commands.allow in "
+                "the machine file, or do it at the box"
+            )
+        told = self._read(asked)
+        if retained:
+            self.counters.stale += 1
+            raise CommandRefusedError(
+                "it is retained at the broker and would come again with every connection; send it without "
+                "retain"
+            )
+        self._check_age(told)
+        self._check_new(machine, told.id)
+        return AlarmCommand(
+            verb=Verb(verb),
+            alarm=told.alarm,
+            by=told.by,
+            duration_s=told.duration_s,
+            occurrence=told.occurrence,
+            reason=told.reason,
+        )
+
+    def _read(self, asked: bytes) -> CommandPayload:
+        if len(asked) > self._settings.max_bytes:
+            self.counters.malformed += 1
+            raise CommandRefusedError(
+                f"it has {len(asked)} bytes; a command has at most {self._settings.max_bytes}"
+            )
+        try:
+            return CommandPayload.model_validate_json(asked)
+        except ValidationError as error:
+            self.counters.malformed += 1
+            found = [f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg']}" for e in error.errors()]
+            # The names of unknown keys are the sender's: nothing of them may write a line into a log.
+            shown = re.sub(r"[^ -~]", "?", "; ".join(found[:5]))[:_SHOWN_FAULTS]
+            raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error
+
+    def _check_age(self, told: CommandPayload) -> None:
+        now_ns = self._clock.wall_ns()
+        age_s = now_ns / NS_PER_S - told.issued_at.timestamp()
+        limit_s = self._settings.max_age_s
+        oldest_s = min(told.expires_s or limit_s, limit_s)
+        if -limit_s <= age_s <= oldest_s:
+            return
+        self.counters.stale += 1
+        now = datetime.fromtimestamp(now_ns / NS_PER_S, UTC).isoformat(timespec="seconds")
+        raise CommandRefusedError(
+            f"it was issued {abs(age_s):.0f} s {'ago' if age_s > 0 else 'in the future'}, with at most "
+            f"{oldest_s if age_s > 0 else limit_s:g} s allowed; the clock of the box says {now}: "
+            "send it again, or set the clocks"
+        )
+
+    def _check_new(self, machine: str, identifier: str) -> None:
+        if (machine, identifier) in self._seen:
+            self.counters.stale += 1
+            raise CommandRefusedError(
+                f"a command with id {identifier!r} has come before; give every command its own id"
+            )
+        self._seen[machine, identifier] = None
+        while len(self._seen) > REMEMBERED:
+            self._seen.popitem(last=False)
+
+    def _answer_topic(self, message: aiomqtt.Message) -> str:
+        """Where the sender wants the answer, unless that would speak in the name of this box or of others.
+
+        The box may publish what the sender may not: an answer must not become an alarm, or an entity.
+        """
+        own = f"{message.topic}/response"
+        wanted = getattr(message.properties, "ResponseTopic", None)
+        if not isinstance(wanted, str) or not wanted or len(wanted) > 256 or set(wanted) & set("+#\0"):
+            return own
+        reserved = ("$", f"{self._topics.root}/", "homeassistant/", "spBv1.0/")
+        return own if wanted.startswith(reserved) and not wanted.startswith(own) else wanted
+
+
+def _correlation(message: aiomqtt.Message) -> bytes | None:
+    data = getattr(message.properties, "CorrelationData", None)
+    return data if isinstance(data, bytes) else None
+
+
+def _id_of(asked: bytes) -> str | None:
+    """The id of a command that may be malformed, so that its sender knows which one was refused."""
+    try:
+        told = json.loads(asked)
+    except (ValueError, RecursionError):
+        return None
+    identifier = told.get("id") if isinstance(told, dict) else None
+    return identifier[:_SHOWN_ID] if isinstance(identifier, str) else None

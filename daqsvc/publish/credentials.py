@@ -1,0 +1,169 @@
+"""What the box shows to the broker and what it trusts: read from files again for every connection.
+
+So a password or certificate that was replaced takes effect at the next connection, and nothing secret
+stays in the settings. Secrets are in no message of this module and in no ``repr``.
+"""
+
+from __future__ import annotations
+
+import os
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daqsvc.publish.certificates import Certificate, certificates
+
+if TYPE_CHECKING:
+    from daqsvc.publish.settings import MqttSettings
+
+CREDENTIALS_DIRECTORY = "CREDENTIALS_DIRECTORY"
+"""Where systemd tells a service the directory of its credentials (systemd.exec, LoadCredential=)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """What one connection is made with.
+
+    Attributes:
+        password: None without one.
+        context: None without TLS.
+        own: the box's certificate; None without one.
+        trusted: the authorities of `ca_file`; empty for those of the system.
+        stamp: changes whenever one of the files does; see `stamp_of`.
+    """
+
+    password: str | None = field(repr=False)
+    context: ssl.SSLContext | None
+    own: Certificate | None
+    trusted: tuple[Certificate, ...]
+    stamp: tuple[object, ...]
+
+
+def read_credentials(settings: MqttSettings) -> Credentials:
+    """Read password, key and certificates as the files are now; blocks.
+
+    Raises:
+        OSError: a file cannot be read, or does not hold what it should; the message names it.
+        CertificateError: a certificate cannot be read.
+    """
+    stamp = stamp_of(settings)  # before reading: what is replaced meanwhile is seen as changed later
+    password = _password(settings)
+    if not settings.tls:
+        return Credentials(password, None, None, (), stamp)
+    context = tls_context(settings.ca_file)
+    own = None
+    if settings.cert_file is not None:
+        key = _key_file(settings)
+        _show(context, settings.cert_file, key)
+        own = next(iter(certificates(settings.cert_file)), None)
+    trusted = () if settings.ca_file is None else tuple(certificates(settings.ca_file))
+    return Credentials(password, context, own, trusted, stamp)
+
+
+def stamp_of(settings: MqttSettings) -> tuple[object, ...]:
+    """Which files there are now: identity, size and time of change of each; blocks."""
+    return tuple(_stamp(path) for path in _files(settings))
+
+
+def tls_context(ca_file: Path | None) -> ssl.SSLContext:
+    """A context that verifies the broker's certificate and host name; reads files.
+
+    Args:
+        ca_file: certificate authorities in PEM; None for those of the system.
+
+    Raises:
+        OSError: the file cannot be read, or holds no certificate.
+    """
+    try:
+        context = ssl.create_default_context(cafile=ca_file)
+    except ssl.SSLError as error:
+        raise OSError(f"ca_file {ca_file} holds no certificate in PEM: {error}") from error
+    except OSError as error:
+        raise OSError(f"ca_file {ca_file} cannot be read: {error.strerror or error}") from error
+    context.sslsocket_class = _TidySocket
+    return context
+
+
+def _show(context: ssl.SSLContext, cert_file: Path, key_file: Path | None) -> None:
+    """Let the context show a certificate to the broker."""
+
+    def no_password() -> str:
+        # OpenSSL would ask at the terminal, and the service would wait there for ever.
+        raise OSError(f"the key of {cert_file} is encrypted; give one that is not, e.g. as a credential")
+
+    try:
+        context.load_cert_chain(cert_file, key_file, no_password)
+    except ssl.SSLError as error:
+        raise OSError(
+            f"cert_file {cert_file} and its key {key_file or cert_file} cannot be used together: {error}"
+        ) from error
+    except FileNotFoundError as error:
+        missing = next((path for path in (cert_file, key_file) if path and not path.exists()), cert_file)
+        raise FileNotFoundError(
+            f"{missing} is not there; put it there, or correct cert_file and key_file"
+        ) from error
+
+
+def _password(settings: MqttSettings) -> str | None:
+    file = _password_file(settings)
+    if file is None:
+        return None
+    try:
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        # The error itself would hold the bytes of the password.
+        raise OSError(f"{file} is not UTF-8 text; write the password into it, in its first line") from None
+    return text.partition("\n")[0].rstrip("\r")
+
+
+def _password_file(settings: MqttSettings) -> Path | None:
+    if settings.password_credential is not None:
+        return _credential(settings.password_credential)
+    return settings.password_file
+
+
+def _key_file(settings: MqttSettings) -> Path | None:
+    if settings.key_credential is not None:
+        return _credential(settings.key_credential)
+    return settings.key_file
+
+
+def _credential(name: str) -> Path:
+    """Where systemd has put a credential of the service."""
+    directory = os.environ.get(CREDENTIALS_DIRECTORY)
+    if directory is None:
+        raise FileNotFoundError(
+            f"there is no credential {name!r}: ${CREDENTIALS_DIRECTORY} is not set; write "
+            f"LoadCredential={name}:/path/to/it in the systemd unit, or name a file in the machine file"
+        )
+    return Path(directory) / name
+
+
+def _files(settings: MqttSettings) -> list[Path]:
+    files = [settings.ca_file, settings.cert_file] if settings.tls else []
+    for wanted in (_password_file, _key_file):
+        try:
+            files.append(wanted(settings))
+        except FileNotFoundError:
+            continue  # said when it is read
+    return [path for path in files if path is not None]
+
+
+def _stamp(path: Path) -> object:
+    try:
+        status = path.stat()
+    except OSError:
+        return path, None
+    return path, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+class _TidySocket(ssl.SSLSocket):
+    """Closes itself when the handshake fails; paho would leave it to the garbage collector."""
+
+    def do_handshake(self, block: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
+        try:
+            super().do_handshake(block)
+        except BaseException:
+            self.close()
+            raise

@@ -1,0 +1,178 @@
+"""What Home Assistant is told, so that a machine shows up there by itself.
+
+One retained message per machine describes the device with all its entities (MQTT integration of Home
+Assistant, "device discovery payload", 2024.11 and later). States come from the topics that every other
+consumer reads too; the templates only pick keys.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import daqsvc
+from daqsvc.alarms.states import Level
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.publish.settings import HomeAssistantSettings, Reading
+    from daqsvc.publish.topics import Topics
+
+STALE_S = 120
+"""A figure that has not been told for so long is shown as unavailable."""
+
+_UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°"}
+"""Units as Home Assistant writes them, where that differs."""
+
+_CLASSES = {"mm/s": "speed", "V": "voltage"}
+"""Device classes of Home Assistant that know the unit; it has none for micrometres or g."""
+
+
+@dataclass(frozen=True, slots=True)
+class Discovery:
+    """The discovery message of a machine.
+
+    Args:
+        settings: what to tell.
+        topics: the box.
+    """
+
+    settings: HomeAssistantSettings
+    topics: Topics
+
+    @property
+    def topic(self) -> str:
+        """Where Home Assistant looks for it."""
+        return f"{self.settings.prefix}/device/{self._object_id}/config"
+
+    @property
+    def birth_topic(self) -> str:
+        """Where Home Assistant says that it has started."""
+        return f"{self.settings.prefix}/status"
+
+    def payload(self) -> dict[str, Any]:
+        """The device with all its entities."""
+        settings, machine = self.settings, self.settings.machine
+        return {
+            "device": {
+                "identifiers": [self._id],
+                "name": machine,
+                "manufacturer": "daqsvc",
+                "model": settings.description or "rotating machine",
+                "sw_version": daqsvc.__version__,
+            },
+            "origin": {"name": "daqsvc", "sw_version": daqsvc.__version__},
+            "availability": [
+                {
+                    "topic": self.topics.availability,
+                    "value_template": "{{ value_json.state }}",
+                    "payload_available": "online",
+                    "payload_not_available": "offline",
+                }
+            ],
+            "qos": 1,
+            "components": self._components(),
+        }
+
+    def removals(self, earlier: bytes) -> dict[str, dict[str, str]]:
+        """What an earlier message had and this one has not: each with its platform alone, which removes it.
+
+        Args:
+            earlier: payload of the message that is retained at the broker; anything but a discovery
+                message counts as none.
+        """
+        try:
+            told = json.loads(earlier)
+        except (ValueError, RecursionError):
+            return {}
+        entities = told.get("components") if isinstance(told, dict) else None
+        if not isinstance(entities, dict):
+            return {}
+        now = self._components()
+        return {
+            name: {"platform": entity["platform"]}
+            for name, entity in entities.items()
+            if name not in now and isinstance(entity, dict) and isinstance(entity.get("platform"), str)
+        }
+
+    @property
+    def _id(self) -> str:
+        return f"{self.topics.base}/{self.settings.machine}"
+
+    @property
+    def _object_id(self) -> str:
+        return _safe_id(self._id)
+
+    def _components(self) -> dict[str, dict[str, Any]]:
+        made: dict[str, dict[str, Any]] = {}
+        for alarm in self.settings.alarms:
+            made[f"alarm/{alarm}"] = self._problem(alarm)
+            made[f"level/{alarm}"] = self._level(alarm)
+        for alarm in self.settings.services:
+            made[f"alarm/{alarm}"] = {**self._problem(alarm), "entity_category": "diagnostic"}
+        for reading in self.settings.readings:
+            made[f"{reading.kind}/{reading.detector}/{reading.key}"] = self._sensor(reading)
+        return {name: {**entity, "unique_id": f"{self._id}/{name}"} for name, entity in sorted(made.items())}
+
+    def _problem(self, alarm: str) -> dict[str, Any]:
+        summary = self.topics.summary(self.settings.machine)
+        return {
+            "platform": "binary_sensor",
+            "name": alarm,
+            "device_class": "problem",
+            "state_topic": summary,
+            "value_template": _pick("alarms", alarm, "problem"),
+            "json_attributes_topic": summary,
+            "json_attributes_template": _pick("alarms", alarm, as_json=True),
+        }
+
+    def _level(self, alarm: str) -> dict[str, Any]:
+        return {
+            "platform": "sensor",
+            "name": f"{alarm} level",
+            "device_class": "enum",
+            "options": [level.label for level in Level],
+            "state_topic": self.topics.summary(self.settings.machine),
+            "value_template": _pick("alarms", alarm, "level"),
+        }
+
+    def _sensor(self, reading: Reading) -> dict[str, Any]:
+        made: dict[str, Any] = {
+            "platform": "sensor",
+            "name": f"{reading.detector} {reading.key.replace('_', ' ')}",
+            "state_class": "measurement",
+            "state_topic": self.topics.diagnosis(self.settings.machine, reading.detector),
+            "value_template": _pick(reading.kind, reading.key),
+            "expire_after": STALE_S,
+            "suggested_display_precision": 3 if reading.kind == "probabilities" else 1,
+        }
+        made |= _in_home_assistant(reading.unit)
+        return made
+
+
+def _safe_id(name: str) -> str:
+    """The name in the letters, digits, "_" and "-" that Home Assistant allows in ids; no two become one."""
+    return re.sub(r"[^A-Za-z0-9-]", lambda found: f"_{ord(found[0]):02x}", name)
+
+
+def _in_home_assistant(unit: str) -> Mapping[str, str]:
+    """Unit and device class as Home Assistant knows them."""
+    if not unit:
+        return {}
+    named = {"unit_of_measurement": _UNITS.get(unit, unit)}
+    return {**named, "device_class": _CLASSES[unit]} if unit in _CLASSES else named
+
+
+def _pick(*keys: str, as_json: bool = False) -> str:
+    """A template for one key below others; ``None`` where there is none, which is shown as unknown."""
+    *above, last = keys
+    found = "value_json" + "".join(f"[{_quoted(key)}]" for key in above) + f".get({_quoted(last)})"
+    return f"{{{{ {found}{' | tojson' if as_json else ''} }}}}"
+
+
+def _quoted(key: str) -> str:
+    """A name as a string of Jinja; names hold neither quotes nor backslashes (`daqsvc.publish.topics`)."""
+    return f"'{key}'"

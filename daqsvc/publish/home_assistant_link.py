@@ -1,0 +1,142 @@
+"""Keeps Home Assistant told: at every connection, at its birth, and when an alarm has changed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import random
+from typing import TYPE_CHECKING
+
+from daqsvc.publish.connection import PublishRefusedError
+from daqsvc.publish.home_assistant import Discovery
+from daqsvc.publish.summary import Summary
+
+if TYPE_CHECKING:
+    import aiomqtt
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.settings import HomeAssistantSettings
+    from daqsvc.publish.topics import Topics
+
+log = logging.getLogger(__name__)
+
+BIRTH_DELAY_S = 5.0
+"""After a birth of Home Assistant each box waits up to so long, at random: it has many to listen to."""
+
+EARLIER_S = 1.0
+"""How long an earlier discovery message that is retained at the broker may take to arrive."""
+
+
+class HomeAssistantLink:
+    """Publishes the discovery message and the summary of the alarms.
+
+    Args:
+        settings: what to tell.
+        topics: the box.
+        clock: for the time in the summary.
+    """
+
+    def __init__(self, settings: HomeAssistantSettings, topics: Topics, clock: Clock) -> None:
+        self._settings = settings
+        self._topics = topics
+        self._clock = clock
+        self._discovery = Discovery(settings, topics)
+        self._summary = Summary(settings.machine, (*settings.alarms, *settings.services), topics)
+        self._changed = asyncio.Event()
+        self._born = asyncio.Event()
+        self._earlier: asyncio.Future[bytes] | None = None
+
+    def note(self, message: OutboxMessage) -> None:
+        """Take in an alarm's message that the broker has."""
+        if self._summary.note(message):
+            self._changed.set()
+
+    def take(self, message: aiomqtt.Message) -> bool:
+        """Take in a message from the broker; whether it was meant for this link."""
+        topic = str(message.topic)
+        if topic == self._discovery.birth_topic:
+            # What is retained tells of a birth in the past: the connection has just told everything.
+            if message.payload == b"online" and not message.retain:
+                self._born.set()
+        elif topic == self._discovery.topic:
+            if self._earlier is not None and not self._earlier.done():
+                self._earlier.set_result(bytes(message.payload))
+        else:
+            return False
+        return True
+
+    async def run(self, connection: Connection) -> None:
+        """Tell what there is to tell over one connection; ends at once if nothing shall be told any more.
+
+        Raises:
+            aiomqtt.MqttError: the connection is lost.
+        """
+        try:
+            await self._run(connection)
+        except PublishRefusedError as error:
+            log.warning(
+                "Home Assistant is not told of %s: %s; allow this client to write %s and %s at the broker",
+                self._settings.machine,
+                error,
+                self._discovery.topic,
+                self._topics.summary(self._settings.machine),
+            )
+
+    async def _run(self, connection: Connection) -> None:
+        if not self._settings.enabled:
+            await connection.deliver(self._discovery.topic, b"", retain=True)
+            await connection.deliver(self._topics.summary(self._settings.machine), b"", retain=True)
+            return
+        self._born.clear()
+        await connection.watch(self._discovery.birth_topic)
+        await self._remove(connection)
+        await self._tell(connection)
+        born = asyncio.create_task(self._born.wait())
+        changed = asyncio.create_task(self._changed.wait())
+        try:
+            while True:
+                await asyncio.wait({born, changed}, return_when=asyncio.FIRST_COMPLETED)
+                if born.done():
+                    # Spreads the load on one broker, it keeps no secret.
+                    await asyncio.sleep(random.uniform(0, BIRTH_DELAY_S))  # noqa: S311
+                    self._born.clear()
+                    await self._tell(connection)
+                    born = asyncio.create_task(self._born.wait())
+                else:
+                    await self._summarise(connection)
+                if changed.done():
+                    changed = asyncio.create_task(self._changed.wait())
+        finally:
+            born.cancel()
+            changed.cancel()
+
+    async def _remove(self, connection: Connection) -> None:
+        """Remove what an earlier start has told and this one has not: a renamed alarm, say."""
+        self._earlier = asyncio.get_running_loop().create_future()
+        await connection.watch(self._discovery.topic)
+        earlier = b""
+        with contextlib.suppress(TimeoutError):  # there is none: nothing has been told before
+            earlier = await asyncio.wait_for(self._earlier, EARLIER_S)
+        await connection.unsubscribe(self._discovery.topic)
+        removals = self._discovery.removals(earlier)
+        if removals:
+            told = self._discovery.payload()
+            told["components"] |= removals
+            await connection.deliver(self._discovery.topic, _json(told), retain=True)
+
+    async def _tell(self, connection: Connection) -> None:
+        await connection.deliver(self._discovery.topic, _json(self._discovery.payload()), retain=True)
+        await self._summarise(connection)
+
+    async def _summarise(self, connection: Connection) -> None:
+        self._changed.clear()
+        summary = self._summary.payload(self._clock).to_json()
+        await connection.deliver(self._topics.summary(self._settings.machine), summary, retain=True)
+
+
+def _json(told: object) -> bytes:
+    return json.dumps(told, ensure_ascii=False).encode()

@@ -1,0 +1,207 @@
+"""Everything that goes on over one connection to the broker, until it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.publish.connection import PublishRefusedError
+from daqsvc.publish.credentials import read_credentials, stamp_of
+from daqsvc.publish.delivery import Delivery
+from daqsvc.publish.telemetry_delivery import TelemetryDelivery
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.command_intake import CommandIntake
+    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.counters import PublishCounters
+    from daqsvc.publish.credentials import Credentials
+    from daqsvc.publish.home_assistant_link import HomeAssistantLink
+    from daqsvc.publish.settings import MqttSettings
+    from daqsvc.publish.topics import Topics
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 10.0
+"""How often to look whether a certificate, key or password was replaced."""
+
+ANSWER_EXPIRY_S = 60.0
+"""How long the answer to a command is of use."""
+
+
+class CredentialsReplacedError(Exception):
+    """Certificate, key or password were replaced: time for a new connection."""
+
+
+class Session:
+    """One connection's worth of publishing and listening.
+
+    Args:
+        connection: open, and known as online.
+        credentials: what it was made with.
+        settings: how it was made.
+        topics: the box.
+        outbox: what must reach the broker.
+        clock: the service's clock.
+        counters: what is counted here.
+        intake: takes commands; None if there are none over MQTT.
+        home_assistant: None to leave Home Assistant alone.
+        stopping: ends the deliveries as soon as nothing is left.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        credentials: Credentials,
+        *,
+        settings: MqttSettings,
+        topics: Topics,
+        outbox: Outbox,
+        clock: Clock,
+        counters: PublishCounters,
+        intake: CommandIntake | None,
+        home_assistant: HomeAssistantLink | None,
+        stopping: asyncio.Event,
+    ) -> None:
+        self._connection = connection
+        self._credentials = credentials
+        self._settings = settings
+        self._topics = topics
+        self._outbox = outbox
+        self._clock = clock
+        self._counters = counters
+        self._intake = intake
+        self._home_assistant = home_assistant
+        self._stopping = stopping
+
+    async def run(self, left_s: Callable[[], float]) -> None:
+        """Publish and listen until `stopping` is set and everything is handed over, or time is up.
+
+        Args:
+            left_s: once `stopping` is set, how long the deliveries may take to hand over what is left, in s.
+
+        Raises:
+            aiomqtt.MqttError: the connection is lost or refuses an alarm.
+            CredentialsReplacedError: make a new connection.
+        """
+        deliveries = {
+            asyncio.create_task(self._alarms(), name="mqtt-alarms"),
+            asyncio.create_task(self._telemetry(), name="mqtt-telemetry"),
+        }
+        others = {
+            asyncio.create_task(self._connection.lost(), name="mqtt-lost"),
+            asyncio.create_task(self._listen(), name="mqtt-listen"),
+            asyncio.create_task(self._look_after_credentials(), name="mqtt-credentials"),
+            asyncio.create_task(self._stopping.wait(), name="mqtt-stopping"),
+        }
+        if self._home_assistant is not None:
+            link = self._home_assistant.run(self._connection)
+            others.add(asyncio.create_task(link, name="mqtt-home-assistant"))
+        try:
+            await self._until_stopped(deliveries | others)
+            await self._hand_over(deliveries, others, left_s)
+        finally:
+            for task in deliveries | others:
+                task.cancel()
+            await asyncio.gather(*deliveries, *others, return_exceptions=True)
+
+    async def _until_stopped(self, tasks: set[asyncio.Task[Any]]) -> None:
+        while not self._stopping.is_set():
+            done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+
+    async def _hand_over(
+        self,
+        left: set[asyncio.Task[None]],
+        others: set[asyncio.Task[Any]],
+        left_s: Callable[[], float],
+    ) -> None:
+        """Let the deliveries finish what is left, for as long as the connection lives and the time allows."""
+        while left and (patience_s := left_s()) > 0:
+            watched = {task for task in others if not task.done()}
+            done, _ = await asyncio.wait(
+                left | watched, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            for task in done:
+                task.result()
+            left = left - done
+
+    async def _alarms(self) -> None:
+        delivery = Delivery(
+            self._outbox,
+            self._connection,
+            self._topics.base,
+            self._stopping,
+            on_sent=self._counters.count_published,
+            on_acknowledged=self._acknowledged,
+        )
+        await delivery.run()
+
+    def _acknowledged(self, message: OutboxMessage) -> None:
+        self._counters.acknowledged += 1
+        if self._home_assistant is not None:
+            self._home_assistant.note(message)
+
+    async def _telemetry(self) -> None:
+        delivery = TelemetryDelivery(
+            self._outbox,
+            self._connection,
+            self._clock,
+            self._stopping,
+            on_sent=self._counters.count_telemetry_sent,
+            on_refused=self._counters.count_telemetry_refused,
+        )
+        await delivery.run()
+
+    async def _listen(self) -> None:
+        """Take what the broker sends: commands, and what Home Assistant says."""
+        if self._intake is not None and await self._connection.watch(self._topics.commands, fresh_only=True):
+            log.warning(
+                "MQTT broker %s:%d does not let this client listen to %s: no commands come over it",
+                self._settings.host,
+                self._settings.port,
+                self._topics.commands,
+            )
+        async for message in self._connection.incoming():
+            if self._home_assistant is not None and self._home_assistant.take(message):
+                continue
+            if self._intake is None:
+                continue
+            answer = await self._intake.take(message)
+            try:
+                await self._connection.deliver(
+                    answer.topic,
+                    answer.payload,
+                    retain=False,
+                    expiry_s=ANSWER_EXPIRY_S,
+                    correlation=answer.correlation,
+                )
+            except PublishRefusedError as error:
+                self._intake.counters.unanswered += 1
+                log.warning("an answer on %r is not taken: %s", answer.topic, error)
+
+    async def _look_after_credentials(self) -> None:
+        """Ask for a new connection when files were replaced by others that can be used.
+
+        Raises:
+            CredentialsReplacedError: they were.
+        """
+        known = self._credentials.stamp
+        while True:
+            await asyncio.sleep(LOOK_S)
+            stamp = await asyncio.to_thread(stamp_of, self._settings)
+            if stamp == known:
+                continue
+            known = stamp
+            try:
+                await asyncio.to_thread(read_credentials, self._settings)
+            except (OSError, ValueError) as error:
+                log.warning("%s; the connection stands, but would not come back after a loss", error)
+                continue
+            raise CredentialsReplacedError
