@@ -2,6 +2,7 @@
 # make test   the tests
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
+# make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
@@ -17,7 +18,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench bench-data lock clean
+.PHONY: help demo test check bench bench-data nothing-lost lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -45,6 +46,9 @@ check: $(READY)
 
 bench: $(READY)
 	@for bench in tests/bench/bench_*.py; do $(BIN)/python $$bench || exit 1; done
+
+nothing-lost: $(READY)
+	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)
 
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done

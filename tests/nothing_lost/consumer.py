@@ -1,0 +1,90 @@
+"""Who the alarms are for: an independent MQTT 3.1.1 client with a persistent session."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Self
+
+import paho.mqtt.client as paho
+
+LOOPBACK = "127.0.0.1"
+PATIENCE_S = 20.0
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """An alarm message as it came: when (CLOCK_MONOTONIC), where, and the bytes."""
+
+    t_ns: int
+    topic: str
+    payload: bytes
+
+    @property
+    def alarm(self) -> dict[str, Any]:
+        """The payload."""
+        told: dict[str, Any] = json.loads(self.payload)
+        return told
+
+
+class Consumer:
+    """Receives every alarm message, over a connection that no fault touches, as long as the broker lives.
+
+    A broker that has forgotten it is subscribed to anew; `subscribed` says when that is done.
+    """
+
+    def __init__(self, port: int) -> None:
+        self.arrivals: list[Arrival] = []
+        self.ids: set[str] = set()
+        self.subscribed = threading.Event()
+        self._client = paho.Client(
+            paho.CallbackAPIVersion.VERSION2, client_id="consumer", clean_session=False
+        )
+        self._client.reconnect_delay_set(0.02, 0.1)  # type: ignore[arg-type]  # seconds; fractions work
+        self._client.on_connect = self._connected
+        self._client.on_disconnect = lambda *_: self.subscribed.clear()
+        self._client.on_subscribe = lambda *_: self.subscribed.set()
+        self._client.on_message = self._take
+        self._port = port
+
+    async def __aenter__(self) -> Self:
+        self._client.connect_async(LOOPBACK, self._port)
+        self._client.loop_start()
+        await self.is_listening()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._client.disconnect()
+        await asyncio.to_thread(self._client.loop_stop)
+
+    async def is_listening(self) -> None:
+        """Wait until the broker has it as a subscriber."""
+        until = time.monotonic() + PATIENCE_S
+        while not self.subscribed.is_set():
+            if time.monotonic() > until:
+                raise TimeoutError(f"the consumer could not subscribe within {PATIENCE_S:g} s")
+            await asyncio.sleep(0.01)
+
+    async def has(self, ids: set[str], timeout_s: float) -> bool:
+        """Wait until it has received all of these, at most so long; whether it has."""
+        until = time.monotonic() + timeout_s
+        while not ids <= self.ids:
+            if time.monotonic() > until:
+                return False
+            await asyncio.sleep(0.01)
+        return True
+
+    def _connected(self, client: paho.Client, _userdata: object, flags: Any, *_: object) -> None:
+        if flags.session_present:
+            self.subscribed.set()
+        else:
+            client.subscribe("daqsvc/#", qos=1)
+
+    def _take(self, _client: object, _userdata: object, message: paho.MQTTMessage) -> None:
+        if "/alarms/" in message.topic and message.payload:
+            arrival = Arrival(time.monotonic_ns(), message.topic, message.payload)
+            self.arrivals.append(arrival)
+            self.ids.add(arrival.alarm["id"])
