@@ -1,4 +1,4 @@
-"""Where state lives that must survive a restart."""
+"""Where state lives that must survive a restart, and how much of it is kept."""
 
 from __future__ import annotations
 
@@ -11,8 +11,27 @@ from daqsvc.settings.section import Section
 
 
 class Store(Section):
-    """Where state lives that must survive a restart."""
+    """Where state lives that must survive a restart, and how much of it is kept.
+
+    The limits hold for what the broker has, and for telemetry. An alarm that the broker has not confirmed is
+    kept for as long as the disk has room.
+    """
 
     directory: Annotated[
         Path, Field(strict=False, description="directory of the journal", examples=["/var/lib/daqsvc"])
     ]
+    alarms_max_mb: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        default=256, description="size of the journal from which on its oldest, sent messages are deleted"
+    )
+    alarms_keep_days: Annotated[float, Field(gt=0, le=36_500)] = Field(
+        default=90.0, description="age from which on sent messages of the journal are deleted"
+    )
+    telemetry_max_mb: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        default=64, description="telemetry that waits for the broker; beyond that, the oldest is dropped"
+    )
+    telemetry_max_age_s: Annotated[float, Field(gt=0, le=3.2e9)] = Field(
+        default=86_400.0, description="age from which on telemetry is dropped"
+    )
+    reserve_mb: Annotated[int, Field(ge=0, le=100_000)] = Field(
+        default=64, description="free space on the disk that telemetry leaves to the alarms"
+    )
