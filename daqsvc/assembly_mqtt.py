@@ -1,13 +1,19 @@
-"""From a machine file to the broker."""
+"""From a machine file to the broker, and to what Home Assistant is told."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
-from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.alarms.commands import Verb
+from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings, MqttSettings, Reading
+from daqsvc.rotor.synchronous.signatures import RotorFault
+from daqsvc.settings.models import BEARING, ROTOR_BANK, ROTOR_SYNCHRONOUS, Keyphasor, ProximityProbe
 
 if TYPE_CHECKING:
-    from daqsvc.settings.models import MachineFile
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daqsvc.settings.models import MachineFile, Sensor
 
 
 def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
@@ -15,15 +21,105 @@ def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
     given = machine.mqtt
     if given is None:
         return None
+
+    def file(path: Path | None) -> Path | None:
+        return None if path is None else machine.resolve(path)
+
     return MqttSettings(
         host=given.host,
         port=given.port,
         client_id=machine.mqtt_client_id,
         tls=given.tls,
-        ca_file=None if given.ca_file is None else machine.resolve(given.ca_file),
+        ca_file=file(given.ca_file),
+        cert_file=file(given.cert_file),
+        key_file=file(given.key_file),
+        key_credential=given.key_credential,
         username=given.username,
-        password_file=None if given.password_file is None else machine.resolve(given.password_file),
+        password_file=file(given.password_file),
+        password_credential=given.password_credential,
         keepalive_s=given.keepalive_s,
         topic_root=given.topic_root,
         protocol=given.protocol,
+        telemetry_expiry_s=given.telemetry_expiry_s,
+        commands=_commands(machine),
+        home_assistant=_home_assistant(machine),
     )
+
+
+def _commands(machine: MachineFile) -> CommandSettings | None:
+    given = None if machine.mqtt is None else machine.mqtt.commands
+    if given is None or not given.enabled:
+        return None
+    return CommandSettings(
+        machines=(machine.machine.name,),
+        allow=frozenset(Verb(verb) for verb in given.allow),
+        max_age_s=given.max_age_s,
+        max_bytes=given.max_bytes,
+    )
+
+
+def _home_assistant(machine: MachineFile) -> HomeAssistantSettings | None:
+    given = None if machine.mqtt is None else machine.mqtt.home_assistant
+    if given is None:
+        return None
+    return HomeAssistantSettings(
+        machine=machine.machine.name,
+        description=machine.machine.description,
+        alarms=tuple(alarm.name for alarm in machine.alarms),
+        services=tuple(_services(machine)),
+        readings=tuple(_readings(machine)),
+        prefix=given.prefix,
+        enabled=given.enabled,
+    )
+
+
+def _services(machine: MachineFile) -> Iterator[str]:
+    """The alarms about sensors, detectors and the service itself (`AlarmManager`, `daqsvc.self_check`)."""
+    if machine.pipeline.levels is not None:
+        yield from (f"sensor-ok/{sensor.name}" for sensor in _measured(machine))
+    yield from (f"detector-ok/{detector}" for detector in machine.detectors)
+    yield from ("store/disk", "store/journal", "store/telemetry", "store/audit-log")
+    if machine.mqtt is not None and machine.mqtt.tls:
+        yield "certificate/broker"
+        if machine.mqtt.ca_file is not None:
+            yield "certificate/ca"
+        if machine.mqtt.cert_file is not None:
+            yield "certificate/client"
+
+
+def _readings(machine: MachineFile) -> Iterator[Reading]:
+    """What is shown by itself: vibration levels of every sensor, speed, 1X, probabilities of the modes."""
+    pipeline = machine.pipeline
+    if pipeline.levels is not None:
+        for sensor in _measured(machine):
+            yield from _levels(sensor)
+    if pipeline.rotor_bank is not None:
+        yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
+        for mode in pipeline.rotor_bank.modes:
+            yield Reading(ROTOR_BANK, "probabilities", mode.name)
+    if pipeline.rotor_synchronous is not None:
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "speed", "rpm")
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.amplitude", "um")
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.phase", "deg")
+        for fault in get_args(RotorFault):
+            yield Reading(ROTOR_SYNCHRONOUS, "probabilities", fault)
+    if pipeline.bearing is not None:
+        from daqsvc.diagnosis.bearing_finding import WORDS  # noqa: PLC0415 - brings SciPy's statistics
+
+        for word in WORDS:
+            yield Reading(BEARING, "probabilities", word)
+
+
+def _measured(machine: MachineFile) -> Iterator[Sensor]:
+    return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
+
+
+def _levels(sensor: Sensor) -> Iterator[Reading]:
+    detector = f"levels/{sensor.name}"
+    yield Reading(detector, "statistics", "rms", sensor.unit)
+    yield Reading(detector, "statistics", "peak", sensor.unit)
+    if isinstance(sensor, ProximityProbe):
+        if sensor.sensitivity_mv_per_unit is not None:
+            yield Reading(detector, "statistics", "gap_voltage", "V")
+    else:
+        yield Reading(detector, "statistics", "velocity_rms", "mm/s")

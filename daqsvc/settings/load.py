@@ -104,7 +104,9 @@ class _Reading:
             table = value_at(meant, path[:-1])
             key = str(path[-1])
             section = section_of(declared_at(MachineFile, meant, path[:-1]), table)
-            better = suggested_key(section, table, key) if section is not None else None
+            # A secret in the file is refused, never taken for the value of some other key.
+            usable = None if is_secret(path) else section
+            better = None if usable is None else suggested_key(usable, table, key)
             value = table.pop(key)
             if better is not None:
                 table[better] = value

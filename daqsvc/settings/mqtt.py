@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
 from urllib.parse import SplitResult, urlsplit
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import Section
+from daqsvc.settings.section import Name, Positive, Section
 
 _DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
 
@@ -45,10 +45,44 @@ def _broker_url(url: str) -> str:
     return url
 
 
+Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypass", "unbypass"]
+"""What may be asked of an alarm."""
+
+_File = Annotated[Path, Field(strict=False)]
+
+
+class MqttCommands(Section):
+    """What may be asked of alarms over the broker; who may ask is the broker's access list."""
+
+    enabled: bool = Field(default=False, description="says that commands are taken from the broker")
+    allow: Annotated[tuple[Command, ...], Field(strict=False)] = Field(
+        default=("acknowledge",),
+        description="what may be asked: acknowledge, reset, shelve, unshelve, bypass, unbypass",
+    )
+    max_age_s: Annotated[Positive, Field(le=3600)] = Field(
+        default=60.0, description="how old a command may be when it arrives"
+    )
+    max_bytes: Annotated[int, Field(ge=256, le=65_536)] = Field(
+        default=4096, description="the longest command that is looked at"
+    )
+
+
+class HomeAssistant(Section):
+    """Home Assistant's discovery: the machine shows up there by itself."""
+
+    enabled: bool = Field(
+        default=True, description="false takes away what has been told to Home Assistant before"
+    )
+    prefix: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
+        default="homeassistant", description="its discovery prefix"
+    )
+
+
 class Mqtt(Section):
     """The broker that alarms and diagnoses go to.
 
-    A password never stands in the machine file, only the name of the file that holds it.
+    A password or key never stands in the machine file, only the name of the file or of the systemd credential
+    that holds it.
     """
 
     url: Annotated[
@@ -63,11 +97,21 @@ class Mqtt(Section):
     username: Annotated[str, Field(min_length=1)] | None = Field(
         default=None, description="user at the broker"
     )
-    password_file: Annotated[Path, Field(strict=False)] | None = Field(
-        default=None, description="file whose first line is the password"
+    password_file: _File | None = Field(default=None, description="file whose first line is the password")
+    password_credential: Name | None = Field(
+        default=None, description="systemd credential (LoadCredential=) in place of password_file"
     )
-    ca_file: Annotated[Path, Field(strict=False)] | None = Field(
+    ca_file: _File | None = Field(
         default=None, description="certificates (PEM) to trust in place of the system's"
+    )
+    cert_file: _File | None = Field(
+        default=None, description="certificate (PEM) that the box shows to the broker"
+    )
+    key_file: _File | None = Field(
+        default=None, description="its private key (PEM), if not in cert_file; not encrypted"
+    )
+    key_credential: Name | None = Field(
+        default=None, description="systemd credential (LoadCredential=) in place of key_file"
     )
     keepalive_s: Annotated[int, Field(ge=1, le=65535)] = Field(
         default=30, description="how soon the broker notices that the box is gone"
@@ -78,6 +122,11 @@ class Mqtt(Section):
     topic_root: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
         default="daqsvc", description="first part of every topic"
     )
+    telemetry_expiry_s: Annotated[Positive, Field(le=86_400)] = Field(
+        default=600.0, description="how long diagnoses and status are worth being delivered late"
+    )
+    commands: MqttCommands = Field(default=MqttCommands(), description="commands that come over the broker")
+    home_assistant: HomeAssistant | None = Field(default=None, description="discovery by Home Assistant")
 
     @property
     def tls(self) -> bool:

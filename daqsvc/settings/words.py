@@ -38,7 +38,7 @@ def dotted(path: KeyPath) -> str:
 def is_secret(path: KeyPath) -> bool:
     """Whether the value at ``path`` must not be repeated in a message."""
     key = next((step for step in reversed(path) if isinstance(step, str)), "")
-    return bool(_SECRET.search(key)) and not key.endswith("_file")
+    return bool(_SECRET.search(key)) and not key.endswith(("_file", "_credential"))
 
 
 def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) -> str | None:

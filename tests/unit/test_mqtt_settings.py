@@ -1,0 +1,99 @@
+"""The table [mqtt]: certificates, credentials, commands and Home Assistant, and what does not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from machine_files import LAVAL, changed, only_problem
+
+from daqsvc.alarms.commands import Verb
+from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings.describe import describe
+
+URL = 'url = "mqtts://broker.example:8883"'
+ROOT = 'topic_root = "daqsvc"'
+
+
+def machine(*replacements):
+    text, _ = changed(LAVAL, *replacements)
+    return parse_machine_file(text, LAVAL)
+
+
+@pytest.mark.parametrize(
+    ("addition", "key", "message", "remedy"),
+    [
+        ('key_file = "box.key"', "mqtt.key_file", "key without a certificate", "add cert_file"),
+        ('key_credential = "box-key"', "mqtt.key_credential", "key without a certificate", "add cert_file"),
+        ('password_credential = "pw"', "mqtt.password_credential", "besides password_file", "remove one"),
+        (
+            'cert_file = "box.crt"\nkey_file = "box.key"\nkey_credential = "box-key"',
+            "mqtt.key_credential",
+            "besides key_file",
+            "remove one",
+        ),
+        ('[mqtt.commands]\nallow = ["reboot"]', "mqtt.commands.allow[0]", "acknowledge", "acknowledge"),
+        ("[mqtt.commands]\nmax_age_s = 0", "mqtt.commands.max_age_s", "greater than 0", "max_age_s"),
+        ("[mqtt.commands]\nmax_bytes = 10", "mqtt.commands.max_bytes", "256 or more", "max_bytes"),
+        ('[mqtt.home_assistant]\nprefix = "a/#"', "mqtt.home_assistant.prefix", "between", "write e.g."),
+    ],
+)
+def test_what_does_not_fit_is_named(addition, key, message, remedy):
+    problem, _ = only_problem(LAVAL, (ROOT, f"{ROOT}\n{addition}"))
+    assert problem.key == key
+    assert message in problem.message
+    assert remedy in problem.remedy
+
+
+def test_plaintext_needs_to_be_meant():
+    problem, _ = only_problem(LAVAL, (URL, 'url = "mqtt://localhost"'))
+    assert problem.key == "mqtt.url"
+    assert "insecure = true" in problem.remedy
+
+
+def test_what_would_go_unencrypted_to_another_host_is_warned_of():
+    plain = machine(
+        (URL, 'url = "mqtt://broker.example"\ninsecure = true\ncert_file = "box.crt"'),
+        (ROOT, f"{ROOT}\n[mqtt.commands]\nenabled = true"),
+    )
+    assert {warning.key for warning in plain.warnings} == {
+        "mqtt.ca_file",
+        "mqtt.cert_file",
+        "mqtt.password_file",
+        "mqtt.commands.enabled",
+    }
+
+
+def test_files_start_at_the_directory_of_the_machine_file():
+    settings = mqtt_settings(machine((ROOT, f'{ROOT}\ncert_file = "tls/box.crt"\nkey_file = "tls/box.key"')))
+    assert settings.cert_file == LAVAL.parent / "tls/box.crt"
+    assert settings.key_file == LAVAL.parent / "tls/box.key"
+    assert settings.ca_file == Path("/etc/daqsvc/ca.pem")
+
+
+def test_without_being_asked_nothing_is_taken_and_nobody_else_is_told():
+    settings = mqtt_settings(load_machine_file(LAVAL))
+    assert settings.commands is None
+    assert settings.home_assistant is None
+
+
+def test_only_enabled_commands_are_taken():
+    listed = '[mqtt.commands]\nallow = ["acknowledge", "shelve"]'
+    assert mqtt_settings(machine((ROOT, f"{ROOT}\n{listed}"))).commands is None
+    enabled = machine((ROOT, f"{ROOT}\n{listed}\nenabled = true"))
+    commands = mqtt_settings(enabled).commands
+    assert commands.machines == ("laval-rig",)
+    assert commands.allow == {Verb.ACKNOWLEDGE, Verb.SHELVE}
+    assert "takes commands: acknowledge, shelve" in describe(enabled)
+
+
+def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
+    told = machine((ROOT, f"{ROOT}\n[mqtt.home_assistant]"))
+    settings = mqtt_settings(told).home_assistant
+    assert settings.alarms == tuple(alarm.name for alarm in told.alarms)
+    assert {"sensor-ok/probe-x", "sensor-ok/probe-y", "detector-ok/rotor-bank"} <= set(settings.services)
+    assert {"certificate/broker", "certificate/ca", "store/disk"} <= set(settings.services)
+    assert "certificate/client" not in settings.services
+    off = machine((ROOT, f"{ROOT}\n[mqtt.home_assistant]\nenabled = false"))
+    assert not mqtt_settings(off).home_assistant.enabled
