@@ -10,8 +10,8 @@ from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limit
 from daqsvc.rotor.calibration.file import CalibrationFileError
 from daqsvc.settings.models import (
     Accelerometer,
-    LevelAlarm,
     ProximityProbe,
+    SetpointAlarm,
     VelocitySensor,
 )
 
@@ -78,7 +78,7 @@ def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
     return [
         Limits(alarm.measure, alarm.alert, alarm.danger)
         for alarm in machine.alarms
-        if isinstance(alarm, LevelAlarm) and alarm.sensor == sensor
+        if isinstance(alarm, SetpointAlarm) and sensor in alarm.watched
     ]
 
 

@@ -1,4 +1,4 @@
-"""Alarms: on a measured level, or on what a detector declares."""
+"""Alarms: on a measured level, on a vote of several, or on a detector; and what holds for all of them."""
 
 from __future__ import annotations
 
@@ -16,20 +16,55 @@ class BaseAlarm(Section):
 
     name: Annotated[Name, Field(description="name of the alarm", examples=["shaft-vibration"])]
     latching: bool = Field(default=False, description="whether it stays until it is reset")
+    first_out_group: Name = Field(default="machine", description="alarms among which the first one is marked")
 
 
-class LevelAlarm(BaseAlarm):
-    """Setpoints on a measure of one sensor, in its unit (velocity RMS in mm/s)."""
+class Setpoints(BaseAlarm):
+    """Setpoints on a measure, in its unit (velocity RMS in mm/s)."""
 
-    kind: ClassVar[str] = "a level alarm"
-
-    sensor: Annotated[Name, Field(description="the sensor it watches", examples=["probe-x"])]
     measure: Annotated[Measure, Field(description="what is held against the setpoints", examples=["rms"])]
     alert: Positive | None = Field(default=None, description="first setpoint")
     danger: Positive | None = Field(default=None, description="second setpoint")
     deadband: NotNegative = Field(default=0.0, description="how far below a setpoint it returns")
     on_delay_s: NotNegative = Field(default=0.0, description="how long above before it is raised")
     off_delay_s: NotNegative = Field(default=0.0, description="how long below before it returns")
+    trip_multiply: Annotated[
+        float, Field(ge=1, le=10, description="factor on the setpoints while the machine starts up")
+    ] = 1.0
+
+
+class LevelAlarm(Setpoints):
+    """Setpoints on a measure of one sensor."""
+
+    kind: ClassVar[str] = "a level alarm"
+
+    sensor: Annotated[Name, Field(description="the sensor it watches", examples=["probe-x"])]
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """Names of the sensors that it watches."""
+        return (self.sensor,)
+
+
+class VotingAlarm(Setpoints):
+    """Setpoints on the same measure of several sensors, of which some must agree."""
+
+    kind: ClassVar[str] = "a voting alarm"
+
+    sensors: Annotated[
+        tuple[Name, ...],
+        Field(strict=False, min_length=2, description="the sensors that vote", examples=[["de-x", "de-y"]]),
+    ]
+    vote: Annotated[int, Field(ge=1, description="how many of them must be at a setpoint", examples=[2])]
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """Names of the sensors that it watches."""
+        return self.sensors
+
+
+SetpointAlarm = LevelAlarm | VotingAlarm
+"""What has setpoints on the measure of one or several sensors."""
 
 
 class DiagnosisAlarm(BaseAlarm):
@@ -38,12 +73,46 @@ class DiagnosisAlarm(BaseAlarm):
     kind: ClassVar[str] = "an alarm on a detector"
 
     detector: Annotated[Name, Field(description="the detector it follows", examples=["rotor-bank"])]
+    evidence_nats: NotNegative = Field(
+        default=0.0, description="evidence without which it is not raised, where the detector states it"
+    )
+
+
+def _kind(table: object) -> type[LevelAlarm | VotingAlarm | DiagnosisAlarm]:
+    keys = table if isinstance(table, dict) else {}
+    if "detector" in keys:
+        return DiagnosisAlarm
+    return VotingAlarm if "sensors" in keys else LevelAlarm
 
 
 Alarm: TypeAlias = Annotated[
-    LevelAlarm | DiagnosisAlarm,
-    Kinds(
-        lambda table: DiagnosisAlarm if "detector" in table else LevelAlarm,
-        (LevelAlarm, DiagnosisAlarm),
-    ),
+    LevelAlarm | VotingAlarm | DiagnosisAlarm, Kinds(_kind, (LevelAlarm, VotingAlarm, DiagnosisAlarm))
 ]
+
+
+class StartUp(Section):
+    """How a start-up is recognised, during which ``trip_multiply`` holds: a range, a rate, or either."""
+
+    detector: Annotated[Name, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
+    measure: str = Field(default="speed", description="the signal among its statistics")
+    between: Annotated[tuple[float, float], Field(strict=False)] | None = Field(
+        default=None, description="the signal lies in this range", examples=[[300.0, 2700.0]]
+    )
+    change_per_s: Positive | None = Field(default=None, description="the signal changes at least so fast")
+    at_most_s: Positive = Field(default=120.0, description="how long it may last at most")
+
+
+class AlarmHandling(Section):
+    """What holds for all alarms of the machine."""
+
+    chatter_raises: Annotated[int, Field(ge=0)] = Field(
+        default=5, description="raises within the window beyond which an alarm chatters; 0: never"
+    )
+    chatter_window_s: Positive = Field(default=60.0, description="the window that these are counted over")
+    chatter_quiet_s: Positive = Field(default=60.0, description="how long it must stand still to be quiet")
+    flood_alarms: Annotated[int, Field(ge=0)] = Field(
+        default=10, description="alarms within the window beyond which they are a flood; 0: never"
+    )
+    flood_window_s: Positive = Field(default=600.0, description="the window that these are counted over")
+    shelve_at_most_s: Positive = Field(default=28_800.0, description="the longest time to shelve an alarm")
+    start_up: StartUp | None = Field(default=None, description="when trip_multiply holds")

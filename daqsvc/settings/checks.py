@@ -11,7 +11,7 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
@@ -29,8 +29,8 @@ from daqsvc.settings.layout_checks import (
     check_voltages,
     unique,
 )
-from daqsvc.settings.problems import Finding, choice
-from daqsvc.settings.rotor_checks import check_alarm_detector, rotor_checks
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
@@ -89,15 +89,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield _velocity_band(draft)
     yield from rotor_checks(draft)
     yield from bearing_checks(draft)
-    with suppress(UnusableValueError):
-        for index, alarm in enumerate(draft.alarms):
-            at = ("alarms", index)
-            if isinstance(alarm, LevelAlarm):
-                yield _setpoints(alarm, at)
-                yield _alarm_sensor(draft, alarm, at)
-                yield _alarm_levels(draft, alarm, at)
-            elif isinstance(alarm, DiagnosisAlarm):
-                yield check_alarm_detector(draft, alarm, at)
+    yield from alarm_checks(draft)
     with suppress(UnusableValueError):
         if draft.mqtt is not None:
             yield _transport(draft.mqtt)
@@ -117,10 +109,6 @@ def _unused_buses(draft: MachineFile) -> Iterator[Finding]:
             yield Finding(
                 ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
             )
-
-
-def _named(draft: MachineFile) -> dict[str, Sensor]:
-    return {sensor.name: sensor for sensor in draft.sensors}
 
 
 def _rate_hz(draft: MachineFile, sensor: Sensor) -> float | None:
@@ -167,58 +155,6 @@ def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
                 else "sample faster, or write a lower band",
             )
             return
-
-
-def _setpoints(alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
-    setpoints = [level for level in (alarm.alert, alarm.danger) if level is not None]
-    if not setpoints:
-        yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
-        return
-    if alarm.alert is not None and alarm.danger is not None and alarm.alert >= alarm.danger:
-        yield Finding(
-            (*at, "alert"),
-            f"must be below danger = {alarm.danger:g}",
-            "correct one of the two"
-            if alarm.alert == alarm.danger
-            else "swap the two, or correct one of them",
-        )
-    if alarm.deadband >= min(setpoints):
-        yield Finding(
-            (*at, "deadband"),
-            f"must be smaller than the setpoint {min(setpoints):g}, or the alarm never returns",
-            f"write e.g. deadband = {min(setpoints) / 20:.3g}",
-        )
-
-
-def _alarm_sensor(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
-    sensors = _named(draft)
-    if alarm.sensor not in sensors:
-        yield Finding((*at, "sensor"), "there is no such sensor", choice(alarm.sensor, sensors))
-        return
-    sensor = sensors[alarm.sensor]
-    if sensor.type == "keyphasor":
-        vibration = [name for name, other in sensors.items() if other.type != "keyphasor"]
-        yield Finding(
-            (*at, "sensor"), "is a keyphasor, which measures no vibration", choice(alarm.sensor, vibration)
-        )
-    elif sensor.type == "proximity" and alarm.measure == "velocity_rms":
-        yield Finding(
-            (*at, "measure"),
-            f'needs an accelerometer or a velocity sensor, but "{alarm.sensor}" is a proximity probe',
-            'write measure = "rms" or "peak", with setpoints in ' + sensor.unit,
-        )
-
-
-def _alarm_levels(draft: MachineFile, alarm: LevelAlarm, at: KeyPath) -> Iterator[Finding]:
-    with suppress(UnusableValueError):
-        if alarm.sensor not in _named(draft):
-            return  # said already, about the same key
-    if draft.pipeline.levels is None:
-        yield Finding(
-            (*at, "sensor"),
-            "nothing measures its level",
-            "write a table [pipeline.levels] (it may be empty), or remove the alarm",
-        )
 
 
 def _transport(mqtt: Mqtt) -> Iterator[Finding]:

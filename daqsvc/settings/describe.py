@@ -6,7 +6,7 @@ import re
 import textwrap
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.alarms import LevelAlarm
+from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
 from daqsvc.settings.bearing import BEARING
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.layout_checks import bus_share, frame_facts
@@ -262,19 +262,24 @@ _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay")
 def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
     for alarm in machine.alarms:
         latching = "; latching" if alarm.latching else ""
-        if not isinstance(alarm, LevelAlarm):
-            yield alarm.name, alarm.detector, "by mode", "by mode", "", f"none{latching}"
+        if not isinstance(alarm, SetpointAlarm):
+            evidence = f"{alarm.evidence_nats:g} nats at least" if alarm.evidence_nats else "none"
+            yield alarm.name, alarm.detector, "by mode", "by mode", "", f"{evidence}{latching}"
             continue
         unit = {"velocity_rms": "mm/s", "crest_factor": ""}.get(
-            alarm.measure, machine.sensor(alarm.sensor).unit
+            alarm.measure, machine.sensor(alarm.watched[0]).unit
         )
+        watched = (
+            alarm.sensor if isinstance(alarm, LevelAlarm) else f"{alarm.vote} of {', '.join(alarm.sensors)}"
+        )
+        multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
             alarm.name,
-            f"{alarm.measure} of {alarm.sensor}",
+            f"{alarm.measure} of {watched}",
             "-" if alarm.alert is None else f"{alarm.alert:g} {unit}".rstrip(),
             "-" if alarm.danger is None else f"{alarm.danger:g} {unit}".rstrip(),
             f"{alarm.deadband:g} {unit}".rstrip(),
-            f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{latching}",
+            f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",
         )
 
 

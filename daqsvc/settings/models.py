@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.alarms import Alarm, DiagnosisAlarm, LevelAlarm
+from daqsvc.settings.alarms import (
+    Alarm,
+    AlarmHandling,
+    DiagnosisAlarm,
+    LevelAlarm,
+    SetpointAlarm,
+    VotingAlarm,
+)
 from daqsvc.settings.bearing import BEARING, Bearing, WatchedBearing
 from daqsvc.settings.buses import (
     Bus,
@@ -44,6 +51,7 @@ __all__ = [
     "ROTOR_SYNCHRONOUS",
     "Accelerometer",
     "Alarm",
+    "AlarmHandling",
     "Bearing",
     "Bus",
     "CanBus",
@@ -70,9 +78,11 @@ __all__ = [
     "RotorBank",
     "RotorSynchronous",
     "Sensor",
+    "SetpointAlarm",
     "Store",
     "Stream",
     "VelocitySensor",
+    "VotingAlarm",
     "WatchedBearing",
 ]
 
@@ -166,6 +176,7 @@ class MachineFile(Section):
     sensors: Annotated[tuple[Sensor, ...], Field(strict=False, min_length=1, description="the sensors")]
     pipeline: Pipeline = Field(default=Pipeline(), description="what is computed")
     alarms: Annotated[tuple[Alarm, ...], Field(strict=False)] = Field(default=(), description="the alarms")
+    alarm_handling: AlarmHandling = Field(default=AlarmHandling(), description="what holds for all alarms")
     mqtt: Mqtt | None = Field(default=None, description="the broker; none is configured if absent")
     store: Store | None = Field(default=None, description="the journal's place")
 

@@ -172,7 +172,7 @@ UNKNOWN_KEYS = [
         'detector = "rotor-bank"',
         'detector = "rotor-bank"\nalert = 1',
         "alarms[2].alert",
-        "belongs to a level alarm, but this is an alarm on a detector",
+        "belongs to a level alarm or a voting alarm, but this is an alarm on a detector",
         "remove it",
     ),
     ("[store]", "[shop]\n[store]", "shop", "unknown key", "remove it"),

@@ -1,0 +1,169 @@
+"""Whether the alarms of a machine file can be judged, raised and returned as they stand."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm, SetpointAlarm, VotingAlarm
+from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.rotor_checks import check_alarm_detector
+from daqsvc.settings.section import UnusableValueError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.settings.alarms import StartUp
+    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.problems import KeyPath
+
+_TAKEN = ("alarm-flood", "trip-multiply")
+"""Alarms that the service raises itself."""
+_START_UP: KeyPath = ("alarm_handling", "start_up")
+
+
+def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
+    """Every check of the alarms.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+    """
+    with suppress(UnusableValueError):
+        for index, alarm in enumerate(draft.alarms):
+            at: KeyPath = ("alarms", index)
+            yield _name(alarm.name, at)
+            if isinstance(alarm, SetpointAlarm):
+                yield _setpoints(alarm, at)
+                yield _alarm_sensors(draft, alarm, at)
+                yield _alarm_levels(draft, alarm, at)
+                yield _trip_multiply(draft, alarm, at)
+            if isinstance(alarm, VotingAlarm):
+                yield _vote(draft, alarm, at)
+            if isinstance(alarm, DiagnosisAlarm):
+                yield check_alarm_detector(draft, alarm, at)
+    with suppress(UnusableValueError):
+        if draft.alarm_handling.start_up is not None:
+            yield _start_up(draft, draft.alarm_handling.start_up)
+
+
+def _name(name: str, at: KeyPath) -> Iterator[Finding]:
+    if name in _TAKEN:
+        yield Finding(
+            (*at, "name"), "is an alarm that the service raises itself", "give this one another name"
+        )
+
+
+def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    setpoints = [level for level in (alarm.alert, alarm.danger) if level is not None]
+    if not setpoints:
+        yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
+        return
+    if alarm.alert is not None and alarm.danger is not None and alarm.alert >= alarm.danger:
+        yield Finding(
+            (*at, "alert"),
+            f"must be below danger = {alarm.danger:g}",
+            "correct one of the two"
+            if alarm.alert == alarm.danger
+            else "swap the two, or correct one of them",
+        )
+    if alarm.deadband >= min(setpoints):
+        yield Finding(
+            (*at, "deadband"),
+            f"must be smaller than the setpoint {min(setpoints):g}, or the alarm never returns",
+            f"write e.g. deadband = {min(setpoints) / 20:.3g}",
+        )
+
+
+def _alarm_sensors(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    one = isinstance(alarm, LevelAlarm)
+    for position, name in enumerate(alarm.watched):
+        here = (*at, "sensor") if one else (*at, "sensors", position)
+        yield from _alarm_sensor(draft, alarm, name, here, at)
+
+
+def _alarm_sensor(
+    draft: MachineFile, alarm: SetpointAlarm, name: str, here: KeyPath, at: KeyPath
+) -> Iterator[Finding]:
+    sensors = _named(draft)
+    if name not in sensors:
+        yield Finding(here, "there is no such sensor", choice(name, sensors))
+        return
+    sensor = sensors[name]
+    if sensor.type == "keyphasor":
+        vibration = [other for other, described in sensors.items() if described.type != "keyphasor"]
+        yield Finding(here, "is a keyphasor, which measures no vibration", choice(name, vibration))
+    elif sensor.type == "proximity" and alarm.measure == "velocity_rms":
+        yield Finding(
+            (*at, "measure"),
+            f'needs an accelerometer or a velocity sensor, but "{name}" is a proximity probe',
+            'write measure = "rms" or "peak", with setpoints in ' + sensor.unit,
+        )
+
+
+def _alarm_levels(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    with suppress(UnusableValueError):
+        if not set(alarm.watched) <= set(_named(draft)):
+            return  # said already, about the same key
+    if draft.pipeline.levels is None:
+        yield Finding(
+            (*at, "sensor" if isinstance(alarm, LevelAlarm) else "sensors"),
+            "nothing measures its level"
+            if isinstance(alarm, LevelAlarm)
+            else "nothing measures their levels",
+            "write a table [pipeline.levels] (it may be empty), or remove the alarm",
+        )
+
+
+def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Finding]:
+    count = len(alarm.sensors)
+    if alarm.vote > count:
+        yield Finding(
+            (*at, "vote"),
+            f"cannot be reached by {count} sensors",
+            f"write vote = {count} or less, or add sensors",
+        )
+    for position, name in enumerate(alarm.sensors):
+        if name in alarm.sensors[:position]:
+            yield Finding((*at, "sensors", position), "votes twice", "name each sensor once")
+    if alarm.measure in {"velocity_rms", "crest_factor"}:
+        return
+    units = {s.unit for s in draft.sensors if s.name in alarm.sensors and s.type != "keyphasor"}
+    if len(units) > 1:
+        yield Finding(
+            (*at, "sensors"),
+            f"one setpoint for sensors in {' and '.join(sorted(units))}",
+            "let only sensors of one unit vote together",
+        )
+
+
+def _trip_multiply(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
+    if alarm.trip_multiply > 1 and draft.alarm_handling.start_up is None:
+        yield Finding(
+            (*at, "trip_multiply"),
+            "never holds: nothing says when the machine starts up",
+            "write a table [alarm_handling.start_up], or remove it",
+        )
+
+
+def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
+    if start_up.between is None and start_up.change_per_s is None:
+        yield Finding(_START_UP, "has neither between nor change_per_s", "add one of the two, or both")
+    if start_up.between is not None and not start_up.between[0] < start_up.between[1]:
+        yield Finding((*_START_UP, "between"), "is no range", "write the lower end first")
+    if start_up.detector not in draft.detectors:
+        yield Finding(
+            (*_START_UP, "detector"),
+            "there is no such detector in [pipeline]",
+            choice(start_up.detector, draft.detectors),
+        )
+    if not any(isinstance(alarm, SetpointAlarm) and alarm.trip_multiply > 1 for alarm in draft.alarms):
+        yield Finding(
+            _START_UP,
+            "has no effect: no alarm has a trip_multiply",
+            "write e.g. trip_multiply = 2.0 in an alarm on a level, or remove it",
+            fatal=False,
+        )
+
+
+def _named(draft: MachineFile) -> dict[str, Sensor]:
+    return {sensor.name: sensor for sensor in draft.sensors}
