@@ -124,13 +124,20 @@ class Pipeline:
             await asyncio.shield(asyncio.to_thread(self._pool.shutdown))
 
     async def _listen_for_silence(self) -> None:
-        """Have detectors say, once, that their stream has fallen silent: a window never comes to say it."""
+        """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
+
+        A process that was suspended has not listened: what came meanwhile still waits to be read.
+        """
         ends = {name: ring.end_index for name, ring in self._rings.items()}
-        since_ns = dict.fromkeys(self._rings, self._clock.monotonic_ns())
+        looked_ns = self._clock.monotonic_ns()
+        since_ns = dict.fromkeys(self._rings, looked_ns)
         said: set[str] = set()
         while True:
             await self._clock.sleep_ns(LOOK_NS)
             now_ns = self._clock.monotonic_ns()
+            late_ns, looked_ns = now_ns - looked_ns - LOOK_NS, now_ns
+            if late_ns > LOOK_NS:
+                since_ns = {name: heard_ns + late_ns for name, heard_ns in since_ns.items()}
             for name, ring in self._rings.items():
                 if ring.end_index != ends[name]:
                     ends[name], since_ns[name] = ring.end_index, now_ns
