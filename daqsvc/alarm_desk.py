@@ -1,4 +1,4 @@
-"""The alarm desk: diagnoses in; alarms on disk and at the broker out.
+"""The alarm desk: diagnoses and commands in; alarms on disk and at the broker out.
 
 Everything that must not be lost passes here and nowhere else: an event leaves the alarm manager, gets its
 number and its place on disk from the outbox, and is published from there. The desk knows nothing of buses,
@@ -8,59 +8,113 @@ samples or detectors, so it can be tried by itself.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
-from typing import TYPE_CHECKING
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.alarms.states import Level
+from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.audit import AuditError, AuditLog
+from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload
 from daqsvc.publish.recall import recall
 from daqsvc.publish.topics import Topics
+from daqsvc.self_check import SelfCheck, Vitals
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.alarms.events import AlarmEvent, Identity
-    from daqsvc.alarms.rules import DiagnosisRule, LevelRule
+    from daqsvc.alarms.handling import AlarmHandling
+    from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.publish.mqtt import MqttSettings
 
 logger = logging.getLogger(__name__)
 
+TICK_NS = NS_PER_S
+DISK_TICKS = 10
+"""The disk fills slowly, and asking it may take long."""
+COMMIT_S = 5.0
+"""How long an answer waits for the disk before it says that the disk has not got it yet."""
+MOST_COMMANDS = 64
+"""Commands that may wait at a time; further ones are refused."""
+STOPPING = "the service is stopping; ask again when it runs"
+
+
+@dataclass(slots=True)
+class CommandCounters:
+    """What became of people's commands, from wherever they came; every figure only grows.
+
+    Attributes:
+        accepted: carried out.
+        refused: refused, for whatever reason.
+        unwritten: of those refused, because the audit log could not be written.
+        unanswered_in_log: carried out or refused, but the audit log could not take the outcome.
+    """
+
+    accepted: int = 0
+    refused: int = 0
+    unwritten: int = 0
+    unanswered_in_log: int = 0
+
 
 class AlarmDesk:
     """Alarms of one machine, from diagnosis to broker.
 
-    Use: `open`, `resume`, then `take` as diagnoses come while `run` runs; `settle`, `stop`, `close`.
+    Use: `open`, `resume`, then `take` and `obey` as diagnoses and commands come while `run` and `keep_time`
+    run; `settle`, `stop`, `close`.
 
     Args:
         identity: whose alarms these are.
         rules: one per alarm.
-        store: directory of the journal.
+        store: directory of the journal and the audit log.
         clock: the service's clock.
         mqtt: how to reach the broker; None keeps everything in the journal.
+        handling: what holds for all alarms.
+        limits: how much the journal may keep.
     """
 
     def __init__(
         self,
         identity: Identity,
-        rules: Sequence[LevelRule | DiagnosisRule],
+        rules: Sequence[Rule],
         store: Path,
         clock: Clock,
         mqtt: MqttSettings | None,
+        *,
+        handling: AlarmHandling | None = None,
+        limits: OutboxLimits | None = None,
     ) -> None:
+        limits = limits or OutboxLimits()
         self.identity = identity
-        self.manager = AlarmManager(identity, rules, clock)
-        self.outbox = Outbox(store / "outbox.sqlite", clock)
+        self.manager = AlarmManager(identity, rules, clock, handling=handling)
+        self.outbox = Outbox(store / "outbox.sqlite", clock, limits)
+        self.audit = AuditLog(store / "audit.jsonl", clock)
+        self.commands = CommandCounters()
         self.publisher = (
-            None if mqtt is None else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock)
+            None
+            if mqtt is None
+            else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock, commands=self.obey)
         )
         self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
-        self._under_way: set[asyncio.Future[int]] = set()
+        self._clock = clock
+        self._self_check = SelfCheck(store, limits.reserve_bytes)
+        self._free_bytes: int | None = None
+        self._under_way: set[asyncio.Future[Any]] = set()
+        self._one_at_a_time = asyncio.Lock()
+        self._commands_waiting = 0
+        self._stopping = False
 
     async def open(self) -> None:
         """Open the journal.
@@ -85,13 +139,64 @@ class AlarmDesk:
         if self.publisher is not None:
             await self.publisher.run()
 
+    async def keep_time(self) -> None:
+        """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
+        for tick in itertools.count():
+            if tick % DISK_TICKS == 0:
+                await self._look_at_disk()
+            self.tick()
+            await self._clock.sleep_ns(TICK_NS)
+
+    def tick(self) -> None:
+        """What time alone brings, such as the end of shelving, and how the service itself stands."""
+        for event in self.manager.tick():
+            self._post(event)
+        for condition in self._self_check.look(self._vitals()):
+            for event in self.manager.condition(*condition):
+                self._post(event)
+
     def take(self, diagnosis: Diagnosis) -> None:
         """Take in a diagnosis; what follows from it is on its way to the disk when this returns."""
         for event in self.manager.take(diagnosis):
             self._post(event)
 
+    async def obey(self, command: AlarmCommand, source: str) -> CommandOutcome:
+        """Carry out a person's command, one after the other: written down, obeyed, committed, answered.
+
+        A command that has begun is carried out to its end, even if nobody waits for the answer any more.
+
+        Args:
+            command: what is asked; whoever calls has made sure that it may be asked.
+            source: the way it came, for the audit log.
+
+        Returns:
+            What came of it; if it was obeyed, its events are on disk.
+        """
+        if self._stopping:
+            return self._refuse(STOPPING)
+        if self._commands_waiting >= MOST_COMMANDS:
+            return self._refuse(f"{MOST_COMMANDS} commands wait for the disk already; ask again later")
+        self._commands_waiting += 1
+        work = asyncio.create_task(self._carry_out(command, source), name=f"command {command.verb}")
+        self._watch(work)
+        return await asyncio.shield(work)
+
+    def figures(self) -> dict[str, Any]:
+        """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
+        shown = Counter(status.state for status in self.manager.alarms.values())
+        return {
+            "active": sum(count for state, count in shown.items() if state.is_active),
+            "unacknowledged": sum(c for state, c in shown.items() if state.value.endswith("_unacknowledged")),
+            "latched": sum(count for state, count in shown.items() if state.is_latched),
+            "suppressed": shown[AlarmState.SUPPRESSED],
+            "shelved": shown[AlarmState.SHELVED],
+            "out_of_service": shown[AlarmState.OUT_OF_SERVICE],
+            **asdict(self.manager.counters),
+        }
+
     async def settle(self, timeout_s: float) -> None:
-        """Wait until the events that are under way are on disk, at most so long."""
+        """Take no more commands, and wait until what is under way is on disk, at most so long."""
+        self._stopping = True
         if self._under_way:
             await asyncio.wait(set(self._under_way), timeout=timeout_s)
 
@@ -104,18 +209,109 @@ class AlarmDesk:
         """Close the journal; see `Outbox.close`."""
         await self.outbox.close(timeout_s)
 
-    def _post(self, event: AlarmEvent) -> None:
+    async def _carry_out(self, command: AlarmCommand, source: str) -> CommandOutcome:
+        try:
+            async with self._one_at_a_time:
+                if self._stopping:
+                    return self._refuse(STOPPING)
+                entry = await self.audit.asked(command, source)
+                outcome = await self._outcome(command)
+                await self._write_down(entry, command, source, outcome)
+                return outcome
+        except AuditError as error:
+            logger.error("a command to %s %s was refused: %s", command.verb, command.alarm, error)  # noqa: TRY400
+            self.commands.unwritten += 1
+            return self._refuse(f"{error}")
+        finally:
+            self._commands_waiting -= 1
+
+    async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
+        try:
+            events = self.manager.obey(command)
+        except RefusedError as refusal:
+            return self._refuse(f"{refusal}")
+        self.commands.accepted += 1
+        committed = [self._post(event) for event in events]
+        if committed:
+            await asyncio.wait(committed, timeout=COMMIT_S)
+        return CommandOutcome(
+            accepted=True,
+            reason=_not_on_disk(committed),
+            events=tuple(f"{self.identity.box}-{sequence}" for sequence in _sequences(committed)),
+        )
+
+    async def _write_down(
+        self, entry: str, command: AlarmCommand, source: str, outcome: CommandOutcome
+    ) -> None:
+        """Write down what came of a command: too late to take it back if that fails."""
+        try:
+            await self.audit.answered(entry, command, source, outcome)
+        except AuditError as error:
+            self.commands.unanswered_in_log += 1
+            logger.error("what came of command %s is not in the log: %s", entry, error)  # noqa: TRY400
+
+    def _vitals(self) -> Vitals:
+        outbox, publisher = self.outbox.counters, self.publisher
+        return Vitals(
+            now_ns=self._clock.monotonic_ns(),
+            wall_ns=self._clock.wall_ns(),
+            certificates_end_ns={} if publisher is None else publisher.certificate_expiry,
+            conditions_told=self.manager.conditions,
+            connected=publisher is None or publisher.counters.connected,
+            free_bytes=self._free_bytes,
+            waiting=outbox.waiting,
+            write_errors=outbox.write_errors,
+            lost=outbox.refused + outbox.lost,
+            telemetry_dropped=outbox.telemetry.dropped,
+            unwritten=self.commands.unwritten,
+        )
+
+    async def _look_at_disk(self) -> None:
+        try:
+            self._free_bytes = await asyncio.to_thread(self._self_check.free_bytes)
+        except OSError as error:
+            if self._free_bytes is not None:
+                logger.error("nobody knows how full the disk of the journal is: %s", error)  # noqa: TRY400
+            self._free_bytes = None
+
+    def _refuse(self, reason: str) -> CommandOutcome:
+        self.commands.refused += 1
+        return CommandOutcome(accepted=False, reason=reason)
+
+    def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
         logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
-        committed = self.outbox.submit(
-            self.topics.alarm(event.identity.machine, event.alarm),
-            lambda sequence: alarm_payload(event, sequence).to_json(),
-            retain=True,
-        )
-        self._under_way.add(committed)
-        committed.add_done_callback(self._committed)
+        topic = self.topics.alarm(event.identity.machine, event.alarm)
+        try:
+            committed = self.outbox.submit(
+                topic, lambda sequence: alarm_payload(event, sequence).to_json(), retain=True
+            )
+        except OutboxError as error:
+            committed = asyncio.get_running_loop().create_future()
+            committed.set_exception(error)
+        self._watch(committed)
+        committed.add_done_callback(_tell_loss)
+        return committed
 
-    def _committed(self, committed: asyncio.Future[int]) -> None:
-        self._under_way.discard(committed)
-        if not committed.cancelled() and (error := committed.exception()) is not None:
-            logger.error("an alarm event never reached the disk: %s", error)
+    def _watch(self, work: asyncio.Future[Any]) -> None:
+        self._under_way.add(work)
+        work.add_done_callback(self._under_way.discard)
+
+
+def _sequences(committed: Sequence[asyncio.Future[int]]) -> list[int]:
+    return [one.result() for one in committed if one.done() and one.exception() is None]
+
+
+def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
+    """Why what was done may be undone by a restart; empty if it cannot."""
+    if all(one.done() and one.exception() is None for one in committed):
+        return ""
+    errors = [f"{one.exception()}" for one in committed if one.done() and one.exception() is not None]
+    return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
+        "; ".join(errors) or "the event waits in memory; make room on the disk"
+    )
+
+
+def _tell_loss(committed: asyncio.Future[int]) -> None:
+    if not committed.cancelled() and (error := committed.exception()) is not None:
+        logger.error("an alarm event never reached the disk: %s", error)

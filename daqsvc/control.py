@@ -146,7 +146,16 @@ class ControlServer:
         Raises:
             ControlError: the path is too long for a socket, or taken by something else, or not writable.
         """
-        listening, self._inode = await asyncio.to_thread(_bind, self.path)
+        binding = asyncio.ensure_future(asyncio.to_thread(_bind, self.path))
+        try:
+            listening, self._inode = await asyncio.shield(binding)
+        except asyncio.CancelledError:
+            await asyncio.wait({binding})
+            if binding.exception() is None:
+                listening, inode = binding.result()
+                listening.close()
+                _remove(self.path, inode)
+            raise
         self._server = await asyncio.start_unix_server(self._welcome, sock=listening, limit=LONGEST_LINE)
 
     async def close(self) -> None:
@@ -212,12 +221,35 @@ def parse_request(line: bytes, machine: str) -> Request:
     try:
         request = Request.model_validate_json(line)
     except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        where = ".".join(map(str, problem["loc"])) or "it"
-        raise ValueError(f"the request is not valid, {where}: {problem['msg']}") from None
+        raise ValueError(f"the request is not valid, {_first_problem(error)}") from None
     if request.machine not in {None, machine}:
         raise ValueError(f"this service watches {machine!r}, not {request.machine!r}")
     return request
+
+
+def request_of(command: AlarmCommand, machine: str | None) -> Request:
+    """The request for a command.
+
+    Args:
+        command: what is asked.
+        machine: the machine that is meant; None for whichever the service watches.
+
+    Raises:
+        ControlError: it cannot be asked, e.g. because a text is too long.
+    """
+    try:
+        return Request(
+            schema_=_REQUEST,
+            verb=command.verb,
+            alarm=command.alarm,
+            by=command.by,
+            machine=machine,
+            occurrence=command.occurrence,
+            duration_s=command.duration_s,
+            reason=command.reason,
+        )
+    except ValidationError as error:
+        raise ControlError(f"that cannot be asked, {_first_problem(error)}") from None
 
 
 def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOutcome:
@@ -334,6 +366,11 @@ def _check_length(path: Path) -> None:
             f"the path of the control socket {path} has {length} bytes, at most {LONGEST_PATH} are possible: "
             "choose a store with a shorter path"
         )
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, problem['loc'])) or 'it'}: {problem['msg']}"
 
 
 def _in_short(error: Exception) -> str:

@@ -16,6 +16,8 @@ from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_rules, identity
 from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.assembly_store import outbox_limits
+from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
 
@@ -36,6 +38,8 @@ logger = logging.getLogger(__name__)
 STATUS_EVERY_NS = NS_PER_S
 LAG_EVERY_S = 0.01
 LAG_REMEMBERED = 6000
+SUSPENDED_S = 1.0
+"""A loop that is later than this was not busy: the process was suspended, or the host starved it."""
 RELEASE_S = 0.6
 """What drivers may take to let go of their buses."""
 DRAIN_S = 0.3
@@ -47,9 +51,14 @@ CLOSE_S = 0.3
 
 
 class LoopLag:
-    """How late the event loop gets round to things: a timer's lateness, every 10 ms for a minute."""
+    """How late the event loop gets round to things: a timer's lateness, every 10 ms for a minute.
+
+    Attributes:
+        suspensions: how often it stood still for longer than `SUSPENDED_S`.
+    """
 
     def __init__(self) -> None:
+        self.suspensions = 0
         self._late_s: deque[float] = deque(maxlen=LAG_REMEMBERED)
 
     async def watch(self) -> None:
@@ -58,7 +67,15 @@ class LoopLag:
         while True:
             due_s = loop.time() + LAG_EVERY_S
             await asyncio.sleep(LAG_EVERY_S)
-            self._late_s.append(loop.time() - due_s)
+            late_s = loop.time() - due_s
+            self._late_s.append(late_s)
+            if late_s > SUSPENDED_S:
+                self.suspensions += 1
+                logger.warning(
+                    "the process stood still for %.1f s (suspended, or starved by the host); samples that no "
+                    "buffer could hold meanwhile are counted as lost",
+                    late_s,
+                )
 
     def figures_ms(self) -> dict[str, float]:
         """Median, 99th percentile and maximum of the lateness, in ms."""
@@ -92,7 +109,15 @@ class Service:
         self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
         self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
-        self.desk = AlarmDesk(self._identity, alarm_rules(machine), store, self.clock, mqtt_settings(machine))
+        self.desk = AlarmDesk(
+            self._identity,
+            alarm_rules(machine),
+            store,
+            self.clock,
+            mqtt_settings(machine),
+            limits=outbox_limits(machine),
+        )
+        self.control = ControlServer(store, machine.machine.name, self.desk.obey)
 
     @property
     def publisher(self) -> MqttPublisher | None:
@@ -116,12 +141,18 @@ class Service:
                 await self._serve(stopped)
         finally:
             await _cancel([starting, stopped], DRAIN_S)
+            await self.control.close()
             await self.desk.close(CLOSE_S)
 
     async def _start(self) -> None:
         await self.desk.open()
         await self.pipeline.warm()
         await self._resume()
+        try:
+            await self.control.open()
+        except ControlError as error:
+            # Watching the machine matters more than being told what to do.
+            logger.error("no commands on this box: %s", error)  # noqa: TRY400 - the message says it all
 
     async def _resume(self) -> None:
         """Take over from the journal how the alarms stood when the service ended."""
@@ -130,7 +161,11 @@ class Service:
         await self.desk.resume({s.detector: s.sensors for s in said})
 
     async def _serve(self, stopped: asyncio.Task[Any]) -> None:
-        helpers = [self._task(self.lag.watch(), "loop lag"), self._task(self._tell_status(), "status")]
+        helpers = [
+            self._task(self.lag.watch(), "loop lag"),
+            self._task(self._tell_status(), "status"),
+            self._task(self.desk.keep_time(), "alarm times"),
+        ]
         publishing = None if self.publisher is None else self._task(self.desk.run(), "mqtt")
         pipeline = self._task(self.pipeline.run(), "pipeline")
         reading = [self._task(driver.run(), f"driver {driver.name}") for driver in self.drivers]
@@ -139,6 +174,7 @@ class Service:
             self.ready.set()
             await self._until_stopped(stopped, everything)
         finally:
+            await self.control.close()
             await _cancel(reading, RELEASE_S)
             for ring in self.rings.values():
                 ring.close()
@@ -180,7 +216,7 @@ class Service:
             self.publisher.telemetry("status", payload.to_json())
 
     def figures(self) -> dict[str, Any]:
-        """The service's figures by what they belong to: streams, buses, detectors, loop, outbox, MQTT."""
+        """The service's figures by what they belong to: streams, buses, detectors, alarms, outbox, MQTT."""
         streams: dict[str, Mapping[str, float]] = {}
         buses: dict[str, Mapping[str, Any]] = {}
         for driver in self.drivers:
@@ -202,8 +238,12 @@ class Service:
             "buses": buses,
             "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
             "loop_lag_ms": self.lag.figures_ms(),
+            "suspensions": self.lag.suspensions,
+            "alarms": self.desk.figures(),
+            "commands": asdict(self.desk.commands),
+            "control": asdict(self.control.counters),
             "outbox": asdict(self.desk.outbox.counters),
-            "mqtt": {} if self.publisher is None else _numbers(asdict(self.publisher.counters)),
+            "mqtt": {} if self.publisher is None else self.publisher.figures(),
         }
 
 
@@ -213,10 +253,6 @@ def _ring(machine: MachineFile, stream: str, detectors: Sequence[Detector]) -> S
     # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
     needed = max((4 * d.block for d in detectors if d.stream == stream), default=1)
     return SampleRing(stream, described.layout.channel_names, max(wanted, needed))
-
-
-def _numbers(figures: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: int(value) if isinstance(value, bool) else value for name, value in figures.items()}
 
 
 async def _cancel(tasks: list[asyncio.Task[Any]], patience_s: float) -> None:

@@ -74,7 +74,7 @@ async def test_what_cleared_while_the_service_was_dead_does_not_stay_active_at_t
             await shake(service, LOUD)
             await heard(service, ALARM, "active_unacknowledged")
             # What a kill leaves: the journal as it is in the midst of things, without any goodbye.
-            shutil.copytree(tmp_path / "first", killed)
+            shutil.copytree(tmp_path / "first", killed, ignore=shutil.ignore_patterns("control.sock"))
         async with running(file, killed) as service:
             await shake(service, QUIET)
             await heard(service, ALARM, "returned_unacknowledged")

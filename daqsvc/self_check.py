@@ -1,0 +1,182 @@
+"""What the service has to say about itself: certificates that end, a full disk, telemetry that is dropped.
+
+Each is a condition of the alarm manager: active while it stands, returned when it is over, like any alarm.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.acquisition.clock import NS_PER_S, iso_utc
+from daqsvc.alarms.states import Level
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+NS_PER_DAY = 86_400 * NS_PER_S
+MIB = 1024 * 1024
+
+CERTIFICATE = "certificate/"
+CERTIFICATE_DAYS = 14
+CERTIFICATE_DEADBAND_NS = NS_PER_DAY
+"""A clock that is set by an hour, and back, makes no alarm come and go."""
+QUIET_NS = 60 * NS_PER_S
+"""What happens now and then stands until it has not happened for so long."""
+
+
+class Condition(NamedTuple):
+    """One thing about the service.
+
+    Attributes:
+        name: of the alarm, with a ``/`` in it.
+        level: how bad it is.
+        sentence: in words for a person.
+    """
+
+    name: str
+    level: Level
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vitals:
+    """What is looked at.
+
+    Attributes:
+        now_ns: monotonic clock.
+        wall_ns: wall clock, ns since the Unix epoch.
+        certificates_end_ns: by certificate, when it ends, wall clock.
+        conditions_told: conditions of the service that were ever told of, also before a restart.
+        connected: whether all certificates in use have been seen: there is a connection, or no broker.
+        free_bytes: free space on the store's disk; None if nobody has looked.
+        waiting: alarm events in memory that the disk has not taken.
+        write_errors: failed writes of alarms so far.
+        lost: alarm events that could not even wait, so far.
+        telemetry_dropped: telemetry messages dropped so far.
+        unwritten: commands so far that were refused because the audit log could not be written.
+    """
+
+    now_ns: int
+    wall_ns: int
+    certificates_end_ns: Mapping[str, int]
+    conditions_told: frozenset[str]
+    connected: bool
+    free_bytes: int | None
+    waiting: int
+    write_errors: int
+    lost: int
+    telemetry_dropped: int
+    unwritten: int
+
+
+class SelfCheck:
+    """Remembers what was seen before, and says how things stand.
+
+    Args:
+        store: the store's directory.
+        reserve_bytes: free space below which the disk is nearly full.
+    """
+
+    def __init__(self, store: Path, reserve_bytes: int) -> None:
+        self._store = store
+        self._reserve_bytes = reserve_bytes
+        self._ending: set[str] = set()
+        self._telemetry = _Happening()
+        self._lost = _Happening()
+        self._unwritten = _Happening()
+        self._write_errors = 0
+        self._unwritable = False
+
+    def free_bytes(self) -> int:
+        """Free space for the service on the store's disk; blocks.
+
+        Raises:
+            OSError: the store cannot be reached.
+        """
+        return shutil.disk_usage(self._store).free
+
+    def look(self, vitals: Vitals) -> Iterator[Condition]:
+        """How everything stands, whether that is new or not."""
+        for name, end_ns in sorted(vitals.certificates_end_ns.items()):
+            yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
+        if vitals.connected:
+            seen = {f"{CERTIFICATE}{name}" for name in vitals.certificates_end_ns}
+            for name in sorted(vitals.conditions_told - seen):
+                if name.startswith(CERTIFICATE):
+                    yield Condition(name, Level.NORMAL, "it is no longer in use")
+        if vitals.free_bytes is not None:
+            yield self._disk(vitals.free_bytes)
+        yield self._journal(vitals)
+        yield self._dropped(vitals)
+        yield self._audit(vitals)
+
+    def _certificate(self, name: str, left_ns: int, end_ns: int) -> Condition:
+        condition = f"{CERTIFICATE}{name}"
+        border_ns = CERTIFICATE_DAYS * NS_PER_DAY
+        if left_ns < border_ns:
+            self._ending.add(name)
+        elif left_ns >= border_ns + CERTIFICATE_DEADBAND_NS:
+            self._ending.discard(name)
+        if name not in self._ending:
+            return Condition(condition, Level.NORMAL, f"certificate {name} lasts until {iso_utc(end_ns)}")
+        if left_ns <= 0:
+            sentence = f"certificate {name} ended at {iso_utc(end_ns)}: without a new one there is no broker"
+            return Condition(condition, Level.DANGER, sentence)
+        # No count of days: it would be another sentence every day.
+        sentence = (
+            f"certificate {name} ends at {iso_utc(end_ns)}, in less than {CERTIFICATE_DAYS} days: renew it"
+        )
+        return Condition(condition, Level.ALERT, sentence)
+
+    def _disk(self, free_bytes: int) -> Condition:
+        full = free_bytes < self._reserve_bytes
+        sentence = f"{free_bytes // MIB} MiB are free on the disk of {self._store}"
+        if full:
+            sentence += f", less than {self._reserve_bytes // MIB} MiB: make room, or alarms wait in memory"
+        return Condition("store/disk", Level.ALERT if full else Level.NORMAL, sentence)
+
+    def _journal(self, vitals: Vitals) -> Condition:
+        failed = vitals.write_errors > self._write_errors
+        self._write_errors = vitals.write_errors
+        self._unwritable = vitals.waiting > 0 and (failed or self._unwritable)
+        if self._lost.goes_on(vitals.lost, vitals.now_ns):
+            sentence = f"{vitals.lost} alarm events are lost: the journal in {self._store} cannot be written"
+            return Condition("store/journal", Level.DANGER, sentence)
+        if self._unwritable:
+            sentence = (
+                f"the journal in {self._store} cannot be written, and alarm events wait in memory: make room "
+                "on the disk"
+            )
+            return Condition("store/journal", Level.ALERT, sentence)
+        return Condition("store/journal", Level.NORMAL, f"the journal in {self._store} takes what comes")
+
+    def _dropped(self, vitals: Vitals) -> Condition:
+        stands = self._telemetry.goes_on(vitals.telemetry_dropped, vitals.now_ns)
+        if not stands:
+            return Condition("store/telemetry", Level.NORMAL, "no telemetry is being dropped")
+        sentence = f"telemetry is dropped, {vitals.telemetry_dropped} messages so far: look at the broker"
+        return Condition("store/telemetry", Level.ALERT, sentence)
+
+    def _audit(self, vitals: Vitals) -> Condition:
+        stands = self._unwritten.goes_on(vitals.unwritten, vitals.now_ns)
+        if not stands:
+            return Condition("store/audit-log", Level.NORMAL, "the audit log takes what comes")
+        sentence = f"the audit log in {self._store} cannot be written, and commands are refused: make room"
+        return Condition("store/audit-log", Level.ALERT, sentence)
+
+
+class _Happening:
+    """A count that stands still, or does not."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._last_ns: int | None = None
+
+    def goes_on(self, count: int, now_ns: int) -> bool:
+        """Whether it has grown within `QUIET_NS`."""
+        if count > self._count:
+            self._count, self._last_ns = count, now_ns
+        return self._last_ns is not None and now_ns - self._last_ns < QUIET_NS
