@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,19 @@ DIP_HZ = 2_500.0
 """Bandwidth of the displacement as a rolling element passes a spall."""
 INDEPENDENT = 1.0 / ((1.0 + 2.0 / 36.0) * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)))
 """Of the lines of half-overlapping Hann frames: frames correlate by 1/6, lines by 2/3 and 1/6."""
+
+
+@dataclass(frozen=True, slots=True)
+class HealthySpectrum:
+    """What the frames of the healthy machine were like.
+
+    Attributes:
+        covariance: complex128 ``[f, 2, 2]``, mean cross-spectrum of the two components, line by line.
+        frames: half-overlapping frames that it is the mean of.
+    """
+
+    covariance: Complexes
+    frames: int
 
 
 def power(frequency_hz: Floats, corner_hz: float) -> Floats:

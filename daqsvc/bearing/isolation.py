@@ -26,6 +26,7 @@ from daqsvc.bearing.model import INNER, OUTER, BearingModel, BearingParameters
 from daqsvc.bearing.residual import CORNER_HZ
 
 if TYPE_CHECKING:
+    from daqsvc.bearing.hit import HealthySpectrum
     from daqsvc.bearing.model import Complexes, Floats
     from daqsvc.bearing.ratio_rule import Race
 
@@ -43,8 +44,8 @@ DECIDES_NATS = 2.0
 """Taken off the ratio of every frame: noise alone makes frames lean to either side by as much."""
 OUTER_BELOW, INNER_ABOVE = 0.32, 0.93
 """Shares of the evidence for the inner race that bound a ball's."""
-LEAST_NATS = 80.0
-"""Evidence below which the verdict is left open."""
+LEAST_NATS_PER_S = 165.0
+"""Evidence in a second below which the verdict is left open: a wrong model's does not average out."""
 DOUBT = 0.05
 """A share this near to a boundary leaves the parts on both sides of it possible."""
 _DRAWS = 200
@@ -74,13 +75,40 @@ class Isolation:
     hits: int
 
 
+def least_rate_hz(parameters: BearingParameters) -> float:
+    """Sampling rate above which any line tells the races of a bearing apart."""
+    return 2.0 / HIGHEST_PER_NYQUIST * _lowest_hz(BearingModel(parameters))
+
+
+def isolation_spectrum(parameters: BearingParameters, residual: Floats, rate_hz: float) -> HealthySpectrum:
+    """What `IsolationRule` has to know of the healthy machine.
+
+    Args:
+        parameters: of the healthy bearing.
+        residual: float64 ``[n, 2]``, of the healthy machine with the usual corner, in m/s^2; frames with NaN
+            are left out.
+        rate_hz: sampling rate.
+
+    Raises:
+        ValueError: the residual is too short.
+    """
+    frame, _, kept = _lines(BearingModel(parameters), rate_hz)
+    learnt = hit.spectra(residual, frame)[:, kept]
+    if len(learnt) < 4 * frame:
+        raise ValueError(
+            f"bearing isolation: {len(residual) / rate_hz:.2f} s of healthy residual; "
+            f"{2.0 * (frame + 1) * frame / rate_hz:.1f} s or more are needed"
+        )
+    return hit.HealthySpectrum(hit.covariance(learnt), len(learnt))
+
+
 class IsolationRule:
     """Judges windows of the residual of `daqsvc.bearing.residual.TwoSensorResidual` with its usual corner.
 
     Args:
         parameters: of the healthy bearing.
         rate_hz: sampling rate.
-        healthy: float64 ``[n, 2]``, residual of the healthy machine in m/s^2; frames with NaN are left out.
+        healthy: of the healthy machine, by `isolation_spectrum`.
         mismatch: share by which each parameter may be wrong.
         seed: of the models that are drawn.
 
@@ -89,36 +117,32 @@ class IsolationRule:
             bearing, and then every verdict is ``"inner_or_outer"``.
 
     Raises:
-        ValueError: the healthy residual is too short, or the mismatch not between 0 and 0.5.
+        ValueError: the mismatch is not between 0 and 0.5, or the spectrum another bearing's.
     """
 
     def __init__(
         self,
         parameters: BearingParameters,
         rate_hz: float,
-        healthy: Floats,
+        healthy: HealthySpectrum,
         *,
         mismatch: float = 0.1,
         seed: int = 0,
     ) -> None:
         if not 0.0 <= mismatch < 0.5:
             raise ValueError(f"bearing isolation: a mismatch of {mismatch:g}; it must be from 0 to 0.5")
-        self._frame = 2 * round(FRAME_S * rate_hz / 2.0)
-        frequency_hz = np.fft.rfftfreq(self._frame, 1.0 / rate_hz)
         model = BearingModel(parameters)
-        lowest = max(LOWEST_PER_BALL_MODE * model.modes_hz[2], LOWEST_HZ)
-        highest = HIGHEST_PER_NYQUIST * rate_hz / 2.0
-        self._kept = (frequency_hz > lowest) & (frequency_hz < highest)
-        self.lines_hz: Floats = np.asarray(frequency_hz[self._kept], dtype=np.float64)
-        self._to_displacement = 1.0 / np.diag(model.D)
-        spectra = self._spectra(healthy)
-        if len(spectra) < 4 * self._frame:
+        self._frame, self.lines_hz, self._kept = _lines(model, rate_hz)
+        if len(healthy.covariance) != len(self.lines_hz):
             raise ValueError(
-                f"bearing isolation: {len(healthy) / rate_hz:.2f} s of healthy residual; "
-                f"{2.0 * (self._frame + 1) * self._frame / rate_hz:.1f} s or more are needed"
+                f"bearing isolation: a healthy spectrum of {len(healthy.covariance)} lines; this bearing has "
+                f"{len(self.lines_hz)} at {rate_hz:g} samples a second: learn it with the same figures"
             )
+        self._step_s = self._frame / 2.0 / rate_hz
+        self._to_displacement = 1.0 / np.diag(model.D)
         if len(self.lines_hz):
-            self._weigh(model, hit.covariance(spectra), mismatch, np.random.default_rng(seed))
+            noise = healthy.covariance * np.outer(self._to_displacement, self._to_displacement)
+            self._weigh(model, noise, mismatch, np.random.default_rng(seed))
 
     def _weigh(
         self, model: BearingModel, noise: Complexes, mismatch: float, rng: np.random.Generator
@@ -143,10 +167,12 @@ class IsolationRule:
             residual: float64 ``[n, 2]`` in m/s^2, of a window in which a fault was detected; frames with NaN
                 are left out.
         """
-        inner, outer, hits = self._evidence(residual)
+        spectra = hit.spectra(residual, self._frame)[:, self._kept] * self._to_displacement
+        inner, outer, hits = self._evidence(spectra)
         total = inner + outer
         everything: tuple[Race, ...] = ("inner", "outer", "ball")
-        if total < LEAST_NATS:
+        # Half-overlapping frames are half a frame longer than they are many.
+        if total < LEAST_NATS_PER_S * self._step_s * (len(spectra) + 1):
             return Isolation(
                 "inner_or_outer", everything, inner / total if total else math.nan, inner, outer, hits
             )
@@ -160,9 +186,8 @@ class IsolationRule:
         others = tuple(race for race, near in neighbours.items() if near and race != verdict)
         return Isolation(verdict, (verdict, *others), share, inner, outer, hits)
 
-    def _evidence(self, residual: Floats) -> tuple[float, float, int]:
+    def _evidence(self, spectra: Complexes) -> tuple[float, float, int]:
         """Nats for the inner and for the outer race, and the number of hits."""
-        spectra = self._spectra(residual)
         if not len(spectra) or not len(self.lines_hz):
             return 0.0, 0.0, 0
         cross = spectra[..., 0].conj() * spectra[..., 1]
@@ -178,9 +203,19 @@ class IsolationRule:
         inner, outer = (np.maximum(side - DECIDES_NATS, 0.0).sum() for side in (ratio, -ratio))
         return float(inner), float(outer), len(ratio)
 
-    def _spectra(self, residual: Floats) -> Complexes:
-        """Displacement spectra of the whole frames, complex128 ``[t, lines, 2]``."""
-        return hit.spectra(residual, self._frame)[:, self._kept] * self._to_displacement
+
+def _lines(
+    model: BearingModel, rate_hz: float
+) -> tuple[int, Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """Samples of a frame, the frequencies that tell the races apart, and which of its lines these are."""
+    frame = 2 * round(FRAME_S * rate_hz / 2.0)
+    frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
+    kept = (frequency_hz > _lowest_hz(model)) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0)
+    return frame, frequency_hz[kept], kept
+
+
+def _lowest_hz(model: BearingModel) -> float:
+    return max(LOWEST_PER_BALL_MODE * float(model.modes_hz[2]), LOWEST_HZ)
 
 
 def _moments(

@@ -2,37 +2,58 @@
 
 On the healthy machine the residual is a stationary Gaussian process with the covariance S_0(f), learnt from a
 record of it. Hits add their energy: in every line along the direction in which displacements of the races
-stand out best against S_0, with the spectrum s(f) of a short dip, and of unknown size a. Let q(f) be the mean
-over frames of the whitened energy in that direction, 1 on the healthy machine, and l(f) the ratio of s to the
-noise there. The logarithm of the likelihood ratio is then
+stand out best against S_0, with the spectrum s(f) of a short dip, and of unknown size a. Let e(t, f) be the
+whitened energy of frame t in that direction, 1 on average on the healthy machine, and l(f) the ratio of s to
+the noise there. A frame that holds a hit is then likelier by
 
-    max over a of  n sum over f of  q a l / (1 + a l) - ln(1 + a l)
+    L(t, a) = sum over f of  e a l / (1 + a l) - ln(1 + a l)
 
-with n independent frames. On the healthy machine q is an F variate: both the window and what was learnt are
-finite. The limit is the quantile at the stated rate of false alarms, by a seeded simulation of those.
+nats. Not every frame holds one: a spall is loaded for a part of the revolution, and rolling elements come at
+their own pace. With p the share of frames that do, the logarithm of the likelihood ratio of a window is
+
+    max over a of  sum over t of  ln(1 - p + p exp L(t, a))
+
+Where hits come in bursts it is larger than that of the mean energy, and in steady noise it is not. The limit
+is the quantile at the stated rate of false alarms, by a seeded simulation of Gaussian frames that are held
+against a healthy machine learnt from as many frames as this one.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import ndtri
 
 from daqsvc.bearing import hit
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.residual import CORNER_HZ
 
 if TYPE_CHECKING:
+    from daqsvc.bearing.hit import HealthySpectrum
     from daqsvc.bearing.model import BearingParameters, Floats
 
 FRAME_S = 384 / 48_000
 """Length of a frame: the ringing that is left in the residual, and the lines fine enough for it."""
 LOWEST_HZ, HIGHEST_PER_NYQUIST = 250.0, 0.85
 LEAST_FRAMES = 24
-DRAWS = 8_000
-_CHUNK = 500
+STRUCK = 0.3
+"""Share of the frames that hold a hit, if there are any."""
+DRAWN_FRAMES = 200_000
+"""In all the windows that the limit is simulated with."""
+_TAIL = 0.05
+"""The likelihood ratio falls off exponentially beyond this quantile."""
+_EXACT_FRAMES, _PER_OCTAVE = 256, 16
+"""Longer windows share a limit with those that are at most a sixteenth of an octave longer."""
+_FRAMES_AT_A_TIME = 128
+_COUNTS = 1e-3
+"""Lines in which hits show less against the noise than by this share of the best decide nothing."""
 _SIZES = 10.0 ** np.arange(-3.0, 3.0, 0.25)
+_LARGEST_NATS = 500.0
+_BEFORE = 3.0 - math.sqrt(8.0)
+"""Of the frame before in a frame: half-overlapping Hann frames correlate by 1/6."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,44 +73,64 @@ class Detection:
     false_alarm_rate: float
 
 
+def detection_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
+    """What `WhittleDetector` has to know of the healthy machine.
+
+    Args:
+        residual: float64 ``[n, 2]``, of the healthy machine with the usual corner, in m/s^2; frames with NaN
+            are left out.
+        rate_hz: sampling rate.
+
+    Raises:
+        ValueError: the residual is too short.
+    """
+    frame, _, kept = _lines(rate_hz)
+    learnt = hit.spectra(residual, frame)[:, kept]
+    if len(learnt) < LEAST_FRAMES:
+        raise ValueError(
+            f"bearing detection: {len(residual) / rate_hz:.2f} s of healthy residual; "
+            f"{(LEAST_FRAMES + 1) * frame / 2.0 / rate_hz:.2f} s or more without gaps are needed"
+        )
+    return hit.HealthySpectrum(hit.covariance(learnt), len(learnt))
+
+
 class WhittleDetector:
     """Tells whether the residual holds more than that of the healthy machine.
 
     Args:
         parameters: of the healthy bearing.
         rate_hz: sampling rate.
-        healthy: float64 ``[n, 2]``, residual of the healthy machine with the usual corner, in m/s^2; frames
-            with NaN are left out.
+        healthy: of the healthy machine, by `detection_spectrum`.
         false_alarm_rate: per window.
+        repeatability_db: standard deviation of the healthy machine's level from run to run, which no single
+            record of it shows: a rise that such a change explains at the stated rate is no fault.
 
     Raises:
-        ValueError: the healthy residual is too short or singular, or the rate is not between 0 and 0.5.
+        ValueError: the healthy residual is singular or of another rate, or a rate is not between 0 and 0.5.
     """
 
     def __init__(
         self,
         parameters: BearingParameters,
         rate_hz: float,
-        healthy: Floats,
+        healthy: HealthySpectrum,
         *,
         false_alarm_rate: float = 0.003,
+        repeatability_db: float = 0.0,
     ) -> None:
         if not 0.0 < false_alarm_rate < 0.5:
             raise ValueError(
                 f"bearing detection: a false-alarm rate of {false_alarm_rate:g}; it must be between 0 and 0.5"
             )
         self.false_alarm_rate = false_alarm_rate
-        self._frame = 2 * round(FRAME_S * rate_hz / 2.0)
-        frequency_hz = np.asarray(np.fft.rfftfreq(self._frame, 1.0 / rate_hz), dtype=np.float64)
-        self._kept = (frequency_hz > LOWEST_HZ) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0)
-        learnt = hit.spectra(healthy, self._frame)[:, self._kept]
-        if len(learnt) < LEAST_FRAMES:
+        self._frame, frequency_hz, self._kept = _lines(rate_hz)
+        self._learnt = healthy.frames
+        noise = healthy.covariance
+        if len(noise) != self._kept.sum():
             raise ValueError(
-                f"bearing detection: {len(healthy) / rate_hz:.2f} s of healthy residual; "
-                f"{(LEAST_FRAMES + 1) * self._frame / 2.0 / rate_hz:.2f} s or more without gaps are needed"
+                f"bearing detection: a healthy spectrum of {len(noise)} lines; there are {self._kept.sum()} "
+                f"at {rate_hz:g} samples a second: learn it at this rate"
             )
-        self._learnt = len(learnt)
-        noise = hit.covariance(learnt)
         if not np.linalg.det(noise).real.min() > 0.0:
             raise ValueError(
                 "bearing detection: the two components of the healthy residual are constant or alike; check "
@@ -100,11 +141,15 @@ class WhittleDetector:
         D = np.diag(BearingModel(parameters).D)
         strengths, directions = np.linalg.eigh(D[:, None] * precision * D)
         best = strengths[:, 1]
-        self._along = np.einsum("fij,fj->fi", precision * D, directions[:, :, 1]) / np.sqrt(best)[:, None]
-        # A direction that was learnt from k frames finds 2 / k more in others than in its own.
-        self._along /= np.sqrt(1.0 + 2.0 / self._learnt)
+        along = np.einsum("fij,fj->fi", precision * D, directions[:, :, 1]) / np.sqrt(best)[:, None]
         ratio = hit.power(frequency_hz[self._kept], CORNER_HZ) * best
-        sizes = _SIZES[:, None] * ratio / ratio.max()
+        shows = ratio >= _COUNTS * ratio.max()
+        self._kept[self._kept] = shows
+        # A direction that was learnt from k frames finds 2 / k more in others than in its own.
+        allowed_db = -float(ndtri(false_alarm_rate)) * repeatability_db
+        expected = (1.0 + 2.0 / self._learnt) * 10.0 ** (allowed_db / 10.0)
+        self._along = along[shows].conj() / math.sqrt(expected)
+        sizes = _SIZES[:, None] * ratio[shows] / ratio.max()
         self._weights, self._costs = sizes / (1.0 + sizes), np.log1p(sizes).sum(axis=1)
         self._limits: dict[int, float] = {}
 
@@ -123,23 +168,62 @@ class WhittleDetector:
                 f"bearing detection: no {self._frame} consecutive residuals among {len(residual)}; "
                 "use longer windows"
             )
-        energies = np.abs(np.einsum("tfi,fi->tf", frames, self._along.conj())) ** 2
-        statistic = float(self._statistic(energies.mean(axis=0), len(frames)))
+        statistic = float(self._nats(np.abs(np.einsum("tfi,fi->tf", frames, self._along)) ** 2).max())
         limit = self._limit(len(frames))
         return Detection(statistic > limit, statistic, limit, self.false_alarm_rate)
 
-    def _statistic(self, energies: Floats, frames: int) -> Floats:
-        likelihood = energies @ self._weights.T - self._costs
-        return np.asarray(hit.INDEPENDENT * frames * likelihood.max(axis=-1))
+    def _nats(self, energies: Floats) -> Floats:
+        """Logarithm of the likelihood ratio, float64 ``[sizes]``, of frames of energies ``[t, f]``."""
+        struck = hit.INDEPENDENT * (energies @ self._weights.T - self._costs)
+        nats = np.log1p(STRUCK * np.expm1(np.minimum(struck, _LARGEST_NATS)))
+        return np.asarray((nats + np.maximum(struck - _LARGEST_NATS, 0.0)).sum(axis=0))
 
     def _limit(self, frames: int) -> float:
+        if frames > _EXACT_FRAMES:
+            frames = math.ceil(2.0 ** (math.ceil(_PER_OCTAVE * math.log2(frames)) / _PER_OCTAVE))
         if frames not in self._limits:
-            rng = np.random.default_rng(frames)
-            window, learnt = (2.0 * hit.INDEPENDENT * n for n in (frames, self._learnt))
-            lines = int(self._kept.sum())
-            drawn = [
-                self._statistic(rng.f(window, learnt, (_CHUNK, lines)), frames)
-                for _ in range(DRAWS // _CHUNK)
-            ]
-            self._limits[frames] = float(np.quantile(np.concatenate(drawn), 1.0 - self.false_alarm_rate))
+            drawn = np.array(self._drawn(frames))
+            ordinary = float(np.quantile(drawn, 1.0 - _TAIL))
+            if self.false_alarm_rate >= _TAIL:
+                self._limits[frames] = float(np.quantile(drawn, 1.0 - self.false_alarm_rate))
+            else:
+                excess = float((drawn[drawn > ordinary] - ordinary).mean())
+                self._limits[frames] = ordinary + excess * math.log(_TAIL / self.false_alarm_rate)
         return self._limits[frames]
+
+    def _drawn(self, frames: int) -> list[float]:
+        """Statistics of simulated windows of the healthy machine."""
+        rng = np.random.default_rng(frames)
+        lines = len(self._along)
+        apart = np.abs(np.subtract.outer(np.arange(lines), np.arange(lines)))
+        alike = np.linalg.cholesky(
+            np.where(apart < 3, np.take([1.0, 4 / 9, 1 / 36], apart, mode="clip"), 0.0)
+        )
+        deviation = math.sqrt((1.0 + 2.0 / 36.0) / self._learnt)
+        power = 2.0 * (1.0 + _BEFORE**2) * (1.0 + 2.0 * 0.5**2)
+        parts = [
+            len(part) for part in np.array_split(np.arange(frames), math.ceil(frames / _FRAMES_AT_A_TIME))
+        ]
+        drawn = []
+        for _ in range(math.ceil(DRAWN_FRAMES / frames)):
+            nats = np.zeros(len(_SIZES))
+            learnt = power * np.exp(deviation * (alike @ rng.standard_normal(lines)))
+            for part in parts:
+                noise = rng.standard_normal((2, part + 1, lines + 2))  # real and imaginary parts
+                noise = noise[:, 1:] + _BEFORE * noise[:, :-1]
+                # A Hann window makes a line of three.
+                seen = noise[..., 1:-1] - 0.5 * (noise[..., :-2] + noise[..., 2:])
+                nats += self._nats(np.square(seen).sum(axis=0) / learnt)
+            drawn.append(float(nats.max()))
+        return drawn
+
+
+def _lines(rate_hz: float) -> tuple[int, Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """Samples of a frame, frequencies of its lines, and which of them are looked at."""
+    frame = 2 * round(FRAME_S * rate_hz / 2.0)
+    frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
+    return (
+        frame,
+        frequency_hz,
+        (frequency_hz > LOWEST_HZ) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0),
+    )

@@ -20,7 +20,7 @@ from rotor_runs import seeds
 from scipy.stats import beta
 
 from daqsvc.bearing.parameter_sets import S1, S2, S3
-from daqsvc.bearing.two_sensors import TwoSensorMonitor
+from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def verdicts(name: str, snr_db: float, mismatch: float) -> dict[str, list[str]]:
         rng = np.random.default_rng((2024, run, round(100 * mismatch)))
         true = nominal.mismatched(mismatch, rng)
         calm = simulate(true, signal, "healthy", level, rng, seconds=2.0)
-        monitor = TwoSensorMonitor(SETS[name], RATE_HZ, calm.y, calm.v)
+        monitor = TwoSensorMonitor(learn_pair(SETS[name], RATE_HZ, calm.y, calm.v))
         for fault in FAULTS:
             window = simulate(true, signal, fault, level, rng)
             said[fault].append(monitor.take(window.y, window.v).verdict)
@@ -105,7 +105,7 @@ def test_three_classes_where_the_races_look_alike(name, snr_db, mismatch, target
     assert may_be(*rightly(said, ("inner", "outer", "ball")), target), report(name, said)
 
 
-@pytest.mark.parametrize("name", ["S2", "S3"])
+@pytest.mark.parametrize("name", ["S1", "S2", "S3"])
 def test_faults_far_below_the_noise_are_detected(name):
     said = verdicts(name, -15.0, 0.2)
     print(report(f"{name} -15 dB 20%", said))
@@ -133,7 +133,7 @@ def test_false_alarms_come_at_their_stated_rate():
         level = levels(nominal, signal, snr_db=0.0)
         true = nominal.mismatched(0.1, rng)
         calm = simulate(true, signal, "healthy", level, rng, seconds=4.0)
-        monitor = TwoSensorMonitor(S3, RATE_HZ, calm.y, calm.v, false_alarm_rate=rate)
+        monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, calm.y, calm.v), false_alarm_rate=rate)
         healthy = simulate(true, signal, "healthy", level, rng, seconds=0.5 * per_machine)
         for begin in range(0, len(healthy.y), round(RATE_HZ / 2)):
             part = slice(begin, begin + round(RATE_HZ / 2))

@@ -5,13 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.bearing.isolation import IsolationRule
-from daqsvc.bearing.likelihood import WhittleDetector
+from daqsvc.bearing.isolation import IsolationRule, isolation_spectrum
+from daqsvc.bearing.likelihood import WhittleDetector, detection_spectrum
 from daqsvc.bearing.parameter_sets import S1, S3
 from daqsvc.bearing.residual import TwoSensorResidual
-from daqsvc.bearing.two_sensors import TwoSensorMonitor
+from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
 
 RATE_HZ = 48_000.0
+
+
+def detection(residual: np.ndarray, **more: float) -> WhittleDetector:
+    return WhittleDetector(S3, RATE_HZ, detection_spectrum(residual, RATE_HZ), **more)
+
+
+def isolation_rule(residual: np.ndarray, **more: float) -> IsolationRule:
+    return IsolationRule(S3, RATE_HZ, isolation_spectrum(S3, residual, RATE_HZ), **more)
 
 
 def noise(seconds: float, seed: int = 0) -> np.ndarray:
@@ -41,7 +49,7 @@ def healthy() -> np.ndarray:
 
 @pytest.mark.parametrize(("races", "verdict"), [((0,), "inner"), ((1,), "outer"), ((0, 1), "ball")])
 def test_hits_name_their_race(healthy, races, verdict):
-    detector, rule = WhittleDetector(S3, RATE_HZ, healthy), IsolationRule(S3, RATE_HZ, healthy)
+    detector, rule = detection(healthy), isolation_rule(healthy)
     window = hits(races, 1e-6)
     assert detector.judge(window).detected
     isolation = rule.judge(window)
@@ -51,28 +59,25 @@ def test_hits_name_their_race(healthy, races, verdict):
 
 
 def test_noise_leaves_the_race_open(healthy):
-    rule = IsolationRule(S3, RATE_HZ, healthy)
+    rule = isolation_rule(healthy)
     isolation = rule.judge(separated(noise(0.5, 1)))
     assert isolation.verdict == "inner_or_outer"
     assert set(isolation.group) == {"inner", "outer", "ball"}
 
 
 def test_a_window_of_missing_samples_only_is_open(healthy):
-    assert IsolationRule(S3, RATE_HZ, healthy).judge(np.full((1000, 2), np.nan)).hits == 0
+    assert isolation_rule(healthy).judge(np.full((1000, 2), np.nan)).hits == 0
 
 
 def test_missing_samples_do_not_alarm(healthy):
     window = separated(noise(1.0, 2))
     window[20_000:20_400] = np.nan
-    assert not WhittleDetector(S3, RATE_HZ, healthy).judge(window).detected
+    assert not detection(healthy).judge(window).detected
 
 
 def test_a_rarer_false_alarm_has_a_higher_limit(healthy):
     window = separated(noise(0.6, 3))
-    limits = [
-        WhittleDetector(S3, RATE_HZ, healthy, false_alarm_rate=rate).judge(window).limit
-        for rate in (0.1, 0.01, 0.001)
-    ]
+    limits = [detection(healthy, false_alarm_rate=rate).judge(window).limit for rate in (0.1, 0.01, 0.001)]
     assert limits == sorted(limits)
     assert limits[0] < limits[-1]
 
@@ -81,30 +86,30 @@ def test_a_rate_too_low_for_the_bearing_leaves_every_fault_open():
     """The rolling elements of S1 answer at 12.9 kHz: at 6 kHz no line tells its races apart."""
     y = np.random.default_rng(0).standard_normal((30_000, 2))
     residual = TwoSensorResidual(S1, 6_000.0).process(y)
-    rule = IsolationRule(S1, 6_000.0, residual)
+    rule = IsolationRule(S1, 6_000.0, isolation_spectrum(S1, residual, 6_000.0))
     assert not len(rule.lines_hz)
     assert rule.judge(100.0 * residual).verdict == "inner_or_outer"
 
 
 def test_short_records_and_dead_sensors_are_named():
     with pytest.raises(ValueError, match=r"0\.02 s of healthy residual"):
-        WhittleDetector(S3, RATE_HZ, noise(0.02))
+        detection(noise(0.02))
     with pytest.raises(ValueError, match=r"0\.50 s of healthy residual"):
-        IsolationRule(S3, RATE_HZ, noise(0.5))
+        isolation_rule(noise(0.5))
     dead = noise(2.0)
     dead[:, 1] = 0.0
     with pytest.raises(ValueError, match="both accelerometers are alive"):
-        WhittleDetector(S3, RATE_HZ, dead)
+        detection(dead)
     with pytest.raises(ValueError, match=r"false-alarm rate of 0\.9"):
-        WhittleDetector(S3, RATE_HZ, noise(2.0), false_alarm_rate=0.9)
+        detection(noise(2.0), false_alarm_rate=0.9)
     with pytest.raises(ValueError, match=r"mismatch of 0\.7"):
-        IsolationRule(S3, RATE_HZ, noise(2.0), mismatch=0.7)
+        isolation_rule(noise(2.0), mismatch=0.7)
     with pytest.raises(ValueError, match="use longer windows"):
-        WhittleDetector(S3, RATE_HZ, noise(2.0)).judge(noise(0.004))
+        detection(noise(2.0)).judge(noise(0.004))
 
 
 def test_the_monitor_is_calm_on_the_machine_that_it_has_learnt():
-    monitor = TwoSensorMonitor(S3, RATE_HZ, noise(3.0))
+    monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
     y = noise(2.0, 5)
     findings = [monitor.take(part) for part in np.split(y, 4)]
     assert [finding.verdict for finding in findings] == ["normal"] * 4

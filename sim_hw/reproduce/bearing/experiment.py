@@ -17,7 +17,7 @@ from daqsvc.bearing.detection_filter import paper_gain, residual_transfer, separ
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.parameter_sets import S2, S2_EIGENVALUE, S3
 from daqsvc.bearing.sliding_mode import INNER_SLOPE, OUTER_SLOPE, PaperUnit
-from daqsvc.bearing.two_sensors import TwoSensorMonitor
+from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def _verdicts(seed: int, snr_db: float) -> dict[str, str]:
     level = levels(nominal, signal, snr_db=snr_db)
     machine = nominal.mismatched(0.1, rng)
     calm = simulate(machine, signal, "healthy", level, rng, seconds=2.0)
-    monitor = TwoSensorMonitor(p, 48_000.0, calm.y, calm.v)
+    monitor = TwoSensorMonitor(learn_pair(p, 48_000.0, calm.y, calm.v))
     verdicts: dict[str, str] = {}
     faults: tuple[Fault, ...] = ("healthy", "inner", "outer", "ball", "inner_and_outer")
     for fault in faults:
