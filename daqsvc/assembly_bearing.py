@@ -10,23 +10,27 @@ from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.isolation import least_rate_hz
 from daqsvc.bearing.model import BearingParameters
-from daqsvc.diagnosis.bearing import BearingDetector, HousedBearing
-from daqsvc.diagnosis.bearing_direction import RaceDirection, TwoSensors
+from daqsvc.bearing.two_sensors import PairModel, TwoSensorMonitor
+from daqsvc.diagnosis.bearing import SAME_SPEED, BearingDetector
+from daqsvc.diagnosis.bearing_direction import TwoSensors
+from daqsvc.diagnosis.bearing_housed import HousedBearing
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe
 from daqsvc.dsp.levels import STANDARD_GRAVITY
 from daqsvc.settings.bearing import BEARING
+from daqsvc.settings.models import Keyphasor
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.bearing.identify_baseline import BearingBaseline
-    from daqsvc.settings.bearing import WatchedBearing
+    from daqsvc.settings.bearing import Bearing, WatchedBearing
     from daqsvc.settings.models import MachineFile
 
 log = logging.getLogger(__name__)
 
 _SAME_RATE = 1e-3
-_SAME_SPEED = 0.05
 _M_S2_PER_UNIT = {"g": STANDARD_GRAVITY, "m/s2": 1.0}
 
 
@@ -49,27 +53,60 @@ def bearing_detector(
     stream = machine.sensor(given.bearings[0].sensor).stream
     rate_hz = machine.streams[stream].rate_hz
     bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
-    if calibration is None and given.calibration is not None:
-        calibration = machine.resolve(given.calibration)
+    speed_rpm = machine.machine.speed_rpm
+    keyphasor = None if given.keyphasor is None else _keyphasor(machine, given.keyphasor)
+    # A measured speed tells by itself when the healthy machine's is another one.
+    same_speed_rpm = speed_rpm if keyphasor is None else None
     baseline: BearingBaseline | None = None
     kept: Path | None = None
     if calibration is not None:
-        baseline = _fitting(calibration, bearings, rate_hz, machine.machine.speed_rpm)
+        baseline = _fitting(calibration, bearings, rate_hz, same_speed_rpm)
+    elif given.calibration is not None:
+        try:
+            baseline = _fitting(machine.resolve(given.calibration), bearings, rate_hz, same_speed_rpm)
+        except BaselineFileError as error:
+            raise BaselineFileError(
+                f"pipeline.bearing.calibration = {str(given.calibration)!r}: {error}"
+            ) from None
     elif store is not None:
         kept = store / f"{BEARING}.toml"
-        baseline = _kept(kept, bearings, rate_hz, machine.machine.speed_rpm)
+        baseline = _kept(kept, bearings, rate_hz, same_speed_rpm)
     return BearingDetector(
         machine=machine.machine.name,
         stream=stream,
         rate_hz=rate_hz,
-        speed_rpm=machine.machine.speed_rpm,
+        speed_rpm=speed_rpm,
         bearings=bearings,
-        rules=ChangeRules(false_alarm_probability=given.false_alarm_probability),
+        keyphasor=keyphasor,
+        rules=ChangeRules(
+            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+        ),
         baseline=baseline,
         calibrate_s=given.calibrate_s,
         name=BEARING,
         keep=None if kept is None else partial(_keep, kept),
     )
+
+
+def pair_models(machine: MachineFile, given: Bearing) -> dict[tuple[str, ...], PairModel]:
+    """Bearings with an accelerometer on rotor and housing, by the names of these in that order.
+
+    Args:
+        machine: the machine file.
+        given: its bearings, or those that a recording has.
+
+    Raises:
+        ValueError: masses and springs cannot be those of a bearing, or the rate is too low for them.
+    """
+    found = ((bearing.sensors, _two_sensors(machine, bearing, i)) for i, bearing in enumerate(given.bearings))
+    return {tuple(sensors): two.model for sensors, two in found if two is not None}
+
+
+def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
+    sensor = machine.sensor(name)
+    assert isinstance(sensor, Keyphasor)  # noqa: S101 - settings/bearing_checks.py
+    column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+    return KeyphasorProbe(name, column, sensor.threshold_v, sensor.hysteresis_v, sensor.edge)
 
 
 def _housed(machine: MachineFile, index: int, given: WatchedBearing) -> HousedBearing:
@@ -105,11 +142,15 @@ def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> Two
         parameters = BearingParameters(
             m_r=m_r, m_b=m_b, m_h=m_h, k_s=k_s, k_c=k_c, k_h=k_h, c_s=c_s, c_c=c_c, c_h=c_h
         )
-        two = TwoSensors(rotor.name, column, parameters, m_s2_per_unit)
-        RaceDirection(two, machine.streams[housing.stream].rate_hz)
     except ValueError as error:
         raise ValueError(f"pipeline.bearing.bearings[{index}].model: {error}") from None
-    return two
+    rate_hz, least_hz = machine.streams[housing.stream].rate_hz, least_rate_hz(parameters)
+    if rate_hz < least_hz:
+        raise ValueError(
+            f"pipeline.bearing.bearings[{index}].model: at {rate_hz:g} samples a second the races of this "
+            f"bearing look alike; sample at {least_hz:.0f} Hz or faster, or remove model and rotor_sensor"
+        )
+    return TwoSensors(rotor.name, column, PairModel(parameters, m_s2_per_unit, model.mismatch))
 
 
 def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
@@ -136,8 +177,16 @@ def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
         raise ValueError(f"{at}.orders: {error}") from None
 
 
-def _fitting(path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float) -> BearingBaseline:
+def _fitting(
+    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
+) -> BearingBaseline:
     """The healthy machine of a file, if it is that of these accelerometers at this rate and speed.
+
+    Args:
+        path: the file.
+        bearings: the bearings.
+        rate_hz: sampling rate.
+        speed_rpm: speed of the shaft; None: any.
 
     Raises:
         BaselineFileError: it is not, or the file cannot be used.
@@ -156,17 +205,33 @@ def _fitting(path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rp
         )
     for what, value, wanted, tolerance in (
         ("sampled at {:g} Hz", found.rate_hz, rate_hz, _SAME_RATE),
-        ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm), _SAME_SPEED),
+        ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm or found.speed_rpm), SAME_SPEED),
     ):
         if abs(value / wanted - 1.0) > tolerance:
             raise BaselineFileError(
                 f"{path}: is {what.format(value)}, not {what.format(wanted)}; calibrate as it is watched"
             )
+    for bearing in bearings:
+        if bearing.two is None:
+            continue
+        pair = found.pairs.get(bearing.sensors)
+        names = " and ".join(bearing.sensors)
+        if pair is None:
+            raise BaselineFileError(f"{path}: holds nothing of {names} together; calibrate with both")
+        if pair.parameters != bearing.two.model.parameters:
+            raise BaselineFileError(
+                f"{path}: was learnt with other masses, springs or dampers of {bearing.name} than "
+                "pipeline.bearing.bearings has now; calibrate again, or restore them"
+            )
+        try:
+            TwoSensorMonitor(pair)
+        except ValueError as error:
+            raise BaselineFileError(f"{path}: pair of {names}: {error}; calibrate again") from None
     return found
 
 
 def _kept(
-    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float
+    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
 ) -> BearingBaseline | None:
     """The healthy machine that was learnt before a restart."""
     if not path.exists():

@@ -9,7 +9,7 @@ import numpy as np
 from daqsvc.analysis.bearing_machine import present
 from daqsvc.analysis.machine import MachineAnalyst
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.assembly_bearing import orders_of
+from daqsvc.assembly_bearing import orders_of, pair_models
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
@@ -79,6 +79,7 @@ def learn_by_machine(
         speed_rpm,
         bearings,
         [bearing.sensors for bearing in watched.bearings],
+        pairs=pair_models(machine, watched),
         source=str(recording.source),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -12,6 +12,7 @@ from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import HIGHEST, HealthyResidual, learn_healthy
 from daqsvc.bearing.race.judge import race_baseline
 from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.bearing.two_sensors import learn_pair
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.baseline import RaceBaseline
+    from daqsvc.bearing.two_sensors import HealthyPair, PairModel
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -37,6 +39,7 @@ class BearingBaseline:
         speed_rpm: stated speed of the shaft.
         residuals: innovations of one accelerometer, or of several together, by their names.
         races: lines and levels of each bearing, by the name of its accelerometer.
+        pairs: what accelerometers on rotor and housing show together, by their names in that order.
         source: the recording it comes from.
         written: label of the date, ISO 8601; empty if not known.
     """
@@ -45,6 +48,7 @@ class BearingBaseline:
     speed_rpm: float
     residuals: Mapping[tuple[str, ...], HealthyResidual]
     races: Mapping[str, RaceBaseline]
+    pairs: Mapping[tuple[str, ...], HealthyPair] = field(default_factory=dict)
     source: str = ""
     written: str = ""
 
@@ -56,6 +60,7 @@ def learn_baseline(
     bearings: Mapping[str, BearingOrders],
     together: Sequence[tuple[str, ...]],
     *,
+    pairs: Mapping[tuple[str, ...], PairModel] | None = None,
     highest: float = HIGHEST,
     source: str = "",
 ) -> BearingBaseline:
@@ -67,6 +72,7 @@ def learn_baseline(
         speed_rpm: stated speed of the shaft.
         bearings: fault orders of the bearing at each accelerometer that has one.
         together: accelerometers whose innovations are modelled together.
+        pairs: bearings with an accelerometer on rotor and housing, by the names of these in that order.
         highest: where the bands of the innovations end, as a part of the sampling rate.
         source: what the recording is called.
 
@@ -75,6 +81,7 @@ def learn_baseline(
     """
     residuals: dict[tuple[str, ...], HealthyResidual] = {}
     races: dict[str, RaceBaseline] = {}
+    healthy_pairs: dict[tuple[str, ...], HealthyPair] = {}
     names: tuple[str, ...] = ()
     try:
         for name, orders in bearings.items():
@@ -83,10 +90,18 @@ def learn_baseline(
         for names in together:
             columns = np.column_stack([samples[name] for name in names])
             residuals[names] = learn_healthy(columns, rate_hz, highest=highest)
-    except (NotIdentifiableError, RaceInputError) as error:
+        for names, model in (pairs or {}).items():
+            columns = np.column_stack([samples[name] for name in names]) * model.m_s2_per_unit
+            healthy_pairs[names] = learn_pair(model.parameters, rate_hz, columns)
+    except (NotIdentifiableError, RaceInputError, ValueError) as error:
         raise NotIdentifiableError(f"{', '.join(names)}: {error}") from None
     return BearingBaseline(
-        rate_hz=rate_hz, speed_rpm=speed_rpm, residuals=residuals, races=races, source=source
+        rate_hz=rate_hz,
+        speed_rpm=speed_rpm,
+        residuals=residuals,
+        races=races,
+        pairs=healthy_pairs,
+        source=source,
     )
 
 

@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from daqsvc.bearing.hit import HealthySpectrum
 from daqsvc.bearing.identify import InnovationsModel, Whiteness
 from daqsvc.bearing.identify_baseline import BearingBaseline
 from daqsvc.bearing.identify_change import BANDS, HealthyResidual
+from daqsvc.bearing.model import BearingParameters
 from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence
+from daqsvc.bearing.sliding_mode import SlidingGains, UnitEnergies
+from daqsvc.bearing.two_sensors import HealthyPair
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,6 +40,8 @@ _PREAMBLE = """\
 # [[residual]]: innovations model of one accelerometer, or of several together, and how large the innovations
 # are, in dB, window by window: all bands together, then each.
 # [[race]]: what spoke for each part of a bearing although it was in good order.
+# [[pair]]: cross-spectra of the residual of accelerometers on rotor and housing, with these masses (kg),
+# springs (N/m) and dampers (N s/m). A line holds the power of either race's component, and their cross-power.
 """
 
 Positive = Annotated[float, Field(gt=0)]
@@ -118,6 +124,64 @@ class _Race(_Table):
         return RaceBaseline(evidence, BandLevels(tuple(self.edges_hz), tuple(self.power)), self.speed_rpm)
 
 
+class _Spectrum(_Table):
+    frames: Annotated[int, Field(ge=1)]
+    lines: list[Annotated[list[float], Field(min_length=4, max_length=4)]]
+
+    def made(self) -> HealthySpectrum:
+        """The spectrum of this table.
+
+        Raises:
+            ValueError: a line is no covariance.
+        """
+        lines = np.array(self.lines, dtype=np.float64).reshape(-1, 4)
+        covariance = np.empty((len(lines), 2, 2), dtype=np.complex128)
+        covariance[:, 0, 0], covariance[:, 1, 1] = lines[:, 0], lines[:, 1]
+        covariance[:, 0, 1] = lines[:, 2] + 1j * lines[:, 3]
+        covariance[:, 1, 0] = covariance[:, 0, 1].conj()
+        if not (np.linalg.eigvalsh(covariance) > 0.0).all():
+            raise ValueError("a line of a cross-spectrum is not positive definite")
+        return HealthySpectrum(covariance, self.frames)
+
+
+class _Gains(_Table):
+    inner: Positive
+    outer: Positive
+    leak: Positive
+
+
+class _Energies(_Table):
+    inner_unit: Positive
+    outer_unit: Positive
+
+
+class _Pair(_Table):
+    channels: Annotated[list[str], Field(min_length=2, max_length=2)]
+    parameters: Mapping[str, float]
+    detection: _Spectrum
+    isolation: _Spectrum
+    gains: _Gains
+    energies: _Energies
+
+    def made(self, rate_hz: float) -> HealthyPair:
+        """The healthy machine of this table.
+
+        Raises:
+            ValueError: the figures are not those of a bearing, or one is missing.
+        """
+        try:
+            return HealthyPair(
+                parameters=BearingParameters(**self.parameters),
+                rate_hz=rate_hz,
+                detection=self.detection.made(),
+                isolation=self.isolation.made(),
+                gains=SlidingGains(**self.gains.model_dump()),
+                energies=UnitEnergies(**self.energies.model_dump()),
+            )
+        except TypeError as error:
+            raise ValueError(f"pair of {', '.join(self.channels)}: a figure is missing: {error}") from None
+
+
 class _File(_Table):
     schema_version: Literal[1]
     kind: Literal["bearing"]
@@ -127,6 +191,7 @@ class _File(_Table):
     speed_rpm: Positive
     residual: Annotated[list[_Residual], Field(min_length=1)]
     race: list[_Race] = []
+    pair: list[_Pair] = []
 
 
 def load_bearing_baseline(path: Path | str) -> BearingBaseline:
@@ -143,6 +208,7 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
             speed_rpm=table.speed_rpm,
             residuals={tuple(one.channels): one.made(table.rate_hz) for one in table.residual},
             races={one.channel: one.made() for one in table.race},
+            pairs={tuple(one.channels): one.made(table.rate_hz) for one in table.pair},
             source=table.source,
             written=table.written,
         )
@@ -210,6 +276,24 @@ def _lines(baseline: BearingBaseline) -> Iterator[str]:
         for part, evidence in race.evidence.items():
             pairs = ", ".join(f"{key} = {_value(value)}" for key, value in asdict(evidence).items())
             yield f"evidence.{part} = {{ {pairs} }}"
+    for channels, pair in baseline.pairs.items():
+        yield "\n[[pair]]"
+        yield f"channels = {_value(list(channels))}"
+        for key in ("parameters", "gains", "energies"):
+            figures = ", ".join(
+                f"{name} = {_value(value)}" for name, value in asdict(getattr(pair, key)).items()
+            )
+            yield f"{key} = {{ {figures} }}"
+        yield from _spectrum_lines("detection", pair.detection)
+        yield from _spectrum_lines("isolation", pair.isolation)
+
+
+def _spectrum_lines(key: str, spectrum: HealthySpectrum) -> Iterator[str]:
+    S = spectrum.covariance
+    lines = np.column_stack((S[:, 0, 0].real, S[:, 1, 1].real, S[:, 0, 1].real, S[:, 0, 1].imag))
+    rows = "".join(f"\n    {_value(line)}," for line in lines.tolist())
+    yield f"{key}.frames = {spectrum.frames}"
+    yield f"{key}.lines = [{rows}\n]"
 
 
 def _value(value: Any) -> str:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.identify import NotIdentifiableError
-from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_change import ChangeRules, compare_residual
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
-from daqsvc.diagnosis.bearing_direction import Direction, RaceDirection, TwoSensors
-from daqsvc.diagnosis.bearing_finding import SOUND, BearingFinding, find
+from daqsvc.diagnosis.bearing_direction import Direction, RaceDirection
+from daqsvc.diagnosis.bearing_finding import SOUND, find
+from daqsvc.diagnosis.bearing_learning import HealthyGathering
 from daqsvc.diagnosis.bearing_look import (
     LARGE,
     Look,
@@ -24,19 +23,21 @@ from daqsvc.diagnosis.bearing_look import (
     units_of,
 )
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
+from daqsvc.diagnosis.bearing_speed import SpeedError, measure_speed
 from daqsvc.diagnosis.bearing_standing import Standing, Steadfast
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.identify_baseline import BearingBaseline
     from daqsvc.bearing.identify_change import ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict
+    from daqsvc.diagnosis.bearing_housed import HousedBearing
     from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.probe_checks import KeyphasorProbe
     from daqsvc.diagnosis.record import DataQuality, Severity
 
     Floats = NDArray[np.float64]
@@ -50,35 +51,8 @@ _MISSING = 0.01
 """Part of a look's samples that may be missing; single ones are bridged."""
 _NO_LONGER_LARGE = 8.0
 """Danger stays until the innovations are less than so many times the healthy ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class HousedBearing:
-    """A bearing with the accelerometer on its housing.
-
-    Attributes:
-        name: of the bearing.
-        sensor: name of the accelerometer.
-        column: its column in the stream.
-        orders: fault orders.
-        two: the accelerometer on the rotor and the bearing's masses, if its races are also told by direction.
-    """
-
-    name: str
-    sensor: str
-    column: int
-    orders: BearingOrders
-    two: TwoSensors | None = None
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """The accelerometers that it is judged by."""
-        return (self.sensor,) if self.two is None else (self.two.rotor, self.sensor)
-
-    @property
-    def columns(self) -> tuple[int, ...]:
-        """Their columns."""
-        return (self.column,) if self.two is None else (self.two.column, self.column)
+SAME_SPEED = 0.05
+"""A shaft that turns faster or slower by more than this share is not compared with the healthy one."""
 
 
 class BearingDetector:
@@ -96,12 +70,18 @@ class BearingDetector:
     A look with missing samples, or at a dead or clipped accelerometer, or at a machine that stands still,
     clears nothing: the decision is held and the reason said, unless another bearing shows a fault by itself.
 
+    A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` says how that
+    joins what the lines say. With a keyphasor the lines are looked for at the measured speed. Where that
+    leaves the tolerance of the race test, the evidence begins anew; at another speed than the healthy
+    machine's nothing is compared with it. Neither clears anything.
+
     Args:
         machine: name of the machine.
         stream: name of the stream with all sensors.
         rate_hz: sampling rate.
-        speed_rpm: shaft speed, right to about 1 %.
+        speed_rpm: shaft speed, right to about 1 %; of a shaft with a keyphasor, what it turns at mostly.
         bearings: the bearings.
+        keyphasor: what measures the speed, if anything does.
         rules: what counts as a change.
         race: settings of the race test.
         baseline: the healthy machine; made of the first ``calibrate_s`` seconds if not given.
@@ -118,6 +98,7 @@ class BearingDetector:
         rate_hz: float,
         speed_rpm: float,
         bearings: Sequence[HousedBearing],
+        keyphasor: KeyphasorProbe | None = None,
         rules: ChangeRules | None = None,
         race: RaceRules | None = None,
         baseline: BearingBaseline | None = None,
@@ -135,22 +116,17 @@ class BearingDetector:
         self._speed_rpm = abs(speed_rpm)
         self.rules = rules or ChangeRules()
         self._race = race or RaceRules()
-        self._calibrate_samples = round(calibrate_s * rate_hz)
+        self._keyphasor = keyphasor
+        self._learning = HealthyGathering(self.bearings, rate_hz, calibrate_s)
         self._keep = keep
-        self._watches = self._new_watches()
+        self._watches, self._directions = self._new_watches(), self._new_directions()
         self._pending: list[NDArray[np.float32]] = []
-        self._healthy: list[NDArray[np.float32]] = []
-        self._refused = ""
-        self._directions = {
-            bearing.name: RaceDirection(bearing.two, rate_hz)
-            for bearing in self.bearings
-            if bearing.two is not None
-        }
         self._steadfast = Steadfast()
         self.seen: Look | None = None
         """The last look at good samples."""
         self._large = False
         self._end_index = 0
+        self._speed_unknown = self._has_looked = False
 
     @property
     def standing(self) -> Standing:
@@ -159,10 +135,11 @@ class BearingDetector:
 
     def warm(self) -> None:
         """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
-        noise = np.random.default_rng(1).standard_normal(self._watches[self.bearings[0].name].window)
-        RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).take(noise)
+        samples = round(WINDOW_S * self._rate_hz)
+        noise = np.random.default_rng(1).standard_normal((samples, 2))
+        RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).take(noise[:, 0])
         for direction in self._directions.values():
-            direction.judge(noise.reshape(-1, 2))
+            direction.judge(noise)
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
@@ -214,19 +191,21 @@ class BearingDetector:
         self.seen = look
         changed = self._steadfast.look(look.finding, last=last)
         if self.baseline is None:
-            self._calibrate(samples, look.finding)
-        elif look.finding.verdict == "normal":
-            self._rehearse(samples)
+            self.baseline = self._learning.take(samples, look.finding, self._speed_rpm)
+            if self.baseline is not None:
+                self._watches, self._directions = self._new_watches(), self._new_directions()
+                if self._keep is not None:
+                    self._keep(self.baseline)
         return self._statement(look, first_index, t_ns, changed=changed)
 
     def _judge(self, samples: Floats) -> Look:
         """What the bearings show, one by one and together."""
         samples = np.where(np.isfinite(samples), samples, np.nan)
+        unfit = list(self._follow_speed(samples))
         races: dict[str, RaceVerdict] = {}
-        unfit: list[tuple[DataQuality, str]] = []
         changes: dict[str, ResidualChange] = {}
         directions: dict[str, Direction] = {}
-        for bearing in self.bearings:
+        for bearing in () if self._speed_unknown else self.bearings:
             signal = samples[:, bearing.column]
             missing = int(np.isnan(signal).sum())
             if missing > _MISSING * len(signal):
@@ -245,28 +224,64 @@ class BearingDetector:
             races[bearing.name] = race
             if departed is not None:
                 changes[bearing.name] = departed
-            if race.verdict not in SOUND or (departed is not None and departed.changed):
-                directions |= self._directed(bearing, samples)
+            suspected = race.verdict not in SOUND or (departed is not None and departed.changed)
+            directions |= self._directed(bearing, samples, suspected=suspected)
         change = max(changes.values(), key=lambda one: one.departure, default=None)
         finding = find(races, change, self.rules.false_alarm_probability, directions) if races else None
+        reason = "; ".join(why for _, why in unfit)
         if unfit and (finding is None or finding.verdict in SOUND):
             # What one bearing does not show says nothing about another that cannot be seen.
-            return Look(races, changes, unfit[0][0], "; ".join(why for _, why in unfit), finding)
-        reason = "; ".join(why for _, why in unfit)
+            return Look(races, changes, unfit[0][0], reason, finding, directions)
         return Look(races, changes, "good", reason, finding, directions)
 
-    def _rehearse(self, samples: NDArray[np.float32]) -> None:
-        """Learn directions from a look at the machine in good order, once."""
-        for bearing in self.bearings:
-            direction = self._directions.get(bearing.name)
-            if direction is not None and not direction.ready:
-                direction.learn(samples[:, list(bearing.columns)].astype(np.float64))
+    def _follow_speed(self, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
+        """Measure the speed; begin anew where it has changed. Yields what is against the look."""
+        self._speed_unknown = False
+        if self._keyphasor is None:
+            return
+        try:
+            speed = measure_speed(samples[:, self._keyphasor.column], self._keyphasor, self._rate_hz)
+        except SpeedError as error:
+            self._speed_unknown = True
+            self._begin_anew()
+            yield "not_ok", str(error)
+            return
+        before, tolerance = self._speed_rpm, self._race.speed_tolerance
+        if speed.drift > tolerance:
+            self._speed_unknown = True
+            self._begin_anew()
+            drifts = f"the speed changes by {speed.drift:.1%} within {len(samples) / self._rate_hz:.2g} s"
+            yield (
+                "not_ok",
+                f"{drifts}: the bearings are judged again when it is steady within {tolerance:.1%}",
+            )
+            return
+        if abs(speed.rpm / before - 1.0) > tolerance:
+            self._speed_rpm = speed.rpm
+            self._begin_anew()
+            if self._has_looked:
+                yield (
+                    "not_ok",
+                    f"the speed has gone from {before:.0f} to {speed.rpm:.0f} rpm: the evidence begins anew",
+                )
+        self._has_looked = True
+        if self.baseline is not None and not self._comparable:
+            healthy = f"the healthy state is that at {self.baseline.speed_rpm:.0f} rpm"
+            yield "not_ok", f"the speed is {speed.rpm:.0f} rpm, and {healthy}: only damage with lines shows"
 
-    def _directed(self, bearing: HousedBearing, samples: Floats) -> dict[str, Direction]:
-        """Which race the two accelerometers of a bearing tell; empty if it has one only."""
-        if bearing.name not in self._directions:
+    @property
+    def _comparable(self) -> bool:
+        """Whether the shaft turns as fast as the healthy one did."""
+        return (
+            self.baseline is not None and abs(self._speed_rpm / self.baseline.speed_rpm - 1.0) <= SAME_SPEED
+        )
+
+    def _directed(self, bearing: HousedBearing, samples: Floats, *, suspected: bool) -> dict[str, Direction]:
+        """What the two accelerometers of a bearing tell; empty if it has one only."""
+        if bearing.name not in self._directions or not self._comparable:
             return {}
-        found = self._directions[bearing.name].judge(samples[:, list(bearing.columns)])
+        pair = samples[:, list(bearing.columns)]
+        found = self._directions[bearing.name].judge(pair, suspected=suspected)
         return {} if found is None else {bearing.name: found}
 
     def _departed(self, bearing: HousedBearing, samples: Floats) -> ResidualChange | None:
@@ -275,7 +290,9 @@ class BearingDetector:
         Raises:
             _StandsStillError: the machine does not run, or the sensor is loose.
         """
-        if self.baseline is None or bearing.sensors not in self.baseline.residuals:
+        if self.baseline is None or not self._comparable:
+            return None
+        if bearing.sensors not in self.baseline.residuals:
             return None
         healthy = self.baseline.residuals[bearing.sensors]
         levels = healthy.levels_db(samples[:, list(bearing.columns)])
@@ -289,41 +306,9 @@ class BearingDetector:
             )
         return change
 
-    def _calibrate(self, samples: NDArray[np.float32], finding: BearingFinding) -> None:
-        """Gather the healthy machine, and learn it when there is enough of it."""
-        if finding.verdict != "normal":
-            self._healthy = []
-            self._refused = f"the machine shows {finding.verdict.replace('_', ' ')} at {finding.where}"
-            return
-        self._healthy.append(samples)
-        if sum(map(len, self._healthy)) < self._calibrate_samples:
-            return
-        gathered = np.concatenate(self._healthy).astype(np.float64)
-        self._healthy = []
-        gathered[~np.isfinite(gathered)] = np.nan
-        try:
-            self.baseline = learn_baseline(
-                {
-                    name: gathered[:, column]
-                    for bearing in self.bearings
-                    for name, column in zip(bearing.sensors, bearing.columns, strict=True)
-                },
-                self._rate_hz,
-                self._speed_rpm,
-                {bearing.sensor: bearing.orders for bearing in self.bearings},
-                [bearing.sensors for bearing in self.bearings],
-                source="the running service",
-            )
-        except NotIdentifiableError as error:
-            self._refused = str(error)
-            return
-        self._refused = ""
-        self._watches = self._new_watches()
-        if self._keep is not None:
-            self._keep(self.baseline)
-
     def _new_watches(self) -> dict[str, RaceWatch]:
-        races = {} if self.baseline is None else self.baseline.races
+        """Race tests of the bearings at this speed, with the healthy machine where it is known at that."""
+        races = self.baseline.races if self.baseline is not None and self._comparable else {}
         return {
             bearing.name: RaceWatch(
                 self._rate_hz, self._speed_rpm, bearing.orders, self._race, races.get(bearing.sensor)
@@ -331,10 +316,25 @@ class BearingDetector:
             for bearing in self.bearings
         }
 
+    def _new_directions(self) -> dict[str, RaceDirection]:
+        """Of the bearings with two accelerometers, when the healthy machine is known."""
+        pairs = {} if self.baseline is None else self.baseline.pairs
+        return {
+            bearing.name: RaceDirection(bearing.two, pairs[bearing.sensors], self.rules)
+            for bearing in self.bearings
+            if bearing.two is not None and bearing.sensors in pairs
+        }
+
+    def _begin_anew(self) -> None:
+        """The speed is another one."""
+        self._learning.forget()
+        self._steadfast.interrupt()
+        self._watches = self._new_watches()
+
     def _forget(self) -> None:
         """Samples are missing: evidence from before and after does not belong together."""
         self._pending = []
-        self._healthy = []
+        self._learning.forget()
         self._steadfast.interrupt()
         for watch in self._watches.values():
             watch.forget()
@@ -375,15 +375,8 @@ class BearingDetector:
             model=MODEL,
         )
         if good and not look.reason and self.baseline is None:
-            return replace(said, reason=self._calibrating())
+            return replace(said, reason=self._learning.reason)
         return said
-
-    def _calibrating(self) -> str:
-        if self._refused:
-            return f'no healthy state to tell "changed" by: {self._refused}'
-        gathered = sum(map(len, self._healthy)) / self._rate_hz
-        needed = self._calibrate_samples / self._rate_hz
-        return f"learning the healthy state: {gathered:.0f} of {needed:.0f} s"
 
 
 class _StandsStillError(ValueError):

@@ -1,50 +1,56 @@
-"""Inner or outer race by direction: accelerometers on rotor and housing, and the bearing's masses.
+"""Which race by direction: accelerometers on rotor and housing, held against the healthy machine.
 
-The exact residual of `daqsvc.bearing.residual` separates the races; two sliding units make energies of its
-components, and their ratio names the race. What the healthy machine leaves in them is learnt anew at each
-start, on the first look at which the machine is in good order.
+The monitor of `daqsvc.bearing.two_sensors`, look by look: whether the residual holds more than the healthy
+machine's, which race the hits in it come from, and what the sliding units say to that.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from daqsvc.bearing.residual import TwoSensorResidual
-from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair, UnitEnergies
+from daqsvc.bearing.race.verdict import PARTS
+from daqsvc.bearing.two_sensors import TwoSensorMonitor
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.model import BearingParameters
+    from daqsvc.bearing.identify_change import ChangeRules
     from daqsvc.bearing.race.verdict import Part
+    from daqsvc.bearing.two_sensors import HealthyPair, PairModel
 
     Floats = NDArray[np.float64]
 
-SEPARATE = 0.25
-"""Part of the rolling elements' own frequency from which on the races differ: below, these follow the races
-at once, and inner and outer race look alike to any two sensors."""
-_LEAST_EXCESS = 0.1
-"""Part of the healthy energy by which a unit must be off for it to count; less is not told from noise."""
-_RACE_DB = 4.5
-"""A race's displacement has so much more energy than the other's; a ball meets both."""
-_BALL_DB = 1.5
 
-
-class Direction(NamedTuple):
-    """What two accelerometers say of a fault.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Direction:
+    """What two accelerometers say of a look.
 
     Attributes:
-        group: the parts that remain, the likeliest first.
-        ratio_db: energy of the inner race's displacement over the outer race's; NaN if neither is above what
-            the healthy machine shows.
+        detected: whether the residual is not the healthy machine's.
+        group: parts that the evidence leaves possible, the likeliest first; empty if nobody has asked.
+        change_nats: logarithm of the likelihood ratio of a fault.
+        limit_nats: from which it is detected.
+        inner_nats: evidence of the hits that are the inner race's.
+        outer_nats: evidence of the hits that are the outer race's.
+        ratio_db: energy of the inner race's displacement over the outer race's by the sliding units; NaN if
+            neither stands out.
     """
 
-    group: tuple[Part, ...]
-    ratio_db: float
+    detected: bool
+    group: tuple[Part, ...] = ()
+    change_nats: float = math.nan
+    limit_nats: float = math.nan
+    inner_nats: float = 0.0
+    outer_nats: float = 0.0
+    ratio_db: float = math.nan
+
+    @property
+    def decides(self) -> bool:
+        """Whether it leaves out any part."""
+        return 0 < len(self.group) < len(PARTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,85 +60,62 @@ class TwoSensors:
     Attributes:
         rotor: name of the one on the rotor.
         column: its column in the stream.
-        parameters: of the bearing.
-        m_s2_per_unit: of rotor and housing.
+        model: of the bearing.
     """
 
     rotor: str
     column: int
-    parameters: BearingParameters
-    m_s2_per_unit: tuple[float, float] = (1.0, 1.0)
+    model: PairModel
 
 
 class RaceDirection:
-    """Names the faulty race of one bearing.
+    """Detects a fault of one bearing, and names its race.
 
     Args:
-        two: its accelerometers and parameters.
-        rate_hz: sampling rate.
+        two: its accelerometers and masses.
+        healthy: the healthy machine.
+        rules: how sure a change must be, and how well the healthy machine repeats itself.
 
     Raises:
-        ValueError: the sampling rate is too low for the bearing's rolling elements.
+        ValueError: the healthy machine was learnt with other masses, springs or dampers.
     """
 
-    def __init__(self, two: TwoSensors, rate_hz: float) -> None:
-        p = two.parameters
-        self._two = two
-        ball_hz = math.sqrt((p.k_s + p.k_c) / p.m_b) / math.tau
-        self._residual = TwoSensorResidual(p, rate_hz, corner_hz=SEPARATE * ball_hz)
-        self._gains: SlidingGains | None = None
-        self._healthy = UnitEnergies(math.nan, math.nan)
+    def __init__(self, two: TwoSensors, healthy: HealthyPair, rules: ChangeRules) -> None:
+        if healthy.parameters != two.model.parameters:
+            raise ValueError(
+                f"the healthy state of {two.rotor} was learnt with other masses, springs or dampers; "
+                "calibrate again, or restore them"
+            )
+        self._m_s2_per_unit = two.model.m_s2_per_unit
+        self._monitor = TwoSensorMonitor(
+            healthy,
+            mismatch=two.model.mismatch,
+            false_alarm_rate=rules.false_alarm_probability,
+            repeatability_db=rules.repeatability_db,
+        )
 
-    @property
-    def ready(self) -> bool:
-        """Whether the healthy machine is known."""
-        return self._gains is not None
-
-    def learn(self, pair: Floats) -> None:
-        """Learn from the machine in good order.
-
-        Args:
-            pair: float64 ``[n, 2]``, rotor and housing in their units; NaN where missing.
-        """
-        residual = self._separated(pair)
-        if residual is not None:
-            self._gains = SlidingGains.from_healthy(residual)
-            self._healthy = self._energies(residual, self._gains)
-
-    def judge(self, pair: Floats) -> Direction | None:
-        """Name the faulty race of a window in which something has changed.
+    def judge(self, pair: Floats, *, suspected: bool = False) -> Direction | None:
+        """Judge a look.
 
         Args:
             pair: float64 ``[n, 2]``, rotor and housing in their units; NaN where missing.
+            suspected: name the race even if nothing is detected: something else has found a fault.
 
         Returns:
-            None before the healthy machine is known, or if too much is missing.
+            None if too much is missing to tell.
         """
-        residual = self._separated(pair)
-        if self._gains is None or residual is None:
-            return None
-        found, p = self._energies(residual, self._gains), self._two.parameters
-        # The outer unit is driven by the inner race's component, and the other way round.
-        inner = found.outer_unit / self._healthy.outer_unit - 1.0
-        outer = found.inner_unit / self._healthy.inner_unit - 1.0
-        if not max(inner, outer) > _LEAST_EXCESS:
-            return Direction(("inner", "outer", "ball"), math.nan)
-        least = _LEAST_EXCESS / 2.0
-        inner_m2 = max(inner, least) * self._healthy.outer_unit * (p.m_r / p.k_s) ** 2
-        outer_m2 = max(outer, least) * self._healthy.inner_unit * (p.m_h / p.k_c) ** 2
-        ratio_db = 10.0 * math.log10(inner_m2 / outer_m2)
-        race: Part = "inner" if ratio_db > 0.0 else "outer"
-        if abs(ratio_db) >= _RACE_DB:
-            return Direction((race,), ratio_db)
-        return Direction(("ball",) if abs(ratio_db) <= _BALL_DB else (race, "ball"), ratio_db)
-
-    def _separated(self, pair: Floats) -> Floats | None:
-        """The residual of a window, complete rows only; None if there is none."""
-        self._residual.reset()
-        residual = self._residual.process(pair * self._two.m_s2_per_unit)
-        residual = residual[np.isfinite(residual).all(axis=1)]
-        return residual if len(residual) else None
-
-    @staticmethod
-    def _energies(residual: Floats, gains: SlidingGains) -> UnitEnergies:
-        return UnitEnergies.of(SlidingPair(gains).process(residual))
+        self._monitor.reset()
+        try:
+            found = self._monitor.take(pair * self._m_s2_per_unit, suspected=suspected)
+        except ValueError:
+            return None  # no stretch between the gaps is as long as a frame
+        isolation = found.isolation
+        return Direction(
+            detected=found.detection.detected,
+            group=() if isolation is None else isolation.group,
+            change_nats=found.detection.statistic,
+            limit_nats=found.detection.limit,
+            inner_nats=0.0 if isolation is None else isolation.inner_nats,
+            outer_nats=0.0 if isolation is None else isolation.outer_nats,
+            ratio_db=found.ratio_db,
+        )

@@ -1,7 +1,13 @@
 """From the bearings of a machine, each judged by itself, to one statement about the machine.
 
 A fault is heard at the far bearing, too: the bearing that shows most is the faulty one. That the machine has
-changed at all is for the innovations of its healthy model to say, where there is one.
+changed at all is for the innovations of its healthy model to say, where there is one, and for the residual of
+two accelerometers, where a bearing has them.
+
+Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
+if they leave it open, and contradicts them if it is sure of the other race: the verdict is then
+``inner_or_outer``. Where no lines stand out the direction names the part of whatever has changed; if it is
+not sure either, the machine has ``changed``.
 """
 
 from __future__ import annotations
@@ -58,13 +64,17 @@ def find(
         verdicts: of each bearing that could be judged, by name; at least one.
         change: of the innovations; None without a healthy machine to compare with.
         false_alarm_probability: that ``change`` was judged at.
-        directions: which race the two accelerometers of a bearing tell, of those that have two and have
-            changed.
+        directions: what the two accelerometers of a bearing tell, of those that have two.
     """
-    # A direction that leaves everything open tells nothing.
-    told = {name: one for name, one in (directions or {}).items() if len(one.group) < len(PARTS)}
+    directions = directions or {}
+    told = {name: one for name, one in directions.items() if one.decides}
     faulty = {name: said for name, said in verdicts.items() if said.verdict not in SOUND}
-    where = max(faulty or told or verdicts, key=lambda name: severity_of(verdicts[name]))
+    felt = {name: one for name, one in directions.items() if one.detected}
+    if not faulty and (felt or told):
+        among = {name: told[name] for name in felt if name in told} or felt or told
+        where = max(among, key=lambda name: among[name].change_nats / among[name].limit_nats)
+    else:
+        where = max(faulty or verdicts, key=lambda name: severity_of(verdicts[name]))
     said = verdicts[where]
     shares = _probabilities(said)
     verdict: RaceWord = said.verdict
@@ -74,12 +84,12 @@ def find(
             verdict, group = _corroborated(said, told[where])
     else:
         changed = any(v.verdict == "changed" for v in verdicts.values()) if change is None else change.changed
-        verdict = "changed" if changed else "normal"
-        if changed and told:
-            verdict, group = _by_direction(told[where])
-        else:
-            group = (verdict,)
-        doubt = false_alarm_probability if changed else 0.0
+        verdict = "changed" if changed or felt else "normal"
+        group = (verdict,)
+        if verdict == "changed" and where in told:
+            group = told[where].group
+            verdict = told[where].group[0]
+        doubt = 0.0 if verdict == "normal" else false_alarm_probability
         sound = shares["normal"] + shares["changed"]
         shares |= {"normal": sound * doubt, "changed": 0.0}
         shares[verdict] += sound * (1.0 - doubt)
@@ -95,11 +105,6 @@ def find(
 
 
 _OTHER: Mapping[RaceWord, RaceWord] = {"inner": "outer", "outer": "inner"}
-
-
-def _by_direction(told: Direction) -> tuple[RaceWord, tuple[str, ...]]:
-    """What the direction alone says of a change."""
-    return (told.group[0] if len(told.group) == 1 else "inner_or_outer"), told.group
 
 
 def _corroborated(said: RaceVerdict, told: Direction) -> tuple[RaceWord, tuple[str, ...]]:

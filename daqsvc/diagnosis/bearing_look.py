@@ -28,7 +28,7 @@ class Look:
     Attributes:
         races: of each bearing that could be judged, by name.
         changes: of the innovations at each of them; empty without a healthy machine.
-        directions: which race two accelerometers tell, of each bearing that has two and has changed.
+        directions: what two accelerometers tell, of each bearing that has two.
         quality: what the samples are worth.
         reason: why they are not good.
         finding: what the bearings show together; None if none could be judged.
@@ -48,11 +48,13 @@ class Look:
 
 
 _UNITS = {"speed": "rpm", "residual.rise": "dB", "line.frequency": "Hz"}
+_DIRECTION_UNITS = {"direction": "dB", "direction.change": "nat"}
+"""Of figures that begin with the name of a bearing."""
 
 
 def units_of(figures: Iterable[str]) -> dict[str, str]:
     """Unit of each figure that has one."""
-    units = {key: "dB" if key.endswith(".direction") else _UNITS.get(key, "") for key in figures}
+    units = {key: _UNITS.get(key) or _DIRECTION_UNITS.get(key.partition(".")[2], "") for key in figures}
     return {key: unit for key, unit in units.items() if unit}
 
 
@@ -65,11 +67,10 @@ def figures_of(look: Look, where: str) -> dict[str, float]:
             "residual.rise": float(look.change.rise_db[0]),
             "residual.departure": look.change.departure,
         }
-    figures |= {
-        f"{name}.direction": direction.ratio_db
-        for name, direction in look.directions.items()
-        if math.isfinite(direction.ratio_db)
-    }
+    for name, direction in look.directions.items():
+        figures[f"{name}.direction.change"] = direction.change_nats
+        if math.isfinite(direction.ratio_db):
+            figures[f"{name}.direction"] = direction.ratio_db
     for name, race in look.races.items():
         for part in PARTS:
             evidence = race.evidence[part]
@@ -94,12 +95,20 @@ def thresholds_of(look: Look, where: str) -> dict[str, float]:
         for part, evidence in look.races[where].evidence.items():
             thresholds[f"{where}.{part}.z"] = evidence.z_limit
             thresholds[f"{where}.{part}.severity"] = evidence.limit
+    for name, direction in look.directions.items():
+        thresholds[f"{name}.direction.change"] = direction.limit_nats
     return thresholds
 
 
 def evidence_of(look: Look, where: str) -> dict[str, float]:
-    """Log-likelihood ratios of the lines of each part against noise, in nats."""
+    """Log-likelihood ratios in nats: of the lines of each part against noise, of either race's hits."""
     if where not in look.races:
         return {}
     lines = look.races[where].lines
-    return {part: float(sum(line.evidence for line in lines if line.part == part)) for part in PARTS}
+    evidence: dict[str, float] = {
+        part: float(sum(line.evidence for line in lines if line.part == part)) for part in PARTS
+    }
+    if where in look.directions and look.directions[where].group:
+        direction = look.directions[where]
+        evidence |= {"direction.inner": direction.inner_nats, "direction.outer": direction.outer_nats}
+    return evidence

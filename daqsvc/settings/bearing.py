@@ -39,6 +39,9 @@ class ThreeMasses(Section):
     damping_n_s_per_m: Annotated[
         Triple, Field(description="shaft, contact, housing", examples=["[200.0, 300.0, 2000.0]"])
     ]
+    mismatch: Annotated[float, Field(ge=0, le=0.4)] = Field(
+        default=0.1, description="share by which each of these figures may be wrong"
+    )
 
 
 class WatchedBearing(Section):
@@ -73,6 +76,9 @@ class Bearing(Section):
             examples=['[{ name = "drive-end", sensor = "accel-de", type = "6205-2RS" }]'],
         ),
     ]
+    keyphasor: Name | None = Field(
+        default=None, description="what measures the speed; without it, the machine keeps to speed_rpm"
+    )
     calibrate_s: Annotated[Positive, Field(ge=10, le=120)] = Field(
         default=30.0, description="first seconds, which are the healthy state; kept over restarts"
     )
@@ -83,7 +89,12 @@ class Bearing(Section):
         default=1e-4, description='of calling the unchanged machine "changed", at each look'
     )
 
+    repeatability_db: Annotated[float, Field(ge=0, le=6)] = Field(
+        default=0.8,
+        description="standard deviation of the healthy machine's level from run to run: temperature, load",
+    )
+
     @property
     def sensors(self) -> tuple[Name, ...]:
-        """The sensors that it rests on, each once."""
+        """The accelerometers that it rests on, each once."""
         return tuple(dict.fromkeys(name for bearing in self.bearings for name in bearing.sensors))

@@ -40,6 +40,7 @@ def bearing_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
                 yield _sensors(draft, bearing, at)
                 yield _direction(draft, bearing, at)
             yield _one_stream(draft, given)
+            yield _keyphasor(draft, given)
             yield _speed(draft)
             yield _ring(draft)
 
@@ -132,6 +133,27 @@ def _one_stream(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
                     f'is in stream "{other.stream}", but "{first.name}" is in stream "{first.stream}"',
                     "take sensors of one stream: bearings of a machine are compared",
                 )
+
+
+def _keyphasor(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+    """What measures the speed is a keyphasor, sampled with the accelerometers."""
+    if given.keyphasor is None:
+        return
+    at = (*_BEARING, "keyphasor")
+    sensors = _named(draft)
+    keyphasors = [name for name, sensor in sensors.items() if sensor.type == "keyphasor"]
+    if given.keyphasor not in sensors:
+        yield Finding(at, "there is no such sensor", choice(given.keyphasor, keyphasors))
+    elif given.keyphasor not in keyphasors:
+        yield Finding(at, 'must be a sensor of type "keyphasor"', choice(given.keyphasor, keyphasors))
+    else:
+        first, own = sensors.get(given.bearings[0].sensor), sensors[given.keyphasor].stream
+        if first is not None and own != first.stream:
+            yield Finding(
+                at,
+                f'is in stream "{own}", but "{first.name}" is in stream "{first.stream}"',
+                "sample both in one stream, or remove it: the machine is then taken to keep to speed_rpm",
+            )
 
 
 def _speed(draft: MachineFile) -> Iterator[Finding]:

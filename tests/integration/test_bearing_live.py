@@ -16,8 +16,10 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.parameter_sets import S3
-from daqsvc.diagnosis.bearing import BearingDetector, HousedBearing
+from daqsvc.bearing.two_sensors import PairModel
+from daqsvc.diagnosis.bearing import BearingDetector
 from daqsvc.diagnosis.bearing_direction import TwoSensors
+from daqsvc.diagnosis.bearing_housed import HousedBearing
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import parse_machine_file
 from sim_hw.demo.session import Script, Session
@@ -233,7 +235,7 @@ def pair():
 def test_two_accelerometers_tell_the_race_where_the_lines_do_not(pair, fault, sign) -> None:
     """The bearing is another one than the file says: its lines are not found, and the direction decides."""
     wrong = BearingOrders(inner=9.45, outer=4.55, ball=3.05, cage=4.55 / 14.0)
-    bearing = HousedBearing("drive-end", "housing", 1, wrong, TwoSensors("rotor", 0, S3))
+    bearing = HousedBearing("drive-end", "housing", 1, wrong, TwoSensors("rotor", 0, PairModel(S3)))
     given = {"rate_hz": PAIR_RATE_HZ, "bearings": [bearing]}
     watch = detector(**given)
     watch.warm()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -78,23 +76,30 @@ def test_the_innovations_say_whether_anything_has_changed(verdicts, changed, ver
     assert max(found.probabilities, key=found.probabilities.get) == verdict
 
 
+def direction(*group: str, detected: bool = True, nats: float = 50.0) -> Direction:
+    return Direction(detected=detected, group=group, change_nats=nats, limit_nats=10.0)
+
+
 @pytest.mark.parametrize(
     ("by_lines", "by_direction", "verdict", "group"),
     [
-        (race("normal"), Direction(("outer",), -9.0), "outer", ("outer",)),
-        (race("normal"), Direction(("ball",), 0.0), "ball", ("ball",)),
-        (race("normal"), Direction(("inner", "outer", "ball"), math.nan), "changed", ("changed",)),
-        (race("inner_or_outer", ("inner", "outer")), Direction(("outer",), -9.0), "outer", ("outer",)),
+        (race("normal"), direction("outer"), "outer", ("outer",)),
+        (race("normal"), direction("ball"), "ball", ("ball",)),
+        (race("normal"), direction("inner", "outer", "ball"), "changed", ("changed",)),
+        (race("inner_or_outer", ("inner", "outer")), direction("outer"), "outer", ("outer",)),
         (
             race("inner_or_outer", ("inner", "outer")),
-            Direction(("ball",), 0.0),
+            direction("ball"),
             "inner_or_outer",
             ("inner", "outer"),
         ),
-        (race("normal"), Direction(("inner", "ball"), 3.0), "inner_or_outer", ("inner", "ball")),
-        (race("inner"), Direction(("inner",), 9.0), "inner", ("inner",)),
-        (race("inner"), Direction(("outer",), -9.0), "inner_or_outer", ("inner", "outer")),
-        (race("ball"), Direction(("outer",), -9.0), "ball", ("ball",)),
+        (race("normal"), direction("inner", "ball"), "inner", ("inner", "ball")),
+        (race("inner"), direction("inner"), "inner", ("inner",)),
+        (race("inner"), direction("inner", "outer", "ball"), "inner", ("inner",)),
+        (race("inner"), direction("outer"), "inner_or_outer", ("inner", "outer")),
+        (race("inner"), direction("outer", detected=False), "inner_or_outer", ("inner", "outer")),
+        (race("inner"), direction("outer", "ball"), "inner", ("inner",)),
+        (race("ball"), direction("outer"), "ball", ("ball",)),
     ],
 )
 def test_the_direction_settles_a_doubt_or_raises_one(by_lines, by_direction, verdict, group) -> None:
@@ -102,6 +107,24 @@ def test_the_direction_settles_a_doubt_or_raises_one(by_lines, by_direction, ver
     assert (found.verdict, found.group) == (verdict, group)
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert max(found.probabilities, key=found.probabilities.get) == verdict
+
+
+def test_the_direction_alone_may_see_a_change() -> None:
+    verdicts = {"a": race("normal", severity=2.0), "b": race("normal")}
+    still = change(changed=False)
+    felt = {"a": direction("inner"), "b": direction(detected=False, nats=1.0)}
+    found = find(verdicts, still, 1e-3, felt)
+    assert (found.verdict, found.where) == ("inner", "a")
+    assert found.probabilities["inner"] == pytest.approx(0.999)
+    assert find(verdicts, still, 1e-3, {"a": direction(detected=False)}).verdict == "normal"
+    assert find(verdicts, still, 1e-3, {"a": direction("inner", "outer", "ball")}).verdict == "changed"
+
+
+def test_of_two_bearings_without_lines_the_one_whose_residual_shows_more_decides() -> None:
+    verdicts = {"a": race("normal", severity=9.0), "b": race("normal")}
+    felt = {"a": direction("inner", nats=20.0), "b": direction("outer", nats=90.0)}
+    found = find(verdicts, None, 1e-3, felt)
+    assert (found.verdict, found.where) == ("outer", "b")
 
 
 def looks(steadfast: Steadfast, *words: str) -> list[str]:
