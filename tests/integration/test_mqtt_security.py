@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import shutil
 import subprocess
 
 import pytest
-from brokers import eventually, running_mosquitto
+from brokers import Consumer, eventually, free_port, running_mosquitto
+from tls_files import authority, openssl, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.store import Outbox
+from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
+from daqsvc.publish.payloads import status_payload
 
 pytestmark = pytest.mark.mosquitto
 CLOCK = SystemClock()
@@ -38,35 +42,30 @@ async def publishing(outbox, settings):
         await running
 
 
-def openssl(*arguments):
-    program = shutil.which("openssl")
-    if program is None:
-        pytest.skip("no openssl on this machine (apt-get install openssl)")
-    subprocess.run([program, *arguments], check=True, capture_output=True)
-
-
-def certificate(directory, name, host):
-    """A certificate for ``host`` that vouches for itself."""
-    key, cert = directory / f"{name}.key", directory / f"{name}.crt"
-    openssl(
-        *("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}"),
-        *("-addext", f"subjectAltName={host}", "-keyout", str(key), "-out", str(cert)),
+def tls_config(pair, clients=None):
+    """What Mosquitto shows; with ``clients`` it wants certificates of that authority from them."""
+    wanted = (
+        f"cafile {clients.cert}\nrequire_certificate true\nuse_identity_as_username true\n" if clients else ""
     )
-    return key, cert
+    return f"{wanted}certfile {pair.cert}\nkeyfile {pair.key}"
 
 
-def tls_config(key, cert):
-    return f"certfile {cert}\nkeyfile {key}"
-
-
-def tls_settings(port, ca_file):
-    return MqttSettings("127.0.0.1", port, "daqsvc-tls", tls=True, ca_file=ca_file)
+def tls_settings(port, ca_file, own=None):
+    return MqttSettings(
+        "127.0.0.1",
+        port,
+        "daqsvc-tls",
+        tls=True,
+        ca_file=ca_file,
+        cert_file=own.cert if own else None,
+        key_file=own.key if own else None,
+    )
 
 
 async def test_a_broker_with_a_trusted_certificate_is_served(tmp_path, outbox):
-    key, cert = certificate(tmp_path, "broker", "IP:127.0.0.1")
-    with running_mosquitto(tmp_path, config=tls_config(key, cert)) as mosquitto:
-        async with publishing(outbox, tls_settings(mosquitto.port, cert)) as publisher:
+    broker = self_signed(tmp_path, "broker", "IP:127.0.0.1")
+    with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, broker.cert)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected over TLS")
             sequence = await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
             await eventually(lambda: outbox.counters.sent == 1, f"{sequence} is acknowledged")
@@ -80,10 +79,10 @@ async def test_a_broker_with_a_trusted_certificate_is_served(tmp_path, outbox):
     ],
 )
 async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, caplog, host, trusted, reason):
-    key, cert = certificate(tmp_path, "broker", host)
-    _, stranger = certificate(tmp_path, "stranger", "IP:127.0.0.1")
-    with running_mosquitto(tmp_path, config=tls_config(key, cert)) as mosquitto:
-        settings = tls_settings(mosquitto.port, cert if trusted else stranger)
+    broker = self_signed(tmp_path, "broker", host)
+    stranger = self_signed(tmp_path, "stranger", "IP:127.0.0.1")
+    with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
+        settings = tls_settings(mosquitto.port, (broker if trusted else stranger).cert)
         async with publishing(outbox, settings) as publisher:
             await eventually(lambda: "is away" in caplog.text, "it is refused")
             assert any(part in caplog.text for part in reason.split("|"))
@@ -91,19 +90,112 @@ async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, ca
 
 
 async def test_a_rotated_certificate_takes_effect_at_the_next_connection(tmp_path, outbox):
-    old_key, old = certificate(tmp_path, "old", "IP:127.0.0.1")
-    new_key, new = certificate(tmp_path, "new", "IP:127.0.0.1")
+    old, new = (self_signed(tmp_path, name, "IP:127.0.0.1") for name in ("old", "new"))
     trusted = tmp_path / "trusted.crt"
-    trusted.write_bytes(old.read_bytes())
-    with running_mosquitto(tmp_path, config=tls_config(old_key, old)) as mosquitto:
+    trusted.write_bytes(old.cert.read_bytes())
+    with running_mosquitto(tmp_path, config=tls_config(old)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, trusted)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected with the old certificate")
             mosquitto.stop()
-            old_key.write_bytes(new_key.read_bytes())
-            old.write_bytes(new.read_bytes())
-            trusted.write_bytes(new.read_bytes())
+            new.replaces(old)
+            trusted.write_bytes(new.cert.read_bytes())
             mosquitto.start()
             await eventually(lambda: publisher.counters.connections == 2, "connected with the new one")
+
+
+async def test_a_broker_that_wants_certificates_gets_the_one_of_the_box(tmp_path, outbox, caplog):
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
+            await eventually(lambda: "is away" in caplog.text, "nobody is served without a certificate")
+            assert publisher.counters.connections == 0
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
+            await eventually(lambda: publisher.counters.connected, "the box is served")
+            assert "u'box'" in mosquitto.log_text
+
+
+async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
+    tmp_path, outbox, monkeypatch, caplog
+):
+    """The complaint: a renewed certificate takes effect only after a restart, if somebody thinks of it."""
+    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
+    old_ca, new_ca = authority(tmp_path, "old-ca"), authority(tmp_path, "new-ca", days=60)
+    broker, box = signed(tmp_path, "broker", old_ca, host="IP:127.0.0.1"), signed(tmp_path, "box", old_ca)
+    new_broker = signed(tmp_path, "new-broker", new_ca, host="IP:127.0.0.1", days=9)
+    new_box = signed(tmp_path, "new-box", new_ca, days=9)
+    with running_mosquitto(tmp_path, config=tls_config(broker, old_ca)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, old_ca.cert, box)) as publisher:
+            await eventually(lambda: publisher.counters.connected, "connected with the old certificates")
+            before = dict(publisher.certificate_expiry)
+            assert {name: ns / 1e9 for name, ns in before.items()} == {
+                "client": box.not_after_s,
+                "broker": broker.not_after_s,
+                "ca": old_ca.not_after_s,
+            }
+            mosquitto.stop()
+            for new, old in ((new_ca, old_ca), (new_broker, broker), (new_box, box)):
+                new.replaces(old)
+            mosquitto.start()
+            await eventually(lambda: publisher.counters.connections == 2, "connected with the new ones")
+            after = publisher.certificate_expiry
+            assert all(after[name] > before[name] for name in ("client", "broker", "ca"))
+            seconds = publisher.figures()["certificates"]["client"]["not_after_seconds"]
+            assert seconds == new_box.not_after_s
+            renewed = signed(tmp_path, "renewed", new_ca, days=20)
+            renewed.replaces(box)
+            await eventually(lambda: publisher.counters.connections == 3, "a renewal alone is enough")
+            assert publisher.certificate_expiry["client"] / 1e9 == renewed.not_after_s
+            assert mosquitto.log_text.count("u'renewed'") == 1
+    assert "Traceback" not in caplog.text
+
+
+async def test_a_renewal_is_no_outage_to_anybody(tmp_path, outbox, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    renewed = signed(tmp_path, "renewed", ca)
+    plain = free_port()
+    config = f"{tls_config(broker, ca)}\nlistener {plain} 127.0.0.1\nallow_anonymous true"
+    with running_mosquitto(tmp_path, config=config) as mosquitto:
+        async with (
+            Consumer(plain) as live,
+            publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher,
+        ):
+            await eventually(lambda: live.on("/availability"), "the box is online")
+            renewed.replaces(box)
+            await eventually(lambda: publisher.counters.connections == 2, "connected anew")
+            await eventually(lambda: len(live.on("/availability")) == 2, "it says so")
+            assert [m.payload["state"] for m in live.on("/availability")] == ["online", "online"]
+
+
+async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, outbox, monkeypatch, caplog):
+    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.02)
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    whole = box.cert.read_bytes()
+    with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
+            await eventually(lambda: publisher.counters.connected, "connected")
+            box.cert.write_bytes(whole[: len(whole) // 2])
+            await eventually(lambda: "cannot be used together" in caplog.text, "it is looked at")
+            assert str(box.cert) in caplog.text
+            assert publisher.counters.connected
+            await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
+            await eventually(lambda: outbox.counters.sent == 1, "alarms still pass")
+            assert publisher.counters.connections == 1
+            box.cert.write_bytes(whole)
+            await eventually(lambda: publisher.counters.connections == 2, "the whole one is taken")
+
+
+async def test_an_encrypted_key_is_refused_and_nobody_is_asked_at_the_terminal(tmp_path, outbox, caplog):
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    openssl("ec", "-in", box.key, "-aes256", "-passout", "pass:sesame", "-out", tmp_path / "locked.key")
+    (tmp_path / "locked.key").replace(box.key)
+    with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)):
+            await eventually(lambda: "is encrypted" in caplog.text, "it is said")
 
 
 def password_config(tmp_path):
@@ -129,6 +221,51 @@ async def test_a_corrected_password_is_read_at_the_next_attempt_and_never_logged
             await eventually(lambda: publisher.counters.connected, "the corrected password is taken")
     assert SECRET not in caplog.text
     assert SECRET not in repr(settings)
+
+
+async def test_password_and_key_may_be_systemd_credentials(tmp_path, outbox, monkeypatch, caplog):
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    config = f"{tls_config(broker)}\n{password_config(tmp_path)}"
+    with running_mosquitto(tmp_path, config=config, anonymous=False) as mosquitto:
+        settings = dataclasses.replace(
+            tls_settings(mosquitto.port, ca.cert, box),
+            username="daq",
+            password_credential="mqtt-password",  # noqa: S106  a name
+            key_file=None,
+            key_credential="mqtt-key",
+        )
+        monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
+        async with publishing(outbox, settings) as publisher:
+            await eventually(lambda: "LoadCredential=mqtt-password" in caplog.text, "the remedy is named")
+            given = tmp_path / "credentials"
+            given.mkdir()
+            (given / "mqtt-password").write_text(SECRET + "\n")
+            box.key.replace(given / "mqtt-key")
+            monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(given))
+            await eventually(lambda: publisher.counters.connected, "both are found")
+
+
+async def test_secrets_are_in_no_log_and_in_nothing_that_is_published(tmp_path, outbox, caplog):
+    """Every log record of every library, everything on the broker, and what the publisher says of itself."""
+    caplog.set_level(1)
+    caplog.set_level(1, "daqsvc.publish.connection.library")
+    mine = tmp_path / "mine"
+    mine.write_bytes(b"\xff" + SECRET.encode())
+    with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
+        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        async with publishing(outbox, settings) as publisher:
+            await eventually(lambda: "is not UTF-8 text" in caplog.text, "the file is named")
+            mine.write_text(f"{SECRET}\nsecond {SECRET}\n")
+            await eventually(lambda: publisher.counters.connected, "connected")
+            figures = publisher.figures()
+            publisher.telemetry("status", status_payload("lab", "edge-1", {"mqtt": figures}, CLOCK).to_json())
+            await eventually(lambda: publisher.counters.telemetry_sent == 1, "the status is published")
+            told = [repr(settings), repr(publisher), repr(figures), repr(read_credentials(settings))]
+            told += [str(vars(record)) for record in caplog.records]
+            for sequence in range(3):
+                told += [repr(m) for m in await outbox.pending_telemetry(sequence, 10)]
+        assert not [text for text in told if SECRET in text]
 
 
 async def test_a_missing_password_file_is_named_and_awaited(tmp_path, outbox, caplog):
