@@ -14,8 +14,9 @@ from daqsvc import assembly, assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
-from daqsvc.assembly_alarms import alarm_rules, identity
+from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.assembly_store import outbox_limits
 from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
