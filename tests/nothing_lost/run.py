@@ -315,6 +315,7 @@ async def run(course: Course, directory: Path) -> Report:
             journal,
             list(consumer.arrivals),
             stage.forgotten,
+            set(proxy.tap.acknowledged) if stage.disk_was_full else set(),
         )
         verdict = Verdict.on(evidence)
         verdict.violations[:0] = stage.failures

@@ -114,6 +114,7 @@ class Teller:
             self._clock.wall_offset_s = step.wall_offset_s
             self._under_way = []
             self._desk.take(step.diagnosis(self._desk.identity.machine, self._clock.monotonic_ns()))
+            self._desk.outbox.telemetry(f"{self._desk.topics.base}/status", b'{"step": %d}' % step.number)
             before = settling[-1:]
             settling.append(asyncio.create_task(self._settled(step.number, self._under_way, before)))
         await asyncio.gather(*settling)
@@ -179,6 +180,7 @@ async def run(arguments: argparse.Namespace) -> None:
     bypassed = arguments.mutation == "bypass"
     desk = AlarmDesk(script.identity, RULES, arguments.store, clock, None if bypassed else mqtt)
     if desk.publisher is not None:
+        assert hasattr(desk.publisher, "_backoff")
         desk.publisher._backoff = QUICK_RETRY
     await desk.open()
     if bypassed:
@@ -192,10 +194,13 @@ async def run(arguments: argparse.Namespace) -> None:
     clock.wall_offset_s = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s
     await desk.resume(SENSORS)
     running = asyncio.create_task(desk.run())
+    timekeeper = asyncio.create_task(desk.keep_time())
     await teller.tell(script.steps[untold:])
     while desk.outbox.counters.waiting or desk.outbox.counters.depth:
         await asyncio.sleep(0.02)
     teller.write("done")
+    timekeeper.cancel()
+    await desk.settle(timeout_s=2.0)
     await desk.stop(deadline_s=2.0)
     await running
     await desk.close(timeout_s=2.0)
