@@ -34,6 +34,10 @@ _IN_WORDS = {
     "changed": "a change, its cause not yet known",
     "unmodelled": "an unmodelled change",
     "small_change": "a small change",
+    "inner": "damage of the inner race",
+    "outer": "damage of the outer race",
+    "ball": "damage of a rolling element",
+    "inner_or_outer": "damage of the inner or outer race",
 }
 """Decisions that are no names of a state."""
 
@@ -317,12 +321,14 @@ class _DecisionWatch:
     def _sentence(diagnosis: Diagnosis, evidence: float | None) -> str:
         decision = diagnosis.decision
         sentence = f"{diagnosis.detector} finds {_IN_WORDS.get(decision, decision)}"
+        if diagnosis.where:
+            sentence += f" at {diagnosis.where}"
         probability = diagnosis.probabilities.get(decision, 0.0)
         if probability > 0.5:  # a smaller one says less than the words
             sentence += ", p > 0.999" if probability > SURE else f", p = {probability:.3f}"
         if evidence is not None:
             sentence += f", evidence {evidence:.3g} nats"
-        others = [mode for mode in diagnosis.group if mode != decision]
+        others = [_IN_WORDS.get(mode, mode) for mode in diagnosis.group if mode not in decision.split("_or_")]
         if others:
             how = "possibly" if decision == DEPARTURE else "not told apart from"
             sentence += f", {how} {', '.join(others)}"

@@ -209,7 +209,7 @@ class WhittleDetector:
             nats = np.zeros(len(_SIZES))
             learnt = power * np.exp(deviation * (alike @ rng.standard_normal(lines)))
             for part in parts:
-                noise = rng.standard_normal((2, part + 1, lines + 2))  # real and imaginary parts
+                noise = rng.standard_normal((2, part + 1, lines + 2), dtype=np.float32)  # real, imaginary
                 noise = noise[:, 1:] + _BEFORE * noise[:, :-1]
                 # A Hann window makes a line of three.
                 seen = noise[..., 1:-1] - 0.5 * (noise[..., :-2] + noise[..., 2:])

@@ -373,6 +373,7 @@ class BearingDetector:
             sensors=tuple(bearing.sensor for bearing in self.bearings if bearing.name == standing.where)
             or tuple(bearing.sensor for bearing in self.bearings),
             model=MODEL,
+            where=standing.where,
         )
         if good and not look.reason and self.baseline is None:
             return replace(said, reason=self._learning.reason)

@@ -101,7 +101,10 @@ def thresholds_of(look: Look, where: str) -> dict[str, float]:
 
 
 def evidence_of(look: Look, where: str) -> dict[str, float]:
-    """Log-likelihood ratios in nats: of the lines of each part against noise, of either race's hits."""
+    """Log-likelihood ratio of each part in nats: of its lines against noise, or of its hits if that is more.
+
+    A ball's hits are those of both races: the fewer of them speak for it.
+    """
     if where not in look.races:
         return {}
     lines = look.races[where].lines
@@ -110,5 +113,7 @@ def evidence_of(look: Look, where: str) -> dict[str, float]:
     }
     if where in look.directions and look.directions[where].group:
         direction = look.directions[where]
-        evidence |= {"direction.inner": direction.inner_nats, "direction.outer": direction.outer_nats}
+        inner, outer = direction.inner_nats, direction.outer_nats
+        hits = {"inner": inner, "outer": outer, "ball": min(inner, outer)}
+        return {part: max(nats, hits[part]) for part, nats in evidence.items()}
     return evidence

@@ -25,6 +25,8 @@ class Diagnosis:
         end_index: one past its last sample.
         decision: the mode or level that the detector stands by now, e.g. ``"F1L2"`` or ``"alert"``;
             ``"undetermined"`` while it cannot say.
+        where: the part of the machine that it is about, e.g. the name of a bearing; empty if it is about the
+            machine as a whole.
         changed: whether ``decision`` differs from the one before.
         severity: how bad the decision is.
         probabilities: conditional probability per mode, summing to one; empty if the detector has none.
@@ -62,6 +64,7 @@ class Diagnosis:
     reason: str = ""
     sensors: tuple[str, ...] = ()
     model: str = ""
+    where: str = ""
 
 
 def silence_reason(stream: str, silence_s: float) -> str:

@@ -276,6 +276,7 @@ async def test_damage_reaches_the_alarm_over_the_bus() -> None:
     assert [(p["kind"], p["cause"]["decision"]) for p in alarms] == [("raised", "outer")]
     (raised,) = alarms
     assert raised["cause"]["detector"] == "bearing"
+    assert "bearing finds damage of the outer race at drive-end" in raised["message"]
     assert raised["cause"]["sensors"] == ["accel-de"]
     assert raised["cause"]["statistics"]["residual.ratio"] > 1.2
     said = [m.payload for m in heard if m.kind == "diagnosis" and m.payload["detector"] == "bearing"]
