@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import scipy.fft
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -106,11 +107,12 @@ class _Spectrum:
         resolution = rate_hz / len(centred)
         # Only the lowest lines matter: as a slower series they are found in a hundredth of the time.
         highest = int(ORDERS[-1] * (_OTHER_MOST + 0.5) * nominal_hz / resolution) + 16
-        spectrum = np.fft.rfft(centred, axis=0)[:highest]
-        slow = np.fft.irfft(spectrum, 2 * len(spectrum), axis=0)
+        spectrum = scipy.fft.rfft(centred, axis=0)[:highest]
+        slow = scipy.fft.irfft(spectrum, scipy.fft.next_fast_len(2 * len(spectrum), real=True), axis=0)
         # A Hann window keeps strong lines elsewhere out; it widens a line by half.
         window = np.hanning(len(slow))[:, np.newaxis]
-        power = np.abs(np.fft.rfft(slow * window, len(slow) * _POINTS_PER_LINE, axis=0)) ** 2
+        lines = scipy.fft.rfft(slow * window, len(slow) * _POINTS_PER_LINE, axis=0)
+        power = lines.real**2 + lines.imag**2
         return cls(power, resolution / _POINTS_PER_LINE, resolution, nominal_hz)
 
     @property

@@ -19,6 +19,7 @@ from daqsvc.bearing.race.decision import decide
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
 from daqsvc.bearing.race.quality import checked
+from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.speed import shaft_rate
 from daqsvc.bearing.race.verdict import (
@@ -30,7 +31,7 @@ from daqsvc.bearing.race.verdict import (
     RaceVerdict,
 )
 from daqsvc.bearing.race.weigh import EnvelopeView, Scales, view_of
-from daqsvc.dsp.envelope import squared_envelope, whiten
+from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -54,7 +55,7 @@ class RaceFeatures:
         lines: kinematic lines found, strongest first.
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
-        speed_seen: whether they stood out.
+        speed_doubt: why they do not confirm it; empty if they do.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         spectrum: envelope spectrum, for figures.
@@ -64,7 +65,7 @@ class RaceFeatures:
     lines: tuple[RaceLine, ...]
     levels: BandLevels
     speed_rpm: float
-    speed_seen: bool
+    speed_doubt: str
     revolutions: float
     notes: tuple[str, ...]
     spectrum: EnvelopeSpectrum
@@ -115,8 +116,8 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     evidence = features.evidence
     notes = [*features.notes]
     notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
-    if not features.speed_seen:
-        notes.append("no harmonics of the shaft stand out; the stated speed was taken as it is")
+    if features.speed_doubt:
+        notes.append(f"the speed is not confirmed: {features.speed_doubt}")
     return RaceVerdict(
         verdict=decision.verdict,
         group=decision.group,
@@ -125,7 +126,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         lines=features.lines,
         margin=decision.margin,
         speed_rpm=features.speed_rpm,
-        speed_seen=features.speed_seen,
+        speed_seen=not features.speed_doubt,
         revolutions=features.revolutions,
         false_alarm_probability=len(PARTS) * false_alarm_probability(rules.z_limit),
         level_db=None if change_db is None else change_db[0],
@@ -141,22 +142,26 @@ def race_features(
     sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
-    shaft = shaft_rate(spectrum, rate_hz / length, speed_rpm / 60.0, rules.speed_tolerance, bearing.cage)
-    revolutions = length / rate_hz * shaft.rate_hz
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)
     band = whiten(spectrum, length, rate_hz, rules.low_hz, top_hz, rules.whitening_hz)
     top_order = max(highest_order(bearing), NOTCHED_HARMONICS + 1.0)
-    bins = min(int(top_order * revolutions) + 10, len(band.phase) // 2)
+    stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
+    bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
-    square = view_of(phases, sizes, bins, revolutions)
-    log = view_of(np.log(phases + LOG_OFFSET), np.log(sizes + LOG_OFFSET), bins, revolutions)
+    power = line_power(phases, bins)
+    shaft = shaft_rate(spectrum, step_hz, power, stated_hz, rules.speed_tolerance, bearing.cage)
+    revolutions = shaft.rate_hz / step_hz
+    square = view_of(power, line_power(sizes, bins), revolutions)
+    log_phases, log_sizes = (line_power(np.log(x + LOG_OFFSET), bins) for x in (phases, sizes))
+    log = view_of(log_phases, log_sizes, revolutions)
     evidence = Scales(square, log, bearing, shaft, revolutions, rules).weigh()
+    refuse_rivals(evidence, bearing, shaft, rules.slip)
     return RaceFeatures(
         evidence=evidence,
         lines=_found(evidence, square, bearing, shaft.rate_hz),
         levels=band_levels(spectrum, length, rate_hz),
         speed_rpm=60.0 * shaft.rate_hz,
-        speed_seen=shaft.seen,
+        speed_doubt=shaft.doubt,
         revolutions=revolutions,
         notes=sound.notes,
         spectrum=EnvelopeSpectrum(

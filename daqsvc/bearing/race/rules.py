@@ -19,7 +19,8 @@ class RaceRules:
         z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
         severity_limit: of a race; ``z`` times ``depth``.
         ball_severity_limit: of a ball.
-        unseen_caution: factor on both limits of severity where no harmonic of the shaft confirms its speed.
+        unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
+        unseen_ball_caution: the same for a ball: at a wrong speed it is a ball that races are most taken for.
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
         steadiness_limit: least steadiness of a race's lines.
@@ -48,6 +49,7 @@ class RaceRules:
     severity_limit: float = 3.0
     ball_severity_limit: float = 2.2
     unseen_caution: float = 2.0
+    unseen_ball_caution: float = 3.5
     depth_limit: float = 0.12
     ball_depth_limit: float = 0.20
     steadiness_limit: float = 0.30

@@ -1,4 +1,4 @@
-"""The shaft's speed from its harmonics, near a stated one."""
+"""The shaft's speed from its harmonics, near a stated one, and whether they confirm it."""
 
 from __future__ import annotations
 
@@ -6,35 +6,48 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.fft
 
+from daqsvc.bearing.race.harmonics import shaft_harmonics, slow_series
 from daqsvc.bearing.race.verdict import RaceInputError
-from daqsvc.dsp.envelope import hann, running_median
 from daqsvc.dsp.order_speed import find_speed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daqsvc.bearing.race.harmonics import ShaftHarmonics
+    from daqsvc.dsp.order_speed import LineSpeed
+
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
 
-HARMONICS = np.arange(1, 9)
-WEIGHTS = np.where(HARMONICS < 4, 1.0, 0.5)
-CAP_NATS = 4.0
-"""Most that one harmonic counts: a strong line that is not the shaft's must not decide alone."""
 PRIOR_SHARE = 0.006
 """Spread of the true speed about the stated one. A weaker prior was drawn to the lines of the bearing."""
-HIGHEST_ORDER = 16.0
-"""Highest multiple of the stated rate that the slower series keeps."""
 LINE_REVOLUTIONS = 160.0
 """As many are enough to see 1X to 3X sharply; more cost more than they give."""
 LINE_DEVIATION_SHARE = 0.002
 """Largest deviation of a speed from the lines of 1X to 3X that is taken before the votes of all harmonics."""
 SEEN_NATS = 7.0
-"""Votes that noise gathers once in a thousand records of 300 revolutions."""
+"""Votes from which harmonics stand out."""
+NOT_MAINS_NATS = 3.5
+"""Votes of them that must not be at multiples of the mains' frequency: about one clear harmonic."""
+SAME = 0.004
+"""Speeds as near as this are one, as sharply as lines tell."""
+NEAR = 0.03
+"""A speed as near to the stated one as this may be the same, misstated."""
+NEAR_NATS = 6.0
+"""Lead in votes that it takes to go beyond the tolerance of the stated speed."""
+SCAN = (0.48, 2.1)
+"""Shares of the stated speed between which other speeds are held against it."""
+LEAD_NATS = 4.0
+"""Lead in votes that another speed may have by chance, or by lines of the bearing."""
+OTHER_NATS = 10.0
+"""Lead in votes of another speed from which on the stated one is refused: three harmonics or more that stand
+out clearly there and not here."""
+WHOLE_SHARE = 0.4
+"""Voices of half orders over those of whole ones from which on they look like harmonics themselves; the same
+of odd orders over even ones, below which they look like none."""
 CAGE_SLIP = 0.02
-LEAST_POWER = 1e-300
-LEAST_RATIO = 1e-12
+REMEDY = "give the speed of this recording and the rate it was sampled with"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,26 +56,44 @@ class ShaftRate:
 
     Attributes:
         rate_hz: revolutions per second.
-        seen: whether harmonics of the shaft stand out at that rate.
+        seen: whether harmonics of the shaft stand out at that rate, and more so than at any other.
         sharp: whether it is known to a fraction of the search.
+        doubt: why they do not confirm it; empty if they do.
+        scan: votes for all speeds about the stated one.
     """
 
     rate_hz: float
     seen: bool
     sharp: bool = False
+    doubt: str = ""
+    scan: SpeedScan | None = None
+
+    def outvoted(self, rival_hz: float, slip: float) -> bool:
+        """Whether harmonics stand out at another rate, and more so than at this one.
+
+        Args:
+            rival_hz: the other rate.
+            slip: how far it may be from there, as a share.
+        """
+        if self.scan is None:
+            return False
+        rival = self.scan.votes_about(rival_hz, slip)
+        return rival >= SEEN_NATS and rival > self.scan.votes_about(self.rate_hz, SAME)
 
 
 def shaft_rate(
-    spectrum: Complex, step_hz: float, stated_hz: float, tolerance: float, cage: float
+    spectrum: Complex, step_hz: float, envelope_power: Real, stated_hz: float, tolerance: float, cage: float
 ) -> ShaftRate:
-    """Refine a stated shaft rate by the harmonics of the shaft in a signal.
+    """Refine a stated shaft rate by the harmonics of the shaft in a signal and in its envelope.
 
     The lines of 1X to 3X decide where they stand out (`find_speed`); otherwise eight harmonics vote, each
-    with a limited voice.
+    with a limited voice. The votes also tell whether the speed is confirmed: it must have more of them than
+    any other from half to twice the stated one.
 
     Args:
         spectrum: one-sided spectrum of the signal, unwindowed.
         step_hz: between its bins.
+        envelope_power: power spectrum of the band's envelope, its bins as far apart.
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
         cage: order of the bearing's cage.
@@ -70,31 +101,113 @@ def shaft_rate(
     Raises:
         RaceInputError: the harmonics of a wholly different speed are there, and none of this one.
     """
-    # All that matters lies at low frequencies: as a slower series it is found in no time.
-    bins = min(int(HIGHEST_ORDER * stated_hz / step_hz), len(spectrum) - 1)
-    low = spectrum[:bins].copy()
-    low[0] = 0.0
-    samples = scipy.fft.next_fast_len(2 * bins, real=True)
-    signal = scipy.fft.irfft(low, samples)
-    rate_hz = samples * step_hz
-    voted, votes = _vote(signal, rate_hz, stated_hz, tolerance)
-    enough = signal[: int(LINE_REVOLUTIONS * rate_hz / stated_hz)]
+    series, series_hz = slow_series(spectrum, step_hz, stated_hz)
+    harmonics = shaft_harmonics(series, series_hz, envelope_power, 1.0 / step_hz, stated_hz)
+    scan = SpeedScan.of(harmonics, stated_hz, cage)
+    wrong: ValueError | None = None
+    enough = series[: int(LINE_REVOLUTIONS * series_hz / stated_hz)]
+    line: LineSpeed | None = None
     try:
-        line = find_speed(enough[:, np.newaxis], rate_hz, stated_hz)
+        line = find_speed(enough[:, np.newaxis], series_hz, stated_hz)
     except ValueError as error:
-        # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
-        seen = votes > SEEN_NATS
-        if seen or _cage_line(enough, rate_hz, (1.0 - cage) * stated_hz):
-            return ShaftRate(voted, seen)
-        raise RaceInputError(
-            "shaft speed or sample rate",
-            f"is wrong: {error}",
-            "give the speed of this recording and the rate it was sampled with",
-        ) from error
-    sharp = line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz
-    if sharp and abs(line.hz / stated_hz - 1.0) <= tolerance:
-        return ShaftRate(line.hz, seen=True, sharp=True)
-    return ShaftRate(voted, votes > SEEN_NATS)
+        wrong = error
+    rate_hz, sharp = scan.voted(tolerance), False
+    if line is not None and line.seen and line.deviation_hz <= LINE_DEVIATION_SHARE * stated_hz:
+        within = abs(line.hz / stated_hz - 1.0) <= tolerance
+        sharp = within or scan.votes_about(line.hz) > scan.votes_about(rate_hz) - LEAD_NATS
+        rate_hz = line.hz if sharp else rate_hz
+    beside = scan.best(np.abs(scan.share - 1.0) <= NEAR)
+    if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
+        rate_hz, sharp = beside, True
+    doubt = scan.doubt(rate_hz)
+    # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
+    if wrong is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
+        raise RaceInputError("shaft speed or sample rate", f"is wrong: {wrong}", REMEDY) from wrong
+    scan.refuse_other(rate_hz)
+    return ShaftRate(rate_hz, not doubt, sharp, doubt, scan)
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedScan:
+    """Votes for all speeds about a stated one.
+
+    Attributes:
+        harmonics: what votes.
+        stated_hz: stated revolutions per second.
+        rates_hz: speeds, ``[n]``.
+        votes: for them in nats, ``[n]``.
+        share: the speeds over the stated one, ``[n]``.
+        others: which of them would be another speed, ``[n]``.
+    """
+
+    harmonics: ShaftHarmonics
+    stated_hz: float
+    rates_hz: Real
+    votes: Real
+    share: Real
+    others: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, harmonics: ShaftHarmonics, stated_hz: float, cage: float) -> SpeedScan:
+        """Count the votes for all speeds about a stated one."""
+        rates = harmonics.grid(SCAN[0] * stated_hz, SCAN[1] * stated_hz)
+        share = rates / stated_hz
+        others = np.abs(share - 1.0) > NEAR
+        # The shaft's own multiples are told by the half and the odd orders instead.
+        # A damaged ball strikes both races as the cage carries it past: at multiples of 1X less the cage.
+        for own in (0.5, 2.0, *((1.0 - cage) * k for k in (1, 2, 3))):
+            others &= np.abs(share / own - 1.0) > CAGE_SLIP
+        return cls(harmonics, stated_hz, rates, harmonics.votes(rates), share, others)
+
+    def voted(self, tolerance: float) -> float:
+        """The rate about the stated one that most harmonics speak for."""
+        inside = np.flatnonzero(np.abs(self.share - 1.0) <= tolerance)
+        total = self.votes[inside] - 2.0 * ((self.share[inside] - 1.0) / PRIOR_SHARE) ** 2
+        return float(self.rates_hz[inside[np.argmax(total)]])
+
+    def best(self, among: NDArray[np.bool_]) -> float:
+        """The rate of some that most harmonics speak for."""
+        return float(self.rates_hz[np.argmax(np.where(among, self.votes, -np.inf))])
+
+    def votes_about(self, rate_hz: float, reach: float = SAME) -> float:
+        """Most votes for a rate within a share of one; minus infinity beyond the scan."""
+        about = np.abs(self.rates_hz / rate_hz - 1.0) <= reach
+        return float(self.votes[about].max(initial=-np.inf))
+
+    def doubt(self, rate_hz: float) -> str:
+        """Why the harmonics do not confirm a rate; empty if they do."""
+        own = self.votes_about(rate_hz)
+        if own < SEEN_NATS:
+            return "no harmonics of the shaft stand out"
+        if own - self.harmonics.mains_votes(rate_hz) < NOT_MAINS_NATS:
+            return "only harmonics at multiples of the mains' frequency stand out"
+        other = self.best(self.others)
+        if self.votes_about(other) > own + LEAD_NATS:
+            return f"more harmonics stand out at {60.0 * other:.0f} rpm"
+        odd, even, half = (
+            float(self.harmonics.voices(np.array([rate_hz]), orders).mean())
+            for orders in (np.arange(1.0, 9.0, 2.0), np.arange(2.0, 9.0, 2.0), np.arange(0.5, 8.0))
+        )
+        if half > WHOLE_SHARE * max(odd, even):
+            return f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm"
+        if odd < WHOLE_SHARE * even:
+            return f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm"
+        return ""
+
+    def refuse_other(self, rate_hz: float) -> None:
+        """Refuse the stated speed if far more harmonics speak for another one.
+
+        Raises:
+            RaceInputError: they do.
+        """
+        other = self.best(self.others)
+        if self.votes_about(other) - self.votes_about(rate_hz) > OTHER_NATS:
+            raise RaceInputError(
+                "shaft speed or sample rate",
+                f"is wrong: the harmonics of a shaft stand out at about {60.0 * other:.0f} rpm, not at "
+                f"{60.0 * self.stated_hz:g} rpm",
+                REMEDY,
+            )
 
 
 def _cage_line(series: Real, rate_hz: float, line_hz: float) -> bool:
@@ -104,27 +217,3 @@ def _cage_line(series: Real, rate_hz: float, line_hz: float) -> bool:
     except ValueError:
         return False
     return line.seen and abs(line.hz / line_hz - 1.0) < CAGE_SLIP
-
-
-def _score(signal: Real, rate_hz: float, width_hz: float) -> tuple[Real, float]:
-    """Log of the periodogram over its local median, and its bins per Hz."""
-    spectrum = scipy.fft.rfft(signal * hann(len(signal)))
-    power = spectrum.real**2 + spectrum.imag**2
-    per_hz = len(signal) / rate_hz
-    ratio = power / np.maximum(running_median(power, round(width_hz * per_hz)), LEAST_POWER)
-    return np.log(np.maximum(ratio, LEAST_RATIO)), per_hz
-
-
-def _vote(signal: Real, rate_hz: float, stated_hz: float, tolerance: float) -> tuple[float, float]:
-    """The rate that most harmonics speak for, and their votes in nats."""
-    score, per_hz = _score(signal, rate_hz, 2.0 * stated_hz)
-    np.minimum(score, CAP_NATS, out=score)
-    step = 0.5 / per_hz / HARMONICS[-1]
-    count = int(np.ceil(tolerance * stated_hz / step))
-    candidates = stated_hz + step * np.arange(-count, count + 1)
-    bins = np.rint(np.outer(candidates, HARMONICS) * per_hz).astype(np.int64)
-    heard = bins < len(score)
-    votes = np.where(heard, score[np.minimum(bins, len(score) - 1)], 0.0) @ WEIGHTS
-    total = votes - 2.0 * ((candidates / stated_hz - 1.0) / PRIOR_SHARE) ** 2
-    best = int(np.argmax(total))
-    return float(candidates[best]), float(votes[best])

@@ -15,6 +15,8 @@ Part = Literal["inner", "outer", "ball"]
 RaceWord = Literal["normal", "changed", "inner", "outer", "ball", "inner_or_outer"]
 
 PARTS: tuple[Part, ...] = ("inner", "outer", "ball")
+PLACES: Mapping[Part, str] = {"inner": "inner race", "outer": "outer race", "ball": "ball"}
+"""The parts in words."""
 
 
 class RaceInputError(ValueError):

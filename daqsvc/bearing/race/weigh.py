@@ -14,7 +14,6 @@ from daqsvc.bearing.race.depth import ModulationDepth, sharpest
 from daqsvc.bearing.race.lines import LineEvidence, line_evidence
 from daqsvc.bearing.race.null import REVOLUTIONS, false_alarm_probability, significance
 from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
-from daqsvc.dsp.envelope import line_power
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.speed import ShaftRate
 
     Real = NDArray[np.float64]
-    Envelope = NDArray[np.float32]
 
 SHARPEN_SHARE = 0.01
 """How far the deepest lines may be from the most significant comb, as a share."""
@@ -45,18 +43,16 @@ class EnvelopeView:
     power: Real
 
 
-def view_of(phases: Envelope, sizes: Envelope, bins: int, revolutions: float) -> EnvelopeView:
-    """Look at an envelope.
+def view_of(phases: Real, sizes: Real, revolutions: float) -> EnvelopeView:
+    """Look at an envelope's spectrum.
 
     Args:
-        phases: of the band with unit amplitudes, ``[samples]``.
-        sizes: of the band with clipped amplitudes, ``[samples]``.
-        bins: how many bins of their spectra to look at.
+        phases: line power of the band with unit amplitudes, ``[bins]``.
+        sizes: that of the band with clipped amplitudes, ``[bins]``.
         revolutions: of the shaft in the record: bins per order.
     """
-    lines = line_evidence(line_power(phases, bins), revolutions)
-    power = line_power(sizes, bins)
-    return EnvelopeView(lines, ModulationDepth(power, lines.notched, revolutions), power)
+    lines = line_evidence(phases, revolutions)
+    return EnvelopeView(lines, ModulationDepth(sizes, lines.notched, revolutions), sizes)
 
 
 class Scales:
@@ -132,12 +128,10 @@ class Scales:
         if part == "ball":
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
-            e = replace(e, limit=self._caution * rules.ball_severity_limit, steadiness_limit=0.0)
+            caution = 1.0 if self._seen else rules.unseen_ball_caution
+            e = replace(e, limit=caution * rules.ball_severity_limit, steadiness_limit=0.0)
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(order, gap, rules))
-            elif not self._seen:
-                reason = "no harmonic of the shaft confirms its speed, and a ball's lines are weak"
-                e = replace(e, testable=False, reason=reason)
         return e
 
 
