@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 REMEMBERED = 4096
-"""Ids of commands that are remembered, to refuse a command that comes again."""
+"""Ids of commands that can be remembered, to refuse a command that comes again."""
 
 QUIET_NS = 10 * NS_PER_S
 """After one refusal has been logged, further ones are not for so long."""
@@ -54,7 +54,8 @@ class CommandCounters:
         refused: refused by the alarms, e.g. a reset while the condition stands.
         malformed: too large, not JSON, or not a command of a known version.
         unauthorised: for a machine or a verb that the machine file does not allow.
-        stale: too old, from the future, retained at the broker, or here for the second time.
+        stale: too old, from the future, retained at the broker, here for the second time, or so many that
+            a second time could not be told.
         unanswered: answers that the broker did not take.
     """
 
@@ -99,7 +100,7 @@ class CommandIntake:
         self._topics = topics
         self._handler = handler
         self._clock = clock
-        self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._seen: OrderedDict[tuple[str, str], int] = OrderedDict()
         self._quiet_until_ns = clock.monotonic_ns()
 
     async def take(self, message: aiomqtt.Message) -> Answer:
@@ -209,14 +210,20 @@ class CommandIntake:
         )
 
     def _check_new(self, machine: str, identifier: str) -> None:
+        now_ns = self._clock.monotonic_ns()
+        # A command that is no longer remembered would be too old, from whichever side its clock was off.
+        forget_ns = now_ns - round(2 * self._settings.max_age_s * NS_PER_S)
+        while self._seen and next(iter(self._seen.values())) < forget_ns:
+            self._seen.popitem(last=False)
         if (machine, identifier) in self._seen:
             self.counters.stale += 1
             raise CommandRefusedError(
                 f"a command with id {identifier!r} has come before; give every command its own id"
             )
-        self._seen[machine, identifier] = None
-        while len(self._seen) > REMEMBERED:
-            self._seen.popitem(last=False)
+        if len(self._seen) >= REMEMBERED:
+            self.counters.stale += 1
+            raise CommandRefusedError(f"there were {REMEMBERED} commands in a short time; ask again later")
+        self._seen[machine, identifier] = now_ns
 
     def _answer_topic(self, message: aiomqtt.Message) -> str:
         """Where the sender wants the answer, unless that would speak in the name of this box or of others.

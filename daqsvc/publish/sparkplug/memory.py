@@ -1,0 +1,73 @@
+"""What an edge node must remember over restarts: the number of its session, and what hosts have been told."""
+
+from __future__ import annotations
+
+import json
+import logging
+from typing import TYPE_CHECKING
+
+from daqsvc.outbox.files import replace_durably
+from daqsvc.publish.sparkplug.node import NUMBERS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+
+class Memory:
+    """Two numbers in a file; every method blocks on the disk.
+
+    Args:
+        path: the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.bd_seq = 0
+        """Number of the next session, 0 to 255."""
+        self.cursor: int | None = None
+        """The last message of the outbox that a broker has taken; None if there has been no session."""
+
+    def load(self) -> None:
+        """Read the file; one that is absent or cannot be read begins anew, which is logged."""
+        try:
+            told = json.loads(self._path.read_bytes())
+            bd_seq, cursor = told["bd_seq"], told["cursor"]
+            if not (isinstance(bd_seq, int) and 0 <= bd_seq < NUMBERS and isinstance(cursor, int | None)):
+                raise ValueError(f"bd_seq {bd_seq!r}, cursor {cursor!r}")
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            log.warning(
+                "Sparkplug memory %s cannot be read (%s): the session's number begins anew, and alarms of the "
+                "time before are not told to Sparkplug hosts; it is replaced at the next connection",
+                self._path,
+                error,
+            )
+            return
+        self.bd_seq, self.cursor = bd_seq, cursor
+
+    def begin_session(self, cursor: int) -> None:
+        """The broker has accepted a session with `bd_seq`: the next one gets another number.
+
+        Args:
+            cursor: where to begin in the outbox if nobody has been told anything yet.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.cursor = cursor if self.cursor is None else self.cursor
+        self._save((self.bd_seq + 1) % NUMBERS, self.cursor)
+
+    def advance(self, cursor: int) -> None:
+        """A broker has taken everything up to here.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._save(self.bd_seq, cursor)
+
+    def _save(self, bd_seq: int, cursor: int | None) -> None:
+        replace_durably(self._path, json.dumps({"bd_seq": bd_seq, "cursor": cursor}).encode())
+        self.bd_seq, self.cursor = bd_seq, cursor

@@ -1,0 +1,276 @@
+"""What is refused before an alarm ever hears of it: each with a reason, counted, and without any effect."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import asdict, replace
+from datetime import UTC, datetime, timedelta
+
+import aiomqtt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.publish.command_intake import CommandIntake
+from daqsvc.publish.command_payloads import ResponsePayload
+from daqsvc.publish.settings import CommandSettings
+from daqsvc.publish.topics import Topics
+
+NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=UTC)
+SETTINGS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE, Verb.SHELVE}), max_age_s=60.0)
+TOPICS = Topics("daqsvc", "lab", "edge-1")
+ACKNOWLEDGE = "daqsvc/lab/edge-1/rig/commands/acknowledge"
+COMMAND = {
+    "schema": "daqsvc.command/1",
+    "id": "c1",
+    "alarm": "rotor-fault",
+    "by": "Ada",
+    "issued_at": NOW.isoformat(),
+}
+
+
+class Desk:
+    """Remembers what it is asked, and does it."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def __call__(self, command, source):
+        self.asked.append((command, source))
+        return CommandOutcome(accepted=True, events=("edge-1-7",))
+
+
+@pytest.fixture
+def desk():
+    return Desk()
+
+
+@pytest.fixture
+def intake(desk):
+    return make(desk)
+
+
+def make(desk, settings=SETTINGS):
+    return CommandIntake(settings, TOPICS, desk, DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9))
+
+
+def message(payload=None, topic=ACKNOWLEDGE, *, retain=False, properties=None, **changes):
+    if payload is None:
+        payload = json.dumps(COMMAND | changes).encode()
+    return aiomqtt.Message(topic, payload, 1, retain, 1, properties)
+
+
+def mqtt5(**values):
+    made = Properties(PacketTypes.PUBLISH)
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
+async def answer(intake, *arguments, **options):
+    """The answer, and where it goes."""
+    told = await intake.take(message(*arguments, **options))
+    return ResponsePayload.model_validate_json(told.payload), told
+
+
+async def test_a_command_reaches_the_desk_with_all_that_it_says(intake, desk):
+    response, told = await answer(
+        intake,
+        topic="daqsvc/lab/edge-1/rig/commands/shelve",
+        duration_s=600.0,
+        occurrence="o-1",
+        reason="probe is being replaced",
+    )
+    ((command, source),) = desk.asked
+    assert command == AlarmCommand(
+        verb=Verb.SHELVE,
+        alarm="rotor-fault",
+        by="Ada",
+        duration_s=600.0,
+        occurrence="o-1",
+        reason="probe is being replaced",
+    )
+    assert source == "mqtt daqsvc/lab/edge-1/rig/commands/shelve"
+    assert (response.accepted, response.id, response.events) == (True, "c1", ("edge-1-7",))
+    assert (response.machine, response.verb, response.reason) == ("rig", "shelve", "")
+    assert told.topic == "daqsvc/lab/edge-1/rig/commands/shelve/response"
+    assert asdict(intake.counters) == asdict(intake.counters) | {"accepted": 1, "refused": 0}
+
+
+async def test_a_refusal_of_the_alarms_is_passed_on_and_counted(intake):
+    async def strict(_command, _source):
+        return CommandOutcome(accepted=False, reason="the condition stands")
+
+    intake._handler = strict
+    response, _ = await answer(intake)
+    assert (response.accepted, response.reason) == (False, "the condition stands")
+    assert (intake.counters.accepted, intake.counters.refused) == (0, 1)
+
+
+LATE = (NOW - timedelta(seconds=61)).isoformat()
+AHEAD = (NOW + timedelta(hours=1)).isoformat()
+REFUSED = {
+    "no JSON": ({"payload": b"acknowledge!"}, "malformed", "JSON"),
+    "nothing": ({"payload": b""}, "malformed", "JSON"),
+    "not UTF-8": ({"payload": b'{"id": "\xff"}'}, "malformed", "schema daqsvc.command/1"),
+    "a list": ({"payload": b"[1]"}, "malformed", "object"),
+    "deeply nested": ({"payload": b"[" * 4000}, "malformed", "JSON"),
+    "oversized": ({"reason": "x" * 5000}, "malformed", "at most 4096"),
+    "another version": ({"schema": "daqsvc.command/2"}, "malformed", "daqsvc.command/1"),
+    "another schema": ({"schema": "daqsvc.alarm/1"}, "malformed", "daqsvc.command/1"),
+    "unknown key": ({"force": True}, "malformed", "force: Extra inputs"),
+    "wrong type": ({"by": 7}, "malformed", "by: "),
+    "nobody": ({"by": ""}, "malformed", "by: "),
+    "line break": ({"by": "Ada\nalarm reset by root"}, "malformed", "by: "),
+    "no offset": ({"issued_at": "2026-11-21T12:00:00"}, "malformed", "issued_at: "),
+    "a time as number": ({"issued_at": 1}, "malformed", "issued_at: "),
+    "negative time": ({"duration_s": -1}, "malformed", "duration_s: "),
+    "another machine": (
+        {"topic": "daqsvc/lab/edge-1/pump/commands/acknowledge"},
+        "unauthorised",
+        "no commands for machine 'pump'",
+    ),
+    "a verb not allowed": (
+        {"topic": "daqsvc/lab/edge-1/rig/commands/reset"},
+        "unauthorised",
+        "allowed: acknowledge, shelve",
+    ),
+    "no verb": (
+        {"topic": "daqsvc/lab/edge-1/rig/commands/reboot"},
+        "unauthorised",
+        "'reboot' is not allowed",
+    ),
+    "too old": ({"issued_at": LATE}, "stale", "61 s ago, with at most 60 s allowed"),
+    "older than its sender wants": (
+        {"issued_at": (NOW - timedelta(seconds=10)).isoformat(), "expires_s": 5},
+        "stale",
+        "at most 5 s",
+    ),
+    "from the future": ({"issued_at": AHEAD}, "stale", "3600 s in the future"),
+    "retained": ({"retain": True}, "stale", "retained"),
+}
+
+
+@pytest.mark.parametrize(("options", "counted", "reason"), REFUSED.values(), ids=REFUSED)
+async def test_what_is_not_a_command_is_refused_counted_and_changes_nothing(
+    intake, desk, options, counted, reason
+):
+    response, _ = await answer(intake, **options)
+    assert not response.accepted
+    assert reason in response.reason
+    assert response.events == ()
+    assert desk.asked == []
+    counters = asdict(intake.counters)
+    assert counters.pop(counted) == 1
+    assert not any(counters.values())
+
+
+async def test_a_sender_may_not_allow_itself_more_time(intake, desk):
+    response, _ = await answer(intake, issued_at=LATE, expires_s=3600)
+    assert not response.accepted
+    assert desk.asked == []
+
+
+async def test_a_command_that_comes_twice_is_carried_out_once(intake, desk):
+    first, _ = await answer(intake)
+    second, _ = await answer(intake)
+    other, _ = await answer(intake, id="c2")
+    assert (first.accepted, second.accepted, other.accepted) == (True, False, True)
+    assert "'c1' has come before" in second.reason
+    assert len(desk.asked) == 2
+
+
+async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.command_intake.REMEMBERED", 10)
+    for number in range(30):
+        await answer(intake, id=f"n{number}")
+    repeated, _ = await answer(intake, id="n0")
+    assert "has come before" in repeated.reason
+    assert len(desk.asked) == 10
+    assert intake.counters.stale == 21
+
+
+async def test_ids_are_forgotten_when_a_repeat_would_be_too_old_anyway(desk, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.command_intake.REMEMBERED", 1)
+    clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
+    intake = CommandIntake(SETTINGS, TOPICS, desk, clock)
+    await answer(intake)
+    clock.advance_to(clock.monotonic_ns() + 121 * 10**9)
+    repeated, _ = await answer(intake)
+    later, _ = await answer(intake, id="c2", issued_at=(NOW + timedelta(seconds=121)).isoformat())
+    assert "121 s ago" in repeated.reason
+    assert later.accepted
+
+
+async def test_a_refused_command_may_come_again_when_the_clocks_are_set(intake):
+    late, _ = await answer(intake, issued_at=LATE)
+    again, _ = await answer(intake)
+    assert (late.accepted, again.accepted) == (False, True)
+
+
+async def test_the_sender_learns_which_of_its_commands_was_refused(intake):
+    response, _ = await answer(intake, schema="daqsvc.command/9", id="mine")
+    assert response.id == "mine"
+    nameless, _ = await answer(intake, payload=b"{")
+    assert nameless.id is None
+
+
+async def test_mqtt5_senders_are_answered_where_they_want_and_recognise_it(intake):
+    wanted = mqtt5(ResponseTopic="operators/ada/answers", CorrelationData=b"\x01\x02")
+    _, told = await answer(intake, properties=wanted)
+    assert (told.topic, told.correlation) == ("operators/ada/answers", b"\x01\x02")
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "daqsvc/lab/edge-1/rig/alarms/rotor-fault",
+        "daqsvc/lab/edge-2/rig/commands/acknowledge",
+        "daqsvc/lab/edge-1/rig/commands/acknowledge",
+        "homeassistant/device/x/config",
+        "spBv1.0/g/NCMD/e",
+        "$SYS/broker",
+        "x" * 300,
+    ],
+)
+async def test_an_answer_never_speaks_in_the_name_of_somebody_else(intake, topic):
+    """The box may write where the sender may not: the sender must not borrow that."""
+    response, told = await answer(intake, properties=mqtt5(ResponseTopic=topic))
+    assert told.topic == f"{ACKNOWLEDGE}/response"
+    assert response.accepted
+
+
+async def test_a_flood_of_refusals_does_not_fill_the_log(intake, caplog):
+    caplog.set_level(logging.INFO)
+    for _ in range(100):
+        await answer(intake, payload=b"nonsense")
+    assert len(caplog.records) == 1
+    assert intake.counters.malformed == 100
+
+
+async def test_a_sender_writes_no_lines_into_the_log(intake, caplog):
+    await answer(intake, **{"x\nroot: alarm reset": 1})
+    assert "\n" not in caplog.records[0].getMessage()
+
+
+async def test_the_limit_of_the_size_is_the_machine_files(desk):
+    intake = make(desk, replace(SETTINGS, max_bytes=300))
+    response, _ = await answer(intake, reason="x" * 250)
+    assert "at most 300" in response.reason
+
+
+@given(
+    st.binary(max_size=300)
+    | st.dictionaries(st.text(max_size=8), st.integers()).map(json.dumps).map(str.encode)
+)
+async def test_whatever_comes_there_is_an_answer(payload):
+    desk = Desk()
+    response, _ = await answer(make(desk), payload=payload)
+    assert not response.accepted
+    assert response.reason
+    assert desk.asked == []
