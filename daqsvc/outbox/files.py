@@ -82,12 +82,13 @@ def take_possession(path: Path) -> BinaryIO:
     return lock
 
 
-def connect(path: Path | str, *, synchronous: str) -> sqlite3.Connection:
+def connect(path: Path | str, *, synchronous: str, wal_pages: int = WAL_PAGES) -> sqlite3.Connection:
     """A connection for one writer, the file checked.
 
     Args:
         path: the database; ``":memory:"`` for one without a file.
         synchronous: ``"FULL"`` to have each commit on the disk, ``"OFF"`` to leave it to the system.
+        wal_pages: pages in the write-ahead log from which on they are moved to the database.
 
     Raises:
         sqlite3.Error: the file is corrupt (see `is_corrupt`) or cannot be used.
@@ -98,7 +99,7 @@ def connect(path: Path | str, *, synchronous: str) -> sqlite3.Connection:
         connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute(f"PRAGMA synchronous = {synchronous}")
-        connection.execute(f"PRAGMA wal_autocheckpoint = {WAL_PAGES}")
+        connection.execute(f"PRAGMA wal_autocheckpoint = {wal_pages}")
         connection.execute(f"PRAGMA journal_size_limit = {WAL_MAX_BYTES}")
         _check(connection)
     except BaseException:

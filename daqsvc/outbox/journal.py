@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import sqlite3
-from itertools import islice
 from typing import TYPE_CHECKING
 
 from daqsvc.outbox.files import (
@@ -21,6 +20,7 @@ from daqsvc.outbox.files import (
     used_bytes,
 )
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum
+from daqsvc.outbox.salvage import readable
 from daqsvc.outbox.sequence import SequenceMark
 
 if TYPE_CHECKING:
@@ -222,40 +222,14 @@ class Journal:
         return int(used[0]) if used else None
 
     def _salvage(self, aside: Path) -> None:
-        """Copy from a corrupt file every message that can be read and has kept its checksum."""
         connection = self._open_connection()
-        opened = contextlib.closing(sqlite3.connect(aside, isolation_level=None))
-        with opened as broken, _transaction(connection):
-            # From both ends, so that one bad page does not hide what lies behind it.
-            for order in ("ASC", "DESC"):
-                connection.executemany(
-                    "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    self._readable(broken, order, aside.stat().st_size),
-                )
+        with _transaction(connection):
+            connection.executemany(
+                "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", readable(aside, self._next)
+            )
             connection.execute(_FILL_LATEST)
         count = connection.execute("SELECT count(*) FROM messages").fetchone()[0]
         log.warning("outbox %s: %d messages were saved from the corrupt file", self.path, count)
-
-    def _readable(self, broken: sqlite3.Connection, order: str, size: int) -> Iterator[tuple[object, ...]]:
-        try:
-            rows = broken.execute(
-                "SELECT sequence, topic, payload, retain, sent, wall_ns, checksum "  # noqa: S608  constants only
-                f"FROM messages NOT INDEXED ORDER BY sequence {order}"
-            )
-            # A file whose pages point at each other must not be read for ever.
-            for row in islice(rows, size // 16):
-                sequence, topic, payload, retain, sent, wall_ns, told = row
-                sound = (
-                    isinstance(topic, str)
-                    and isinstance(payload, bytes)
-                    and {retain, sent} <= {0, 1}
-                    and isinstance(wall_ns, int)
-                    and sequence < self._next
-                )
-                if sound and told == checksum(sequence, topic, payload):
-                    yield row
-        except (sqlite3.Error, ValueError, OverflowError) as error:
-            log.info("outbox %s: the corrupt file could be read up to a point (%s)", self.path, error)
 
     def commit(self, drafts: Sequence[Draft], sent: Iterable[int]) -> tuple[list[int | Exception], int]:
         """Write drafts and mark others as sent, in one durable transaction.

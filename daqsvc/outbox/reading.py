@@ -7,6 +7,8 @@ behind there belongs to the administrator, and the service could not open it.
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -144,13 +146,13 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         OSError: a file is not there or must not be read.
         sqlite3.Error: it cannot be opened.
     """
-    path.open("rb").close()  # SQLite would not say why it cannot
+    _check_readable(path)
     log, index = (path.with_name(path.name + suffix) for suffix in ("-wal", "-shm"))
     if not log.exists() or log.stat().st_size == 0:
         with contextlib.closing(_connect(path, "immutable=1")) as connection:
             yield connection
         return
-    log.open("rb").close()
+    _check_readable(log)
     if index.exists():
         connection = _connect(path, "mode=ro")
         try:
@@ -167,6 +169,13 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             shutil.copyfile(part, copy.with_name(part.name))
         with contextlib.closing(_connect(copy, "mode=rw")) as connection:
             yield connection
+
+
+def _check_readable(path: Path) -> None:
+    """Raise what SQLite would not tell apart; without opening: closing would undo the locks of this process."""
+    path.stat()
+    if not os.access(path, os.R_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def _connect(path: Path, how: str) -> sqlite3.Connection:

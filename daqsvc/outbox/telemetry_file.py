@@ -43,6 +43,9 @@ MEMORY_BYTES = 4 * 1024 * 1024
 SMALLEST_BYTES = 256 * 1024
 """A file that may not grow to this is not worth having."""
 
+WAL_PAGES = 256
+"""See `files.connect`; 1 MiB comes on top of the limit of the file."""
+
 FILE_RETRY_S = 30.0
 """Time between attempts to get back from memory to the file."""
 
@@ -230,7 +233,7 @@ class TelemetryFile:
         self._next = max(self._next, (last or 0) + 1)
 
     def _connect(self) -> sqlite3.Connection:
-        connection = connect(self._path, synchronous="OFF")
+        connection = connect(self._path, synchronous="OFF", wal_pages=WAL_PAGES)
         try:
             version = _known_version(connection)
             connection.execute("BEGIN IMMEDIATE")

@@ -1,14 +1,13 @@
-"""The journal against a dictionary: through restarts, kill -9, power cuts, clock steps and destroyed files."""
+"""The journal against a dictionary: restarts, kill -9, power cuts, clock steps and destroyed files."""
 
 from __future__ import annotations
 
 import shutil
-import sqlite3
 import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -26,7 +25,7 @@ def drafts_of(topics_and_retain):
 
 
 class Store:
-    """A directory whose state at any moment is what a crash leaves: the copy goes on, the original is lost."""
+    """A directory whose state at any moment is what a crash leaves: a copy goes on, the original ends."""
 
     def __init__(self):
         self._directory = tempfile.TemporaryDirectory()

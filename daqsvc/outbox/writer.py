@@ -1,0 +1,276 @@
+"""The thread that writes the journal: group commits, retries, and what to do about a file that fails."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import queue
+import sqlite3
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+
+from daqsvc.outbox.files import is_corrupt, is_full
+from daqsvc.outbox.messages import Draft, OutboxError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from daqsvc.outbox.journal import Journal
+
+    _Post: TypeAlias = Callable[..., None]
+
+_T = TypeVar("_T")
+
+log = logging.getLogger(__name__)
+
+MARK_LINGER_S = 0.05
+"""How long a mark may wait for company: nobody waits for it, and each commit costs the disk a sync."""
+
+RETRY_FIRST_S, RETRY_MOST_S = 0.1, 5.0
+
+COMMIT_AT_MOST = 2000
+"""Messages in one transaction, so that neither memory nor the write-ahead log grows with the backlog."""
+
+READ_FAILURES_MAX = 3
+"""Reads in a row that may fail before the file is given up as if it were corrupt."""
+
+
+@dataclass(slots=True)
+class Batch:
+    """What one turn of the writer does."""
+
+    drafts: list[tuple[Draft, asyncio.Future[int]]] = field(default_factory=list)
+    sent: list[int] = field(default_factory=list)
+    reads: list[tuple[Callable[[], Any], asyncio.Future[Any]]] = field(default_factory=list)
+
+    def is_urgent(self) -> bool:
+        """Whether somebody waits for it."""
+        return bool(self.drafts or self.reads)
+
+    def add(self, other: Batch) -> None:
+        """Do the other, too, after this one."""
+        self.drafts += other.drafts
+        self.sent += other.sent
+        self.reads += other.reads
+
+
+@dataclass(slots=True)
+class Failure:
+    """What went wrong in one turn of the writer, if anything."""
+
+    write: sqlite3.Error | OSError | None = None
+    read: sqlite3.Error | None = None
+
+
+class Reports(Protocol):
+    """Who is told, on the event loop, what the writer has done."""
+
+    def committed(
+        self,
+        outcomes: Sequence[tuple[asyncio.Future[int], int | Exception]],
+        marked: int,
+        last_sequence: int,
+    ) -> None:
+        """Drafts are on disk under their numbers, or were refused; ``marked`` others are newly sent."""
+
+    def failed(self, failure: Failure) -> None:
+        """A turn failed and will be tried again."""
+
+    def replaced(self, unsent: int) -> None:
+        """A corrupt file was set aside; so many unsent messages are in the new one."""
+
+    def abandoned(self, drafts: Sequence[asyncio.Future[int]], error: OutboxError) -> None:
+        """Drafts that will not reach the disk any more."""
+
+    def stopped(self, reason: str) -> None:
+        """The writer has ended through a mistake in this program."""
+
+
+class JournalWriter:
+    """Does all that is done with one journal, in the order in which it was asked for.
+
+    Args:
+        journal: the file; nobody else may use it.
+        reports: who is told.
+        make_way: called on the thread before the journal is opened, with its directory in our possession.
+    """
+
+    def __init__(self, journal: Journal, reports: Reports, make_way: Callable[[], None]) -> None:
+        self._journal = journal
+        self._reports = reports
+        self._make_way = make_way
+        self._work: queue.SimpleQueue[Batch] = queue.SimpleQueue()
+        self._closing = threading.Event()
+
+    def start(self) -> tuple[asyncio.Future[int], asyncio.Future[None]]:
+        """Start the thread.
+
+        Returns:
+            What becomes the number of unsent messages or an `OutboxError`; and what is done at the end.
+        """
+        loop = asyncio.get_running_loop()
+        opened: asyncio.Future[int] = loop.create_future()
+        ended: asyncio.Future[None] = loop.create_future()
+        threading.Thread(
+            target=self._run, args=(loop, opened, ended), name="outbox-writer", daemon=True
+        ).start()
+        return opened, ended
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether `close` was called."""
+        return self._closing.is_set()
+
+    def put(self, batch: Batch) -> None:
+        """Have something done."""
+        self._work.put(batch)
+
+    def close(self) -> None:
+        """Do what waits, once, and end."""
+        self._closing.set()
+        self._work.put(Batch())
+
+    # On the thread.
+
+    def _run(
+        self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int], ended: asyncio.Future[None]
+    ) -> None:
+        def post(function: Callable[..., object], *args: object) -> None:
+            # A loop that is closed already has nobody left who would wait for the answer.
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(function, *args)
+
+        batch = Batch()
+        try:
+            try:
+                self._journal.hold()
+                self._make_way()
+                self._journal.open()
+                unsent = self._journal.unsent()
+            except (OutboxError, sqlite3.Error) as error:
+                post(fail, opened, error)
+                return
+            post(succeed, opened, unsent)
+            self._serve(batch, post)
+        except BaseException as error:
+            # A mistake in this program. Whoever waits must hear of it, and nobody may wait in vain.
+            post(self._reports.stopped, f"has stopped: {error!r}")
+            self._gather(batch, wait=False)
+            self._abandon(batch, error, post)
+            raise
+        finally:
+            self._journal.close()
+            post(succeed, ended, None)
+
+    def _serve(self, batch: Batch, post: _Post) -> None:
+        retry_s = RETRY_FIRST_S
+        reported: Exception | None = None
+        failed_reads = 0
+        while True:
+            self._gather(batch, wait=reported is None)
+            failure = self._perform(batch, post)
+            error = failure.write or failure.read
+            if error is None:
+                if reported is not None:
+                    reported = None
+                    log.warning("outbox %s can be used again", self._journal.path)
+                retry_s, failed_reads = RETRY_FIRST_S, 0
+                if self._closing.is_set() and self._work.empty():
+                    return
+                continue
+            post(self._reports.failed, failure)
+            if self._closing.is_set():
+                self._abandon(batch, error, post)
+                return
+            failed_reads = 0 if failure.read is None else failed_reads + 1
+            if reported is None:
+                reported = error
+                log.error(
+                    "outbox %s cannot be %s: %s; messages wait in memory until it can",
+                    self._journal.path,
+                    "written" if failure.write else "read",
+                    error,
+                )
+            if not self._recover(error, post, give_up=failed_reads >= READ_FAILURES_MAX):
+                self._closing.wait(retry_s)
+                retry_s = min(2 * retry_s, RETRY_MOST_S)
+
+    def _gather(self, batch: Batch, *, wait: bool) -> None:
+        """Add what has arrived; marks alone wait for company for a while."""
+        if wait:
+            batch.add(self._work.get())
+        until = time.monotonic() + MARK_LINGER_S
+        while True:
+            linger_s = until - time.monotonic()
+            patient = wait and not batch.is_urgent() and not self._closing.is_set() and linger_s > 0
+            try:
+                batch.add(self._work.get(timeout=linger_s) if patient else self._work.get_nowait())
+            except queue.Empty:
+                return
+
+    def _perform(self, batch: Batch, post: _Post) -> Failure:
+        """Commit, then read, even if the former failed. What is done is taken out of the batch."""
+        failure = Failure()
+        try:
+            while batch.drafts or batch.sent:
+                self._commit(batch, post)
+        except (sqlite3.Error, OSError) as error:
+            failure.write = error
+        try:
+            while batch.reads:
+                query, answer = batch.reads[0]
+                post(succeed, answer, query())
+                batch.reads.pop(0)
+        except sqlite3.Error as error:
+            failure.read = error
+        return failure
+
+    def _commit(self, batch: Batch, post: _Post) -> None:
+        now = batch.drafts[:COMMIT_AT_MOST]
+        outcomes, marked = self._journal.commit([draft for draft, _ in now], batch.sent)
+        settled = [(done, outcome) for (_, done), outcome in zip(now, outcomes, strict=True)]
+        batch.drafts, batch.sent = batch.drafts[COMMIT_AT_MOST:], []
+        post(self._reports.committed, settled, marked, self._journal.last_sequence)
+
+    def _recover(self, error: Exception, post: _Post, *, give_up: bool) -> bool:
+        """Do something about a failure; whether it is worth trying again at once.
+
+        A corrupt file is set aside, and so is one that cannot be read time and again. On a full disk, what
+        the broker has makes room.
+        """
+        try:
+            if isinstance(error, sqlite3.DatabaseError) and (give_up or is_corrupt(error)):
+                self._journal.quarantine(error)
+                post(self._reports.replaced, self._journal.unsent())
+                return True
+            if is_full(error):
+                return self._journal.make_room() > 0
+        except (sqlite3.Error, OSError) as again:
+            if not is_full(again):
+                log.error("outbox %s cannot be recovered: %s", self._journal.path, again)  # noqa: TRY400
+        return False
+
+    def _abandon(self, batch: Batch, error: BaseException, post: _Post) -> None:
+        failure = OutboxError(
+            f"outbox {self._journal.path} was closed while it could not be written: {error}"
+        )
+        post(self._reports.abandoned, [done for _, done in batch.drafts], failure)
+        for _, answer in batch.reads:
+            post(fail, answer, failure)
+        if batch.drafts:
+            log.error("outbox %s lost %d messages: %s", self._journal.path, len(batch.drafts), error)
+
+
+def succeed(future: asyncio.Future[_T], result: _T) -> None:
+    """Answer whoever still waits."""
+    if not future.done():
+        future.set_result(result)
+
+
+def fail(future: asyncio.Future[Any], error: Exception) -> None:
+    """Tell whoever still waits why there is no answer."""
+    if not future.done():
+        future.set_exception(error)
