@@ -172,7 +172,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _check_readable(path: Path) -> None:
-    """Raise what SQLite would not tell apart; without opening: closing would undo the locks of this process."""
+    """Raise what SQLite would not tell apart, without a handle: closing one undoes this process's locks."""
     path.stat()
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
