@@ -11,6 +11,7 @@ from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -32,6 +33,9 @@ TIME_NAME = re.compile(
 
 PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9}
 
+SAME_RATE = 0.005
+"""Rates that differ by less are the same, rounded."""
+
 MOST_UNEVEN = 0.5
 """Steps of an even column of time are within this fraction of their median (rounded times do that)."""
 
@@ -43,11 +47,11 @@ def rate_of(path: Path, contents: Contents, length: int, given_hz: float | None)
         path: the file, for messages.
         contents: what it holds.
         length: samples of a channel.
-        given_hz: what the user says; outranks whatever the file says.
+        given_hz: what the user says; outranks a column of time, but never contradicts a rate that is stated.
 
     Raises:
-        RecordingError: nobody says it, the file contradicts itself, or the rate is outside of
-            `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
+        RecordingError: nobody says it, the file contradicts itself or what is given, or the rate is outside
+            of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
     """
     stated = {
         name: value
@@ -76,7 +80,24 @@ def rate_of(path: Path, contents: Contents, length: int, given_hz: float | None)
             f"the sampling rate of {path} is said to be {rate_hz:g} Hz ({source}); give one from "
             f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs"
         )
+    if given_hz is not None:
+        _refuse_other(path, stated, given_hz)
     return float(rate_hz), source
+
+
+def _refuse_other(path: Path, stated: Mapping[str, float], given_hz: float) -> None:
+    """Refuse a given rate that no statement of the file is near to.
+
+    Raises:
+        RecordingError: none is.
+    """
+    if not stated or any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()):
+        return
+    said = " and ".join(f"{hz:g} Hz ({name})" for name, hz in stated.items())
+    raise RecordingError(
+        f"the sampling rate of {path} is {said} by the file and {given_hz:g} Hz as given: leave --fs out, or "
+        "correct it"
+    )
 
 
 def time_column(contents: Contents, length: int) -> str | None:

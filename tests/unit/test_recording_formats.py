@@ -314,13 +314,15 @@ def test_time_of_other_channels_does_not_count(tmp_path):
     assert load_recording(path, {"s": "slow"}).rate_hz == pytest.approx(5)
 
 
-def test_what_is_stated_outranks_time_and_what_is_given_outranks_both(tmp_path):
+def test_what_is_stated_outranks_time_and_what_is_given_must_agree_with_it(tmp_path):
     path = tmp_path / "rig.mat"
     savemat(path, {"t": np.arange(400) / 500, "x": X, "fs": 640})
     recording = load_recording(path)
     assert (recording.rate_hz, recording.names) == (640, ("x",))
-    recording = load_recording(path, rate_hz=100)
-    assert (recording.rate_hz, recording.rate_source) == (100, "given; fs of the file says 640 Hz")
+    recording = load_recording(path, rate_hz=641)
+    assert (recording.rate_hz, recording.rate_source) == (641, "given; fs of the file says 640 Hz")
+    with pytest.raises(RecordingError, match=r"is 640 Hz \(fs\) by the file and 100 Hz as given: leave --fs"):
+        load_recording(path, rate_hz=100)
     assert load_recording(path, rate_hz=640).rate_source == "given"
 
 
