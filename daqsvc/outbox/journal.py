@@ -300,6 +300,10 @@ class Journal:
         """Messages above ``after`` that are not sent, in order, at most ``limit``."""
         return self._select("WHERE NOT sent AND sequence > ? ORDER BY sequence LIMIT ?", after, limit)
 
+    def following(self, after: int, limit: int) -> list[OutboxMessage]:
+        """Messages above ``after`` that are still kept, sent or not, in order, at most ``limit``."""
+        return self._select("WHERE sequence > ? ORDER BY sequence LIMIT ?", after, limit)
+
     def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, if it is sent, in order."""
         return self._select(f"WHERE sent AND sequence IN ({_IS_LATEST}) ORDER BY sequence")

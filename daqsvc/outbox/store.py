@@ -18,7 +18,7 @@ from daqsvc.outbox.telemetry import Telemetry
 from daqsvc.outbox.writer import Batch, JournalWriter, fail, succeed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Awaitable, Callable, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -128,9 +128,22 @@ class Outbox:
 
     async def next_pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Like `pending`, but waits until there is at least one."""
+        return await self._next(self.pending, after, limit)
+
+    async def following(self, after: int, limit: int) -> list[OutboxMessage]:
+        """Messages above ``after`` that are still kept, sent or not, in order, at most ``limit``."""
+        return await self._read(lambda: self._journal.following(after, limit))
+
+    async def next_following(self, after: int, limit: int) -> list[OutboxMessage]:
+        """Like `following`, but waits until there is at least one."""
+        return await self._next(self.following, after, limit)
+
+    async def _next(
+        self, read: Callable[[int, int], Awaitable[list[OutboxMessage]]], after: int, limit: int
+    ) -> list[OutboxMessage]:
         while True:
             newest = self._books.last_sequence
-            messages = await self.pending(after, limit)
+            messages = await read(after, limit)
             if messages:
                 return messages
             await self._books.news(newest)

@@ -32,21 +32,16 @@ class Memory:
     def load(self) -> None:
         """Read the file; one that is absent or cannot be read begins anew, which is logged."""
         try:
-            told = json.loads(self._path.read_bytes())
-            bd_seq, cursor = told["bd_seq"], told["cursor"]
-            if not (isinstance(bd_seq, int) and 0 <= bd_seq < NUMBERS and isinstance(cursor, int | None)):
-                raise ValueError(f"bd_seq {bd_seq!r}, cursor {cursor!r}")
+            self.bd_seq, self.cursor = _understood(self._path.read_bytes())
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
             log.warning(
-                "Sparkplug memory %s cannot be read (%s): the session's number begins anew, and alarms of the "
-                "time before are not told to Sparkplug hosts; it is replaced at the next connection",
+                "Sparkplug memory %s cannot be read (%s): the session's number begins anew, and alarms of "
+                "the time before are not told to Sparkplug hosts; it is replaced at the next connection",
                 self._path,
                 error,
             )
-            return
-        self.bd_seq, self.cursor = bd_seq, cursor
 
     def begin_session(self, cursor: int) -> None:
         """The broker has accepted a session with `bd_seq`: the next one gets another number.
@@ -71,3 +66,11 @@ class Memory:
     def _save(self, bd_seq: int, cursor: int | None) -> None:
         replace_durably(self._path, json.dumps({"bd_seq": bd_seq, "cursor": cursor}).encode())
         self.bd_seq, self.cursor = bd_seq, cursor
+
+
+def _understood(raw: bytes) -> tuple[int, int | None]:
+    told = json.loads(raw)
+    bd_seq, cursor = told["bd_seq"], told["cursor"]
+    if not (isinstance(bd_seq, int) and 0 <= bd_seq < NUMBERS and isinstance(cursor, int | None)):
+        raise ValueError(f"bd_seq {bd_seq!r} and cursor {cursor!r}")
+    return bd_seq, cursor

@@ -1,0 +1,355 @@
+"""One session of an edge node at one broker, from its subscriptions to its death."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import aiomqtt
+
+from daqsvc.publish.sparkplug.codec import PayloadError
+from daqsvc.publish.sparkplug.host import PrimaryHost
+from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.sparkplug.codec import Metric
+    from daqsvc.publish.sparkplug.memory import Memory
+    from daqsvc.publish.sparkplug.metrics import Board
+    from daqsvc.publish.sparkplug.node import EdgeNode, Publication
+    from daqsvc.publish.sparkplug.settings import SparkplugSettings
+    from daqsvc.publish.topics import Topics
+
+log = logging.getLogger(__name__)
+
+READ_AHEAD = 100
+"""Alarm events that are told before the broker is asked whether it has them."""
+
+TELL_S = 1.0
+"""How often changed figures are told."""
+
+HOST_S = 5.0
+"""How long a broker's word about the primary host is waited for where there are other brokers."""
+
+
+class HostAwayError(Exception):
+    """The primary host is not at this broker."""
+
+
+@dataclass(slots=True)
+class SparkplugCounters:
+    """What the edge node has done; every figure but the first only grows.
+
+    Attributes:
+        connected: whether there is a session now.
+        connections: how many there have been.
+        births: births of the node, by request or new metrics too.
+        alarms: alarm events told as they happened.
+        historical: alarm events told as history.
+        data: messages with figures of the device.
+        commands_refused: commands that ask for what cannot be had.
+        states_refused: STATE messages of the host that cannot be read, or are older than one before.
+        unreadable: messages of the outbox that are no alarm of this version.
+    """
+
+    connected: bool = False
+    connections: int = 0
+    births: int = 0
+    alarms: int = 0
+    historical: int = 0
+    data: int = 0
+    commands_refused: int = 0
+    states_refused: int = 0
+    unreadable: int = 0
+
+
+class EdgeSession:
+    """What is said and heard over one connection.
+
+    One task does all the talking, so that sequence numbers follow each other on the wire.
+
+    Args:
+        connection: open, with the node's death as its last will.
+        bd_seq: number of the session, as in the will.
+        node: makes the messages.
+        board: present values.
+        settings: device, host and brokers.
+        memory: where to go on in the outbox.
+        outbox: the alarms.
+        topics: by which alarms are known in the outbox.
+        clock: for time stamps.
+        counters: what is counted here.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        bd_seq: int,
+        *,
+        node: EdgeNode,
+        board: Board,
+        settings: SparkplugSettings,
+        memory: Memory,
+        outbox: Outbox,
+        topics: Topics,
+        clock: Clock,
+        counters: SparkplugCounters,
+    ) -> None:
+        self._connection = connection
+        self._bd_seq = bd_seq
+        self._node = node
+        self._board = board
+        self._device = settings.device
+        self._alone = len(settings.servers) == 1
+        self._host = None if settings.primary_host is None else PrimaryHost(settings.primary_host)
+        self._memory = memory
+        self._outbox = outbox
+        self._topics = topics
+        self._clock = clock
+        self._counters = counters
+        self._told: dict[str, Any] = {}
+        self._there: Callable[[], bool] = lambda: True
+        self.was_born = False
+        """Whether this session got as far as its births."""
+
+    async def run(self, stopping: asyncio.Event, there: Callable[[], bool]) -> None:
+        """Listen, wait for the host, tell everything; until ``stopping`` is set.
+
+        Args:
+            stopping: ends the session when the alarms that are on disk are told.
+            there: whether the machine can be reached.
+
+        Raises:
+            HostAwayError: the primary host has left this broker, or never came.
+            aiomqtt.MqttError: the connection is lost.
+        """
+        self._there = there
+        heard: asyncio.Queue[aiomqtt.Message] = asyncio.Queue()
+        wanted = [self._node.commands, self._node.device_commands]
+        await self._connection.watch(*wanted, *([self._host.topic] if self._host else []))
+        listening = asyncio.create_task(self._listen(heard), name="sparkplug-listen")
+        stopped = asyncio.create_task(stopping.wait(), name="sparkplug-stop")
+        try:
+            if self._host is not None:
+                await self._await_host(heard, listening, stopped)
+            if stopped.done():
+                return
+            await self._be_born()
+            await self._tell_history()
+            await self._tell(heard, listening, stopped)
+            await self._tell_alarms(await self._outbox.following(self._cursor, READ_AHEAD))
+        finally:
+            for task in (listening, stopped):
+                task.cancel()
+            await asyncio.gather(listening, stopped, return_exceptions=True)
+
+    async def leave(self, timeout_s: float) -> None:
+        """Publish the node's death, if it was born, and disconnect; takes about ``timeout_s`` at most."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                if self._node.is_born:
+                    death = self._node.will(self._bd_seq, self._now_ms)
+                    self._node.die()
+                    await self._connection.deliver(death.topic, death.payload, retain=False)
+        except (TimeoutError, aiomqtt.MqttError) as error:
+            log.info("the node's death was not published (%s); the last will tells it", error)
+            return  # dropped without a word, so that the broker publishes the will
+        await self._connection.close(timeout_s)
+
+    @property
+    def _now_ms(self) -> int:
+        return self._clock.wall_ns() // NS_PER_MS
+
+    @property
+    def _cursor(self) -> int:
+        return self._memory.cursor or 0
+
+    async def _listen(self, heard: asyncio.Queue[aiomqtt.Message]) -> None:
+        async for message in self._connection.incoming():
+            heard.put_nowait(message)
+
+    async def _await_host(
+        self,
+        heard: asyncio.Queue[aiomqtt.Message],
+        listening: asyncio.Task[None],
+        stopped: asyncio.Task[Any],
+    ) -> None:
+        """Until the primary host says that it is online at this broker, or stopped.
+
+        Raises:
+            HostAwayError: it is not, and there are other brokers to try.
+            aiomqtt.MqttError: the connection is lost.
+        """
+        assert self._host is not None  # noqa: S101 - asked for only with a host
+        patience_s = None if self._alone else HOST_S
+        while not self._host.online and not stopped.done():
+            message = await self._first(heard.get(), listening, stopped, patience_s)
+            if message is not None:
+                self._hear(message)
+            if not self._alone and not self._host.online and not stopped.done():
+                raise HostAwayError(
+                    f"primary host {self._host.host_id} is not at this broker; trying the next"
+                )
+
+    async def _first(
+        self,
+        wanted: Coroutine[Any, Any, aiomqtt.Message],
+        listening: asyncio.Task[None],
+        stopped: asyncio.Task[Any],
+        patience_s: float | None,
+    ) -> aiomqtt.Message | None:
+        """The next message, or None if it takes too long or the service stops."""
+        waiting = asyncio.ensure_future(wanted)
+        try:
+            await asyncio.wait(
+                {waiting, listening, stopped}, timeout=patience_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            if listening.done():
+                listening.result()
+            return waiting.result() if waiting.done() else None
+        finally:
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+
+    async def _be_born(self) -> None:
+        """Publish all births, with present values."""
+        for message in await self._outbox.latest():
+            self._board.put(None, self._metrics_of(message))
+        node = self._board.of(None, self._now_ms)
+        devices = {self._device: self._board.of(self._device, self._now_ms)} if self._there() else {}
+        self._told = _values(devices.get(self._device, ()))
+        for publication in self._node.births(self._bd_seq, self._now_ms, node, devices):
+            await self._publish(publication)
+        self._counters.births += 1
+        self.was_born = True
+
+    async def _tell_history(self) -> None:
+        """Tell, as history, the alarm events that no broker has taken yet: the births had the newest only."""
+        newest = max((message.sequence for message in await self._outbox.latest()), default=0)
+        while self._cursor < newest:
+            messages = await self._outbox.following(self._cursor, READ_AHEAD)
+            messages = [message for message in messages if message.sequence <= newest]
+            if not messages:
+                return
+            for message in messages:
+                metrics = [replace(metric, historical=True) for metric in self._metrics_of(message)]
+                if metrics and self._node.knows(None, metrics):
+                    await self._publish(self._node.data(None, self._now_ms, metrics))
+                    self._counters.historical += 1
+            await self._confirm(messages[-1].sequence)
+
+    async def _tell(
+        self,
+        heard: asyncio.Queue[aiomqtt.Message],
+        listening: asyncio.Task[None],
+        stopped: asyncio.Task[Any],
+    ) -> None:
+        """Tell alarms as they come and figures once a second, and do what hosts ask for."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time() + TELL_S
+        arriving = asyncio.create_task(self._outbox.next_following(self._cursor, READ_AHEAD))
+        asked = asyncio.create_task(heard.get())
+        try:
+            while not stopped.done():
+                await asyncio.wait(
+                    {arriving, asked, listening, stopped},
+                    timeout=max(due_s - loop.time(), 0.0),
+                    return_when=asyncio.FIRST_COMPLETED,
+                )
+                if listening.done():
+                    listening.result()
+                if asked.done():
+                    if self._hear(asked.result()):
+                        await self._be_born()
+                    asked = asyncio.create_task(heard.get())
+                if self._host is not None and not self._host.online:
+                    raise HostAwayError(f"primary host {self._host.host_id} has left this broker")
+                if arriving.done():
+                    await self._tell_alarms(arriving.result())
+                    arriving = asyncio.create_task(self._outbox.next_following(self._cursor, READ_AHEAD))
+                if loop.time() >= due_s:
+                    due_s = loop.time() + TELL_S
+                    await self._tell_device()
+        finally:
+            for task in (arriving, asked):
+                task.cancel()
+            await asyncio.gather(arriving, asked, return_exceptions=True)
+
+    async def _tell_alarms(self, messages: list[OutboxMessage]) -> None:
+        """Tell alarm events as they are."""
+        for message in messages:
+            changed = self._board.put(None, self._metrics_of(message))
+            if not changed:
+                continue
+            if self._node.knows(None, changed):
+                await self._publish(self._node.data(None, self._now_ms, changed))
+            else:
+                # An alarm that no birth has named: new births tell its present state.
+                await self._be_born()
+            self._counters.alarms += 1
+        if messages:
+            await self._confirm(messages[-1].sequence)
+
+    async def _tell_device(self) -> None:
+        """Tell what has changed at the machine, and whether it can be reached."""
+        there = self._there()
+        if not there:
+            if self._node.lives(self._device):
+                await self._publish(self._node.device_death(self._device, self._now_ms))
+            return
+        present = self._board.of(self._device, self._now_ms)
+        changed = [m for m in present if m.name not in self._told or self._told[m.name] != m.value]
+        if not self._node.lives(self._device) or not self._node.knows(self._device, changed):
+            await self._publish(self._node.device_birth(self._device, self._now_ms, present))
+        elif changed:
+            await self._publish(self._node.data(self._device, self._now_ms, changed))
+            self._counters.data += 1
+        self._told = _values(present)
+
+    def _hear(self, message: aiomqtt.Message) -> bool:
+        """Take in what a host says; whether it asks for new births."""
+        topic, payload = message.topic.value, bytes(message.payload or b"")
+        try:
+            if self._host is not None and topic == self._host.topic:
+                if not self._host.take(payload):
+                    self._counters.states_refused += 1
+            elif topic == self._node.commands and not message.retain:
+                return self._node.is_born and self._node.wants_rebirth(payload)
+            else:
+                self._counters.commands_refused += 1
+        except PayloadError as error:
+            if self._host is not None and topic == self._host.topic:
+                self._counters.states_refused += 1
+            else:
+                self._counters.commands_refused += 1
+            log.info("%s is left alone: %s", topic, error)
+        return False
+
+    def _metrics_of(self, message: OutboxMessage) -> list[Metric]:
+        """The metrics of an alarm event; none of anything else in the outbox."""
+        if not (message.topic.startswith(f"{self._topics.base}/") and "/alarms/" in message.topic):
+            return []
+        try:
+            return alarm_metrics(message.payload)
+        except ValueError:
+            self._counters.unreadable += 1
+            return []
+
+    async def _publish(self, publication: Publication) -> None:
+        await self._connection.publish(publication.topic, publication.payload, qos=publication.qos)
+
+    async def _confirm(self, sequence: int) -> None:
+        """Have the broker answer, which shows that it has all that was sent before, and remember that."""
+        await self._connection.unsubscribe(f"{self._node.commands}/none")
+        await asyncio.to_thread(self._memory.advance, sequence)
+
+
+def _values(metrics: Iterable[Metric]) -> dict[str, Any]:
+    return {metric.name or "": metric.value for metric in metrics}
