@@ -45,7 +45,7 @@ check: $(READY)
 	@$(BIN)/lint-imports
 
 bench: $(READY)
-	@for bench in tests/bench/bench_*.py; do $(BIN)/python $$bench || exit 1; done
+	@for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || exit 1; done
 
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)
