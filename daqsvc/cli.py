@@ -14,9 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
+from daqsvc.commands.alarm_orders import order_commands
+from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
+from daqsvc.commands.store_argument import store_directory
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -150,19 +153,6 @@ def load(path: Path) -> MachineFile | None:
         return None
 
 
-def store_directory(machine: MachineFile) -> Path:
-    """Where the journal lives if nobody says otherwise.
-
-    The machine file's own word first, then systemd's, then the user's state directory (XDG).
-    """
-    if machine.store is not None:
-        return machine.resolve(machine.store.directory)
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.split(":")[0])
-    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return state / "daqsvc" / f"{machine.site}-{machine.box}-{machine.machine.name}"
-
-
 def prepare_kernel_cache() -> None:
     """Keep compiled kernels in the service's own cache directory; call before any kernel is imported."""
     if "NUMBA_CACHE_DIR" in os.environ:
@@ -199,6 +189,8 @@ def commands() -> dict[str, Command]:
     known: dict[str, Command] = {
         "run": RunCommand(),
         "check": CheckCommand(),
+        "alarms": AlarmsCommand(load),
+        **order_commands(load),
         "analyze": AnalyzeCommand(load, prepare_kernel_cache),
         "calibrate": CalibrateCommand(load, prepare_kernel_cache),
         "detectability": DetectabilityCommand(load, prepare_kernel_cache),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import signal
+import subprocess
+import sys
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -11,6 +14,7 @@ from brokers import LOOPBACK
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
 FRAME_ID = 0x101
 SAMPLES_PER_FRAME = 3
@@ -134,6 +138,7 @@ class CanGateway:
             if self.lossy:
                 self.frames_withheld += 1
                 continue
+            self._writers = [writer for writer in self._writers if not writer.transport.is_closing()]
             for writer in self._writers:
                 writer.write(frame)
 
@@ -142,3 +147,19 @@ class CanGateway:
         payload = np.concatenate([[self._counter], samples.clip(-32_000, 32_000)]).astype("<i8")
         self._counter = (self._counter + SAMPLES_PER_FRAME) % 65_536
         return f"< frame {FRAME_ID:03X} 0.000000 {payload.astype('<u2').tobytes().hex()} >".encode()
+
+
+@contextlib.asynccontextmanager
+async def daqsvc_run(file: Path, store: Path) -> AsyncIterator[subprocess.Popen[bytes]]:
+    """``daqsvc run`` in a process of its own; it is stopped at the end. Its log is beside the store."""
+    command = [sys.executable, "-m", "daqsvc", "run", str(file), "--store", str(store), "-v"]
+    with (
+        (store.parent / "log").open("wb") as log,
+        subprocess.Popen(command, stderr=log) as process,  # noqa: ASYNC220 - it takes no time
+    ):
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGCONT)
+            process.terminate()
+            await asyncio.to_thread(process.wait, 10)

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from dataclasses import dataclass
 from decimal import Decimal
 
 _ORBIT = "orbit:"
+_UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_PART = re.compile(r"([0-9]{1,9})([smhd])")
+_DURATION = re.compile(r"([0-9]{1,9}d)?([0-9]{1,9}h)?([0-9]{1,9}m)?([0-9]{1,9}s)?")
+
+LONGEST_S = 366 * 86_400
+"""Longest time that a duration can say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +90,23 @@ def count(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
     return value
+
+
+def duration(text: str) -> float:
+    """A time in seconds, written like ``90s``, ``30m``, ``8h``, ``2d`` or ``1h30m``."""
+    if not _DURATION.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m")
+    total_s = sum(int(number) * _UNITS_S[unit] for number, unit in _PART.findall(text))
+    if not 0 < total_s <= LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time from 1s to {LONGEST_S // 86_400}d")
+    return float(total_s)
+
+
+def one_line(text: str) -> str:
+    """Text that can stand in a log."""
+    if not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text!r} is not printable; write one line of plain text")
+    return text
 
 
 def calibration_length(text: str) -> int:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-import subprocess
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from brokers import Consumer, eventually, free_port
-from can_gateway import MACHINE, SAMPLES_PER_FRAME, CanGateway
+from can_gateway import MACHINE, SAMPLES_PER_FRAME, CanGateway, daqsvc_run
 from live_service import play
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
@@ -140,21 +138,6 @@ async def test_whoever_was_suspended_has_not_heard_a_silence() -> None:
     assert [diagnosis.reason for diagnosis in said] == ["2 s"]
     ring.close()
     await task
-
-
-@contextlib.asynccontextmanager
-async def daqsvc_run(file: Path, store: Path) -> AsyncIterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "daqsvc", "run", str(file), "--store", str(store), "-v"]
-    with (
-        (store.parent / "log").open("wb") as log,
-        subprocess.Popen(command, stderr=log) as process,  # noqa: ASYNC220 - it takes no time
-    ):
-        try:
-            yield process
-        finally:
-            process.send_signal(signal.SIGCONT)
-            process.terminate()
-            await asyncio.to_thread(process.wait, 10)
 
 
 @pytest.mark.parametrize("lossy", [False, True], ids=["the socket keeps it", "the buffers overflow"])

@@ -1,0 +1,91 @@
+"""``daqsvc alarms``: how the alarms stand and what has happened, from the journal."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.option_types import count
+from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
+
+if TYPE_CHECKING:
+    import argparse
+
+    from daqsvc.commands.store_argument import Load
+
+HISTORY = 20
+"""Events that ``--history`` shows if nobody says how many."""
+
+EXIT_OK, EXIT_FAILED, EXIT_BAD_FILE = 0, 1, 2
+
+
+class AlarmsCommand:
+    """``daqsvc alarms [FILE | --store DIR]``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    help = "how the alarms stand, and what has happened, from the journal"
+    description = (
+        "Show the alarms that are not normal, as they stand in the journal, whether the service runs or not. "
+        "An ID is what daqsvc ack, shelve, reset and the like take, as well as an alarm's name."
+    )
+
+    def __init__(self, load: Load) -> None:
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        add_store(parser)
+        parser.add_argument("--all", action="store_true", help="those that are normal, too")
+        parser.add_argument(
+            "--history",
+            type=count,
+            nargs="?",
+            const=HISTORY,
+            metavar="N",
+            help=f"the last N events instead, newest last (default: {HISTORY})",
+        )
+        parser.add_argument(
+            "--json",
+            action="store_true",
+            help="one JSON object a line: the alarm messages as they go over MQTT",
+        )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.commands.alarm_journal import current, history  # noqa: PLC0415 - brings SQLite
+        from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
+
+        try:
+            store = chosen_store(arguments, self._load)
+            if arguments.history is not None:
+                events = history(store, arguments.history)
+            else:
+                events = current(store)
+                if not arguments.all:
+                    events = [told for told in events if told["state"] != "normal"]
+        except BadFileError:
+            return EXIT_BAD_FILE
+        except (StoreNotFoundError, OutboxError) as error:
+            print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_FAILED
+        _show(events, arguments)
+        return EXIT_OK
+
+
+def _show(events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
+    from daqsvc.commands import alarm_table  # noqa: PLC0415
+
+    if arguments.json:
+        for told in events:
+            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+    elif arguments.history is not None:
+        print(alarm_table.history(events) if events else "nothing has happened yet")  # noqa: T201
+    elif events:
+        print(alarm_table.current(events, time.time_ns()))  # noqa: T201
+    else:
+        print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201
