@@ -11,7 +11,7 @@ import asyncio
 import itertools
 import logging
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -183,6 +183,7 @@ class AlarmDesk:
 
     def figures(self) -> dict[str, Any]:
         """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
+        counted = self.manager.counters
         shown = Counter(status.state for status in self.manager.alarms.values())
         return {
             "active": sum(count for state, count in shown.items() if state.is_active),
@@ -191,7 +192,10 @@ class AlarmDesk:
             "suppressed": shown[AlarmState.SUPPRESSED],
             "shelved": shown[AlarmState.SHELVED],
             "out_of_service": shown[AlarmState.OUT_OF_SERVICE],
-            **asdict(self.manager.counters),
+            "events": counted.events,
+            "annunciations": counted.annunciations,
+            "chattering": counted.chattering,
+            "floods": counted.floods,
         }
 
     async def settle(self, timeout_s: float) -> None:
