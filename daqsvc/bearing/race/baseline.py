@@ -88,8 +88,6 @@ def band_levels(spectrum: Complex, samples: int, rate_hz: float) -> BandLevels:
     while 2.0 * edges[-1] <= TOP_SHARE * rate_hz:
         edges.append(2.0 * edges[-1])
     places = [round(edge * samples / rate_hz) for edge in edges]
-    power = [
-        2.0 * float(np.vdot(spectrum[low:high], spectrum[low:high]).real) / samples**2
-        for low, high in pairwise(places)
-    ]
+    squares = spectrum.real**2 + spectrum.imag**2
+    power = [2.0 * float(squares[low:high].sum()) / samples**2 for low, high in pairwise(places)]
     return BandLevels(tuple(edges), tuple(power))
