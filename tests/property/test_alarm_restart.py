@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarms.events import EventKind, Identity
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, Level, RefusedError
@@ -30,9 +31,8 @@ QUALITY = st.sampled_from(["good", "good", "good", "missing", "not_ok"])
 MEASURED = st.tuples(st.just("levels/x"), st.sampled_from([0.0, 3.5, 5.0, 7.5, 9.0, math.nan]), QUALITY)
 DIAGNOSED = st.tuples(st.just("bank"), st.sampled_from(sorted(MODES)), QUALITY)
 ASKED = st.tuples(
-    st.sampled_from(["acknowledge", "reset"]),
-    # Not of the quality alarms: their last event would no longer tell that they were not OK, then missing.
-    st.sampled_from([rule.alarm for rule in RULES]),
+    st.sampled_from([verb for verb in Verb if verb is not Verb.SHELVE]),
+    st.sampled_from([*(rule.alarm for rule in RULES), "sensor-ok/x", "detector-ok/bank"]),
     st.just("good"),
 )
 STEPS = st.lists(st.tuples(st.booleans(), MEASURED | DIAGNOSED | ASKED), min_size=1, max_size=40)
@@ -55,7 +55,7 @@ class Box:
         assert self.manager.resume(told, SPEAKERS) == []
 
     def do(self, what, which, quality):
-        """The events of a step, without those that only tell a cause afresh."""
+        """The events of a step."""
         events = []
         if what in SPEAKERS:
             said = {"statistics": {"rms": which}, "decision": "normal"}
@@ -67,19 +67,19 @@ class Box:
                 Diagnosis("m", what, t_ns, "s", 0, 1, quality=quality, sensors=sensors, **said)
             )
         else:
-            with contextlib.suppress(KeyError, RefusedError):
-                events = [getattr(self.manager, what)(which)]
+            with contextlib.suppress(RefusedError):
+                events = self.manager.obey(AlarmCommand(verb=what, alarm=which, by="ann"))
         for event in events:
+            self.journal.pop(event.alarm, None)
             self.journal[event.alarm] = alarm_payload(event, 1).to_json()
         return [
             (event.alarm, event.kind, event.from_state, event.to_state, event.to_level, event.occurrence)
             for event in events
-            if event.kind is not EventKind.CHANGED
         ]
 
     def standing(self):
         return {
-            name: (status.state, status.level, status.occurrence)
+            name: (status.state, status.level, status.occurrence, status.own_state, status.first_out)
             for name, status in self.manager.alarms.items()
             if status.state is not AlarmState.NORMAL
         }
@@ -108,6 +108,6 @@ def test_what_nobody_judges_any_more_ends_normal(steps):
     events = successor.resume([alarm_event(payload) for payload in box.journal.values()], {})
     assert {event.alarm for event in events} == set(standing)
     for event in events:
-        assert (event.from_state, event.from_level, event.occurrence) == standing[event.alarm]
+        assert (event.from_state, event.from_level, event.occurrence) == standing[event.alarm][:3]
         assert (event.to_state, event.to_level) == (AlarmState.NORMAL, Level.NORMAL)
     assert dict(successor.alarms) == {}
