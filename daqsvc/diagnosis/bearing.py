@@ -222,6 +222,8 @@ class BearingDetector:
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
                 continue
             races[bearing.name] = race
+            # "Normal" of samples that had to be put right clears nothing; a fault seen through them is one.
+            unfit += [("not_ok", f"{bearing.sensor}: {repair}") for repair in race.repairs]
             if departed is not None:
                 changes[bearing.name] = departed
             suspected = race.verdict not in SOUND or (departed is not None and departed.changed)

@@ -16,6 +16,8 @@ import scipy.fft
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, highest_order
 from daqsvc.bearing.race.decision import decide
+from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
+from daqsvc.bearing.race.knocks import levelled
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
 from daqsvc.bearing.race.quality import checked
@@ -58,6 +60,8 @@ class RaceFeatures:
         speed_doubt: why they do not confirm it; empty if they do.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
+        repairs: what was wrong with them and put right.
+        lost: share of the record that the repairs left nothing of.
         spectrum: envelope spectrum, for figures.
     """
 
@@ -68,6 +72,8 @@ class RaceFeatures:
     speed_doubt: str
     revolutions: float
     notes: tuple[str, ...]
+    repairs: tuple[str, ...]
+    lost: float
     spectrum: EnvelopeSpectrum
 
 
@@ -114,23 +120,25 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     change_db = None if baseline is None else features.levels.change_db(baseline.levels)
     decision = decide(features.evidence, rules, baseline, change_db)
     evidence = features.evidence
-    notes = [*features.notes]
+    notes = [*features.notes, *features.repairs]
     notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
     if features.speed_doubt:
         notes.append(f"the speed is not confirmed: {features.speed_doubt}")
+    repairs = len(features.repairs)
     return RaceVerdict(
         verdict=decision.verdict,
         group=decision.group,
         evidence=features.evidence,
-        probability=decision.probability,
+        probability=doubted(decision.probability, len(notes) - repairs, repairs, features.lost),
         lines=features.lines,
-        margin=decision.margin,
+        margin=min(decision.margin, MOST_MARGIN),
         speed_rpm=features.speed_rpm,
         speed_seen=not features.speed_doubt,
         revolutions=features.revolutions,
         false_alarm_probability=len(PARTS) * false_alarm_probability(rules.z_limit),
         level_db=None if change_db is None else change_db[0],
         notes=tuple(notes),
+        repairs=features.repairs,
         spectrum=features.spectrum,
     )
 
@@ -148,11 +156,14 @@ def race_features(
     stated_hz, step_hz = speed_rpm / 60.0, rate_hz / length
     bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
-    power = line_power(phases, bins)
+    holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
+    power = line_power(levelled(phases, holes), bins)
     shaft = shaft_rate(spectrum, step_hz, power, stated_hz, rules.speed_tolerance, bearing.cage)
     revolutions = shaft.rate_hz / step_hz
-    square = view_of(power, line_power(sizes, bins), revolutions)
-    log_phases, log_sizes = (line_power(np.log(x + LOG_OFFSET), bins) for x in (phases, sizes))
+    square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions)
+    log_phases, log_sizes = (
+        line_power(levelled(np.log(envelope + LOG_OFFSET), holes), bins) for envelope in (phases, sizes)
+    )
     log = view_of(log_phases, log_sizes, revolutions)
     evidence = Scales(square, log, bearing, shaft, revolutions, rules).weigh()
     refuse_rivals(evidence, bearing, shaft, rules.slip)
@@ -164,6 +175,8 @@ def race_features(
         speed_doubt=shaft.doubt,
         revolutions=revolutions,
         notes=sound.notes,
+        repairs=sound.repairs,
+        lost=float(np.diff(holes, axis=1).sum()),
         spectrum=EnvelopeSpectrum(
             order=np.arange(bins) / revolutions,
             amplitude=np.sqrt(square.power),

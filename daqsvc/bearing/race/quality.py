@@ -1,4 +1,4 @@
-"""Samples that no verdict must rest on: recognised before the test, named with a remedy."""
+"""Samples that no verdict must rest on: recognised before the test, put right or named with a remedy."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.bearing.race.knocks import blanked, merged, runs
+from daqsvc.bearing.race.repair import repaired
+from daqsvc.bearing.race.stuck import stuck
 from daqsvc.bearing.race.verdict import RaceInputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from daqsvc.bearing.race.knocks import Stretch
     from daqsvc.bearing.race.rules import RaceRules
 
     Real = NDArray[np.float64]
@@ -25,7 +29,10 @@ PILED_UP = 1.5
 """Samples at the extreme value over those within 2.5 % of the range of it, beyond which it is a limit."""
 DEAD_SHARE = 0.5
 OFFSET_DEVIATIONS = 5.0
-SHIFT_DEVIATIONS = 1.0
+GAP_TAPER_S = 2e-3
+"""A channel that breaks off makes noise of its own: it fades out before, and in behind."""
+BRIDGED = 4
+"""A longer bridge over missing samples leaves a hole in the envelope, which says nothing of the machine."""
 LEAST_REVOLUTIONS = 25.0
 LEAST_BAND = 3.0
 """Top of the analysed band over its bottom, at least."""
@@ -36,12 +43,16 @@ class CheckedSamples:
     """Samples fit for the test.
 
     Attributes:
-        values: ``[n]``, without mean; single missing samples lie on their neighbours' line.
+        values: ``[n]``, without mean and without what was wrong with them.
         notes: what is odd about them without spoiling the test.
+        repairs: what was put right.
+        stretches: where nothing of the machine is left, by sample.
     """
 
     values: Real
     notes: tuple[str, ...]
+    repairs: tuple[str, ...]
+    stretches: tuple[Stretch, ...]
 
 
 def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -> CheckedSamples:
@@ -79,40 +90,10 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
             f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
-    x = _clean(x)
-    mean, deviation = float(x.mean()), float(x.std())
-    thirds = [float(part.mean()) for part in np.array_split(x, 3)]
+    x, gaps, repairs = _bridged(x, rate_hz)
+    mended = repaired(x, rate_hz, round(60.0 * rate_hz / speed_rpm), (rules.low_hz, top_hz))
+    x = mended.values
     notes = []
-    clipped = _clipped_share(x)
-    if clipped > CLIPPED_NOTE_SHARE:
-        notes.append(f"{clipped:.2%} of the samples are clipped: sizes are too small")
-    if max(thirds) - min(thirds) > SHIFT_DEVIATIONS * deviation:
-        notes.append(
-            f"the channel's mean moves from {thirds[0]:.4g} to {thirds[2]:.4g}: check the sensor's supply"
-        )
-    elif abs(mean) > OFFSET_DEVIATIONS * deviation:
-        notes.append(
-            f"the channel has an offset of {mean:.4g}, {abs(mean) / deviation:.0f} times what it measures"
-        )
-    return CheckedSamples(x - mean, tuple(notes))
-
-
-def _clean(x: Real) -> Real:
-    """Fill single missing samples; refuse what is dead or clipped."""
-    good = np.isfinite(x)
-    missing = 1.0 - float(good.mean())
-    if missing > MISSING_SHARE:
-        raise RaceInputError(
-            "channel", f"lacks {missing:.1%} of its samples (NaN or infinite)", "check sensor and cable"
-        )
-    if missing:
-        place = np.arange(len(x))
-        x = np.interp(place, place[good], x[good])
-    steady = float(np.mean(np.diff(x) == 0.0))
-    if steady > DEAD_SHARE:
-        raise RaceInputError(
-            "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
-        )
     clipped = _clipped_share(x)
     if clipped > CLIPPED_SHARE:
         raise RaceInputError(
@@ -120,7 +101,63 @@ def _clean(x: Real) -> Real:
             f"is clipped: {clipped:.1%} of its samples stand at {x.min():.4g} or {x.max():.4g}",
             "use a sensor or a gain with a larger range",
         )
-    return x
+    if clipped > CLIPPED_NOTE_SHARE:
+        notes.append(f"{clipped:.2%} of the samples are clipped: sizes are too small")
+    offset, deviation = float(x.mean()), float(x.std())
+    if abs(offset) > OFFSET_DEVIATIONS * deviation:
+        notes.append(
+            f"the channel has an offset of {offset:.4g}, {abs(offset) / deviation:.0f} times what it measures"
+        )
+    return CheckedSamples(
+        x - offset,
+        tuple(notes),
+        (*repairs, *mended.repairs),
+        (*gaps, *mended.stretches),
+    )
+
+
+def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str]]:
+    """Straight lines over missing samples and drop-outs, and where they are long; refuse what is dead."""
+    good = np.isfinite(x)
+    missing = 1.0 - float(good.mean())
+    if missing > MISSING_SHARE:
+        raise RaceInputError(
+            "channel", f"lacks {missing:.1%} of its samples (NaN or infinite)", "check sensor and cable"
+        )
+    if missing:
+        x = _interpolated(x, good)
+    steady = float(np.mean(np.diff(x) == 0.0))
+    if steady > DEAD_SHARE:
+        raise RaceInputError(
+            "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
+        )
+    held = stuck(x) & good
+    if not missing and not held.any():
+        return x, [], []
+    lost = ~good | held
+    told = []
+    if held.any():
+        dropped = runs(np.flatnonzero(held), 1)
+        first_s = dropped[0][0] / rate_hz
+        what = f"{len(dropped)} times ({held.mean():.1%} of its samples), first at {first_s:.4g} s"
+        if lost.mean() > MISSING_SHARE:
+            raise RaceInputError("channel", f"stands still {what}", "check what drops its samples out")
+        told.append(f"the channel stands still {what}: bridged; check what drops its samples out")
+        x = _interpolated(x, ~held)
+    long = [(first, last) for first, last in runs(np.flatnonzero(lost), 1) if last - first > BRIDGED]
+    taper = round(GAP_TAPER_S * rate_hz)
+    long = merged((max(first - taper, 0), min(last + taper, len(x))) for first, last in long)
+    x = blanked(x, long, rate_hz)
+    if missing:
+        count = int(len(x) - good.sum())
+        told.append(f"{count} samples are missing: bridged; check the bus and the device")
+    return x, long, told
+
+
+def _interpolated(x: Real, good: NDArray[np.bool_]) -> Real:
+    """Straight lines over what is not good."""
+    place = np.arange(len(x))
+    return np.interp(place, place[good], x[good])
 
 
 def _clipped_share(x: Real) -> float:

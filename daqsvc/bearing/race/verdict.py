@@ -117,13 +117,16 @@ class RaceVerdict:
         evidence: what speaks for each part.
         probability: share of belief per word, summing to one, of the words that were weighed.
         lines: kinematic lines found, strongest first.
-        margin: how far the decision is from another, as a factor of severity: 1 is on the fence.
+        margin: how far the decision is from another, as a factor of severity: 1 is on the fence, 10 the most
+            that is told.
         speed_rpm: of the shaft, as the harmonics show it.
         speed_seen: whether harmonics of the shaft stood out at all.
         revolutions: of the shaft in the evidence.
         false_alarm_probability: what the significance limit is set to, per test of three parts, in noise.
         level_db: broadband level over the baseline; None without one.
         notes: what a reader should know, e.g. ``"ball not testable here: ..."``.
+        repairs: those of the notes that say what was wrong with the samples and put right; while there are
+            any, ``"normal"`` clears nothing.
         spectrum: for figures.
     """
 
@@ -139,4 +142,5 @@ class RaceVerdict:
     false_alarm_probability: float
     level_db: float | None = None
     notes: tuple[str, ...] = ()
+    repairs: tuple[str, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)

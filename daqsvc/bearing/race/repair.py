@@ -1,0 +1,168 @@
+"""What is wrong with single samples and short stretches of a channel, put right where that is honest.
+
+Missing samples and drop-outs are bridged, wrong samples and steps taken out, knocks faded out, a wandering
+mean followed. Each repair is told, with its place. A channel without defects comes back as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from daqsvc.bearing.race.knocks import blanked, knocks, merged
+from daqsvc.bearing.race.robust import RobustWhitening
+from daqsvc.bearing.race.spikes import despiked
+from daqsvc.bearing.race.verdict import RaceInputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.race.knocks import Stretch
+
+    Real = NDArray[np.float64]
+
+PASSES = 4
+"""A loud knock hides what is wrong beside it."""
+WANDERING_DEVIATIONS = 1.0
+"""Range of the mean of single revolutions over the deviation within them, from which on it is followed."""
+MOST_BLANKED = 0.2
+MOST_SPIKES = 0.003
+STEADY_REVOLUTIONS = 5
+"""What comes and goes within so many revolutions is vibration, or a single event."""
+MIDDLE_OF = 50
+"""One sample of so many gives the spread of all."""
+TOLD = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """A channel that the race test can hear.
+
+    Attributes:
+        values: ``[n]``.
+        repairs: what was put right, in sentences.
+        stretches: where nothing of the machine is left, by sample.
+    """
+
+    values: Real
+    repairs: tuple[str, ...]
+    stretches: tuple[Stretch, ...]
+
+
+def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[float, float]) -> Repaired:
+    """Put a channel right.
+
+    Args:
+        samples: ``[n]``, all finite, without drop-outs.
+        rate_hz: their sample rate.
+        revolution: samples of one revolution of the shaft.
+        band_hz: where the analysed band begins and ends.
+
+    Raises:
+        RaceInputError: too much is wrong.
+    """
+    whitening = RobustWhitening(samples, rate_hz, *band_hz)
+    values = samples
+    spikes: set[int] = set()
+    steps: list[tuple[int, float]] = []
+    stretches: list[Stretch] = []
+    wandered = ""
+    for _ in range(PASSES):
+        whitened = whitening(values)
+        clean = despiked(values, whitened, whitening, revolution)
+        if clean.values is not values:
+            values, whitened = clean.values, whitening(clean.values)
+            spikes.update(clean.spikes)
+            steps += clean.steps
+        values, told = _steadied(values, revolution)
+        wandered = wandered or told
+        found = merged([*knocks(whitened, rate_hz, revolution), *knocks(_unit(values), rate_hz, revolution)])
+        if not found:
+            break
+        stretches = merged([*stretches, *found])
+        lost = sum(last - first for first, last in stretches) / len(samples)
+        if lost > MOST_BLANKED:
+            raise RaceInputError(
+                "channel",
+                f"is much louder for {lost:.0%} of its time, first at {stretches[0][0] / rate_hz:.2f} s, "
+                "than the machine is otherwise",
+                "give a recording of steady running without knocks, and check cable and mounting",
+            )
+        values = blanked(values, found, rate_hz)
+    if len(spikes) > MOST_SPIKES * len(samples):
+        raise RaceInputError(
+            "channel", f"has {len(spikes)} wrong samples of {len(samples)}", "check cable and converter"
+        )
+    repairs = []
+    if spikes:
+        repairs.append(_told_spikes(sorted(spikes), rate_hz))
+    if steps:
+        repairs.append(_told_steps(sorted(steps), rate_hz))
+    if wandered:
+        repairs.append(wandered)
+    if stretches:
+        repairs.append(_told_knocks(stretches, rate_hz))
+    return Repaired(values, tuple(repairs), tuple(stretches))
+
+
+def _steadied(samples: Real, revolution: int) -> tuple[Real, str]:
+    """The channel without a wandering mean: its two ends, which a spectrum joins, must meet."""
+    count = len(samples) // revolution
+    turns = samples[: count * revolution].reshape(count, revolution)
+    means = median_filter(turns.mean(axis=1), STEADY_REVOLUTIONS, mode="nearest")
+    usual = float(np.median(turns.std(axis=1)))
+    if np.ptp(means) <= WANDERING_DEVIATIONS * usual:
+        return samples, ""
+    middles = (np.arange(count) + 0.5) * revolution
+    drift = np.interp(np.arange(len(samples)), middles, means)
+    told = (
+        f"the channel's mean moves slowly between {means.min():.4g} and {means.max():.4g} (it vibrates with "
+        f"{usual:.3g} r.m.s.): followed and subtracted; check the sensor's supply and temperature"
+    )
+    return samples - drift, told
+
+
+def _unit(samples: Real) -> Real:
+    """The channel about its middle, of unit deviation as far as single events do not count."""
+    low, middle, high = np.quantile(samples[::MIDDLE_OF], (0.1587, 0.5, 0.8413))
+    return np.asarray((samples - middle) / max(0.5 * (high - low), np.finfo(np.float64).tiny))
+
+
+def _told_spikes(spikes: list[int], rate_hz: float) -> str:
+    return (
+        f"{_count(len(spikes), 'sample', 'samples')} that no housing can follow, {_at(spikes, rate_hz)}: "
+        "replaced by what the neighbours predict; check cable and converter"
+    )
+
+
+def _told_steps(steps: list[tuple[int, float]], rate_hz: float) -> str:
+    heights = ", ".join(f"{height:+.4g}" for _, height in steps[:TOLD]) + _more(len(steps))
+    return (
+        f"the channel's mean moves in {_count(len(steps), 'step', 'steps')} ({heights}), "
+        f"{_at([place for place, _ in steps], rate_hz)}: taken out; check the sensor's supply"
+    )
+
+
+def _told_knocks(stretches: list[Stretch], rate_hz: float) -> str:
+    lost_s = sum(last - first for first, last in stretches) / rate_hz
+    return (
+        f"{_count(len(stretches), 'knock', 'knocks')} much louder than the machine, "
+        f"{_at([first for first, _ in stretches], rate_hz)}: {lost_s:.3f} s left out; check what strikes the "
+        "housing, and the sensor's mounting"
+    )
+
+
+def _count(number: int, one: str, many: str) -> str:
+    return f"{number} {one if number == 1 else many}"
+
+
+def _more(number: int) -> str:
+    return ", ..." if number > TOLD else ""
+
+
+def _at(places: list[int], rate_hz: float) -> str:
+    """``at 1.204 s``, ``at 0.31, 0.422, 0.518, ... s``."""
+    return f"at {', '.join(f'{place / rate_hz:.4g}' for place in places[:TOLD])}{_more(len(places))} s"
