@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from daqsvc.bearing.kernels import ORDER
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from daqsvc.bearing.model import Complexes, Floats
+
+    Mask: TypeAlias = NDArray[np.bool_]
 
 DIP_HZ = 2_500.0
 """Bandwidth of the displacement as a rolling element passes a spall."""
@@ -58,6 +62,30 @@ def spectra(residual: Floats, frame: int) -> Complexes:
     cut = np.lib.stride_tricks.sliding_window_view(residual, frame, axis=0)[:: frame // 2]
     cut = cut[np.isfinite(cut).all(axis=(1, 2))]
     return np.asarray(np.fft.rfft(cut * np.hanning(frame), axis=2).swapaxes(1, 2), dtype=np.complex128)
+
+
+def best_direction(noise: Complexes, D: Floats) -> tuple[Complexes, Floats]:
+    """Where displacements of the races stand out best against noise: the first of two whitened directions.
+
+    Args:
+        noise: complex128 ``[f, 2, 2]``, its covariance.
+        D: float64 ``[2]``, accelerations of unit displacements.
+
+    Returns:
+        complex128 ``[f, 2]``, whose inner product with a spectrum has a mean square of 1 on noise; float64
+        ``[f]``, mean square of unit displacements in it.
+    """
+    precision = np.linalg.inv(noise)
+    strengths, directions = np.linalg.eigh(D[:, None] * precision * D)
+    best = np.asarray(strengths[:, 1])
+    along = np.einsum("fij,fj->fi", precision * D, directions[:, :, 1]) / np.sqrt(best)[:, None]
+    return np.asarray(along, dtype=np.complex128), best
+
+
+def energy_correlation(lines: int) -> Floats:
+    """Of the energies of neighbouring lines under a Hann window: float64 ``[lines, lines]``."""
+    apart = np.abs(np.subtract.outer(np.arange(lines), np.arange(lines)))
+    return np.where(apart < 3, np.take([1.0, 4.0 / 9.0, 1.0 / 36.0], apart, mode="clip"), 0.0)
 
 
 def covariance(frames: Complexes) -> Complexes:

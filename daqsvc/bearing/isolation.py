@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 FRAME_S = 128 / 48_000
 """Length of a frame: a hit, and little of the next."""
-LOWEST_PER_BALL_MODE, LOWEST_HZ = 0.2, 600.0
+LOWEST_HZ = 250.0
+LOWEST_PER_BALL_MODE, LOWEST_TELLING_HZ = 0.2, 600.0
 """Lines below this share of the rolling elements' mode cannot tell the races apart."""
 HIGHEST_PER_NYQUIST = 2.0 / 3.0
 STANDS_OUT_NATS = 4.0
@@ -80,11 +81,10 @@ def least_rate_hz(parameters: BearingParameters) -> float:
     return 2.0 / HIGHEST_PER_NYQUIST * _lowest_hz(BearingModel(parameters))
 
 
-def isolation_spectrum(parameters: BearingParameters, residual: Floats, rate_hz: float) -> HealthySpectrum:
+def isolation_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
     """What `IsolationRule` has to know of the healthy machine.
 
     Args:
-        parameters: of the healthy bearing.
         residual: float64 ``[n, 2]``, of the healthy machine with the usual corner, in m/s^2; frames with NaN
             are left out.
         rate_hz: sampling rate.
@@ -92,7 +92,7 @@ def isolation_spectrum(parameters: BearingParameters, residual: Floats, rate_hz:
     Raises:
         ValueError: the residual is too short.
     """
-    frame, _, kept = _lines(BearingModel(parameters), rate_hz)
+    frame, _, kept = short_lines(rate_hz)
     learnt = hit.spectra(residual, frame)[:, kept]
     if len(learnt) < 4 * frame:
         raise ValueError(
@@ -117,7 +117,7 @@ class IsolationRule:
             bearing, and then every verdict is ``"inner_or_outer"``.
 
     Raises:
-        ValueError: the mismatch is not between 0 and 0.5, or the spectrum another bearing's.
+        ValueError: the mismatch is not between 0 and 0.5, or the spectrum of another rate.
     """
 
     def __init__(
@@ -132,16 +132,19 @@ class IsolationRule:
         if not 0.0 <= mismatch < 0.5:
             raise ValueError(f"bearing isolation: a mismatch of {mismatch:g}; it must be from 0 to 0.5")
         model = BearingModel(parameters)
-        self._frame, self.lines_hz, self._kept = _lines(model, rate_hz)
-        if len(healthy.covariance) != len(self.lines_hz):
+        self._frame, frequency_hz, self._kept = short_lines(rate_hz)
+        if len(healthy.covariance) != len(frequency_hz):
             raise ValueError(
-                f"bearing isolation: a healthy spectrum of {len(healthy.covariance)} lines; this bearing has "
-                f"{len(self.lines_hz)} at {rate_hz:g} samples a second: learn it with the same figures"
+                f"bearing isolation: a healthy spectrum of {len(healthy.covariance)} lines; there are "
+                f"{len(frequency_hz)} at {rate_hz:g} samples a second: learn it at this rate"
             )
+        telling = frequency_hz > _lowest_hz(model)
+        self._kept[self._kept] = telling
+        self.lines_hz: Floats = frequency_hz[telling]
         self._step_s = self._frame / 2.0 / rate_hz
         self._to_displacement = 1.0 / np.diag(model.D)
         if len(self.lines_hz):
-            noise = healthy.covariance * np.outer(self._to_displacement, self._to_displacement)
+            noise = healthy.covariance[telling] * np.outer(self._to_displacement, self._to_displacement)
             self._weigh(model, noise, mismatch, np.random.default_rng(seed))
 
     def _weigh(
@@ -204,18 +207,16 @@ class IsolationRule:
         return float(inner), float(outer), len(ratio)
 
 
-def _lines(
-    model: BearingModel, rate_hz: float
-) -> tuple[int, Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """Samples of a frame, the frequencies that tell the races apart, and which of its lines these are."""
+def short_lines(rate_hz: float) -> tuple[int, Floats, hit.Mask]:
+    """Samples of a frame as long as a hit, frequencies of the lines that are looked at, and which these."""
     frame = 2 * round(FRAME_S * rate_hz / 2.0)
     frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
-    kept = (frequency_hz > _lowest_hz(model)) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0)
+    kept = (frequency_hz > LOWEST_HZ) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0)
     return frame, frequency_hz[kept], kept
 
 
 def _lowest_hz(model: BearingModel) -> float:
-    return max(LOWEST_PER_BALL_MODE * float(model.modes_hz[2]), LOWEST_HZ)
+    return max(LOWEST_PER_BALL_MODE * float(model.modes_hz[2]), LOWEST_TELLING_HZ)
 
 
 def _moments(

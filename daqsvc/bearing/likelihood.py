@@ -136,12 +136,7 @@ class WhittleDetector:
                 "bearing detection: the two components of the healthy residual are constant or alike; check "
                 "that both accelerometers are alive and not the same"
             )
-        # Displacements of the races along D: what stands out best is the first of two whitened directions.
-        precision = np.linalg.inv(noise)
-        D = np.diag(BearingModel(parameters).D)
-        strengths, directions = np.linalg.eigh(D[:, None] * precision * D)
-        best = strengths[:, 1]
-        along = np.einsum("fij,fj->fi", precision * D, directions[:, :, 1]) / np.sqrt(best)[:, None]
+        along, best = hit.best_direction(noise, np.diag(BearingModel(parameters).D))
         ratio = hit.power(frequency_hz[self._kept], CORNER_HZ) * best
         shows = ratio >= _COUNTS * ratio.max()
         self._kept[self._kept] = shows
@@ -195,10 +190,7 @@ class WhittleDetector:
         """Statistics of simulated windows of the healthy machine."""
         rng = np.random.default_rng(frames)
         lines = len(self._along)
-        apart = np.abs(np.subtract.outer(np.arange(lines), np.arange(lines)))
-        alike = np.linalg.cholesky(
-            np.where(apart < 3, np.take([1.0, 4 / 9, 1 / 36], apart, mode="clip"), 0.0)
-        )
+        alike = np.linalg.cholesky(hit.energy_correlation(lines))
         deviation = math.sqrt((1.0 + 2.0 / 36.0) / self._learnt)
         power = 2.0 * (1.0 + _BEFORE**2) * (1.0 + 2.0 * 0.5**2)
         parts = [
@@ -218,7 +210,7 @@ class WhittleDetector:
         return drawn
 
 
-def _lines(rate_hz: float) -> tuple[int, Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+def _lines(rate_hz: float) -> tuple[int, Floats, hit.Mask]:
     """Samples of a frame, frequencies of its lines, and which of them are looked at."""
     frame = 2 * round(FRAME_S * rate_hz / 2.0)
     frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)

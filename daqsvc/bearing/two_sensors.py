@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from daqsvc.bearing.isolation import Isolation, IsolationRule, isolation_spectrum
+from daqsvc.bearing.bursts import STEADY, BurstMeter
+from daqsvc.bearing.isolation import Isolation, IsolationRule, isolation_spectrum, short_lines
 from daqsvc.bearing.likelihood import Detection, WhittleDetector, detection_spectrum
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.ratio_rule import RatioRule
@@ -30,18 +31,21 @@ class TwoSensorFinding:
     """What a window says.
 
     Attributes:
-        verdict: ``"normal"`` if nothing is detected, else that of the isolation.
+        verdict: ``"normal"`` if nothing is detected, ``"changed"`` if what is detected does not come in hits,
+            else that of the isolation.
         group: parts that cannot be told apart, the verdict among them unless it is ``"inner_or_outer"``.
         detection: of a change in the total residual.
-        isolation: which race, by the likelihood of its hits; None if nothing is detected.
+        bursts: how much more the energy scatters than that of steady noise; NaN if nothing is detected.
+        isolation: which race, by the likelihood of its hits; None if there are none.
         energies: of the sliding units.
         ratio_db: of those energies, see `RatioRule.ratio_db`; NaN if nothing is detected.
         units: which race that ratio says, for corroboration; None if nothing is detected.
     """
 
-    verdict: Race | Literal["normal", "inner_or_outer"]
+    verdict: Race | Literal["normal", "changed", "inner_or_outer"]
     group: tuple[str, ...]
     detection: Detection
+    bursts: float
     isolation: Isolation | None
     energies: UnitEnergies
     ratio_db: float
@@ -108,7 +112,7 @@ def learn_pair(
         parameters=parameters,
         rate_hz=rate_hz,
         detection=detection_spectrum(residual, rate_hz),
-        isolation=isolation_spectrum(parameters, residual, rate_hz),
+        isolation=isolation_spectrum(residual, rate_hz),
         gains=gains,
         energies=UnitEnergies.of(SlidingPair(gains).process(drive)),
     )
@@ -157,6 +161,8 @@ class TwoSensorMonitor:
             repeatability_db=repeatability_db,
         )
         self._isolation = IsolationRule(parameters, rate_hz, healthy.isolation, mismatch=mismatch)
+        frame, _, kept = short_lines(rate_hz)
+        self._bursts = BurstMeter(parameters, healthy.isolation, frame, kept)
         self._units = SlidingPair(healthy.gains)
         self._ratio = RatioRule(parameters, healthy.energies)
         self.reset()
@@ -178,12 +184,19 @@ class TwoSensorMonitor:
         detection = self._detector.judge(residual)
         energies = UnitEnergies.of(self._units.process(self._drive.process(y, v)))
         if not (detection.detected or suspected):
-            return TwoSensorFinding("normal", ("normal",), detection, None, energies, math.nan, None)
+            return TwoSensorFinding(
+                "normal", ("normal",), detection, math.nan, None, energies, math.nan, None
+            )
+        bursts = self._bursts.measure(residual)
+        if not bursts >= STEADY:
+            verdict: Literal["normal", "changed"] = "changed" if detection.detected else "normal"
+            return TwoSensorFinding(verdict, (verdict,), detection, bursts, None, energies, math.nan, None)
         isolation = self._isolation.judge(residual)
         return TwoSensorFinding(
             verdict=isolation.verdict,
             group=isolation.group,
             detection=detection,
+            bursts=bursts,
             isolation=isolation,
             energies=energies,
             ratio_db=self._ratio.ratio_db(energies),

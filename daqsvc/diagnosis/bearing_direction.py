@@ -30,11 +30,12 @@ class Direction:
 
     Attributes:
         detected: whether the residual is not the healthy machine's.
-        group: parts that the evidence leaves possible, the likeliest first; empty if nobody has asked.
+        group: parts that the evidence leaves possible, the likeliest first; empty if there are no hits.
         change_nats: logarithm of the likelihood ratio of a fault.
         limit_nats: from which it is detected.
         inner_nats: evidence of the hits that are the inner race's.
         outer_nats: evidence of the hits that are the outer race's.
+        bursts: how much more the energy scatters than that of steady noise; NaN if nothing was suspected.
         ratio_db: energy of the inner race's displacement over the outer race's by the sliding units; NaN if
             neither stands out.
     """
@@ -45,6 +46,7 @@ class Direction:
     limit_nats: float = math.nan
     inner_nats: float = 0.0
     outer_nats: float = 0.0
+    bursts: float = math.nan
     ratio_db: float = math.nan
 
     @property
@@ -117,5 +119,6 @@ class RaceDirection:
             limit_nats=found.detection.limit,
             inner_nats=0.0 if isolation is None else isolation.inner_nats,
             outer_nats=0.0 if isolation is None else isolation.outer_nats,
+            bursts=found.bursts,
             ratio_db=found.ratio_db,
         )

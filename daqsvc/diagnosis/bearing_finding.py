@@ -6,8 +6,8 @@ two accelerometers, where a bearing has them.
 
 Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
 if they leave it open, and contradicts them if it is sure of the other race: the verdict is then
-``inner_or_outer``. Where no lines stand out the direction names the part of whatever has changed; if it is
-not sure either, the machine has ``changed``.
+``inner_or_outer``. Where no lines stand out the direction names the part that is hit, or leaves it open; if
+nothing is hit, for the change is steady, the machine has ``changed``.
 """
 
 from __future__ import annotations
@@ -86,9 +86,9 @@ def find(
         changed = any(v.verdict == "changed" for v in verdicts.values()) if change is None else change.changed
         verdict = "changed" if changed or felt else "normal"
         group = (verdict,)
-        if verdict == "changed" and where in told:
-            group = told[where].group
-            verdict = told[where].group[0]
+        if verdict == "changed" and where in directions and directions[where].group:
+            group = directions[where].group
+            verdict = group[0] if directions[where].decides else "inner_or_outer"
         doubt = 0.0 if verdict == "normal" else false_alarm_probability
         sound = shares["normal"] + shares["changed"]
         shares |= {"normal": sound * doubt, "changed": 0.0}

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from daqsvc.bearing.bursts import STEADY
 from daqsvc.bearing.race.verdict import PARTS
 
 if TYPE_CHECKING:
@@ -69,6 +70,8 @@ def figures_of(look: Look, where: str) -> dict[str, float]:
         }
     for name, direction in look.directions.items():
         figures[f"{name}.direction.change"] = direction.change_nats
+        if math.isfinite(direction.bursts):
+            figures[f"{name}.direction.bursts"] = direction.bursts
         if math.isfinite(direction.ratio_db):
             figures[f"{name}.direction"] = direction.ratio_db
     for name, race in look.races.items():
@@ -97,6 +100,8 @@ def thresholds_of(look: Look, where: str) -> dict[str, float]:
             thresholds[f"{where}.{part}.severity"] = evidence.limit
     for name, direction in look.directions.items():
         thresholds[f"{name}.direction.change"] = direction.limit_nats
+        if math.isfinite(direction.bursts):
+            thresholds[f"{name}.direction.bursts"] = STEADY
     return thresholds
 
 

@@ -15,6 +15,7 @@ from daqsvc import assembly
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.identify_file import load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.parameter_sets import S3
 from daqsvc.bearing.two_sensors import PairModel
 from daqsvc.diagnosis.bearing import BearingDetector
@@ -234,10 +235,7 @@ def pair():
 @pytest.mark.parametrize(("fault", "sign"), [("inner", 1.0), ("outer", -1.0)])
 def test_two_accelerometers_tell_the_race_where_the_lines_do_not(pair, fault, sign) -> None:
     """The bearing is another one than the file says: its lines are not found, and the direction decides."""
-    wrong = BearingOrders(inner=9.45, outer=4.55, ball=3.05, cage=4.55 / 14.0)
-    bearing = HousedBearing("drive-end", "housing", 1, wrong, TwoSensors("rotor", 0, PairModel(S3)))
-    given = {"rate_hz": PAIR_RATE_HZ, "bearings": [bearing]}
-    watch = detector(**given)
+    watch = with_pair()
     watch.warm()
     list(feed(watch, pair["healthy"].astype(np.float32), rate_hz=PAIR_RATE_HZ))
     assert list(watch.baseline.residuals) == [("rotor", "housing")]
@@ -247,9 +245,49 @@ def test_two_accelerometers_tell_the_race_where_the_lines_do_not(pair, fault, si
     assert sign * said[-1].statistics["drive-end.direction"] > 4.5
     assert said[-1].units["drive-end.direction"] == "dB"
     assert said[-1].probabilities[fault] > 0.5
-    blind = detector(rate_hz=PAIR_RATE_HZ, bearings=[HousedBearing("drive-end", "housing", 1, wrong)])
+    blind = detector(rate_hz=PAIR_RATE_HZ, bearings=[HousedBearing("drive-end", "housing", 1, WRONG)])
     both = np.concatenate([pair["healthy"], pair[fault]]).astype(np.float32)
     assert list(feed(blind, both, rate_hz=PAIR_RATE_HZ))[-1].decision == "changed"
+
+
+WRONG = BearingOrders(inner=9.45, outer=4.55, ball=3.05, cage=4.55 / 14.0)
+"""Of another bearing: its lines are not found, and only the direction tells the race."""
+
+
+def with_pair(**more: object) -> BearingDetector:
+    bearing = HousedBearing("drive-end", "housing", 1, WRONG, TwoSensors("rotor", 0, PairModel(S3)))
+    return detector(rate_hz=PAIR_RATE_HZ, bearings=[bearing], **more)
+
+
+def test_a_louder_machine_is_changed_and_no_race_is_named(pair) -> None:
+    watch = with_pair()
+    list(feed(watch, pair["healthy"].astype(np.float32), rate_hz=PAIR_RATE_HZ))
+    hiss = np.random.default_rng(4).standard_normal((round(10.0 * PAIR_RATE_HZ), 2))
+    louder = pair["healthy"][: len(hiss)] + 2.0 * pair["healthy"].std(axis=0) * hiss
+    first = round(12.5 * PAIR_RATE_HZ)
+    said = list(feed(watch, louder.astype(np.float32), first, rate_hz=PAIR_RATE_HZ))
+    assert said[-1].decision == "changed"
+    assert (
+        said[-1].statistics["drive-end.direction.bursts"] < said[-1].thresholds["drive-end.direction.bursts"]
+    )
+
+
+def test_a_fault_that_stands_at_a_restart_is_no_healthy_machine(pair, tmp_path) -> None:
+    """What tells the races by direction is kept with the healthy state, and comes back to the last bit."""
+    before = with_pair()
+    list(feed(before, pair["healthy"].astype(np.float32), rate_hz=PAIR_RATE_HZ))
+    save_bearing_baseline(before.baseline, tmp_path / "bearing.toml")
+    kept = load_bearing_baseline(tmp_path / "bearing.toml")
+    again, first = with_pair(baseline=kept), round(12.5 * PAIR_RATE_HZ)
+    outer = pair["outer"].astype(np.float32)
+    said = list(feed(again, outer, rate_hz=PAIR_RATE_HZ))
+    assert [d.decision for d in said] == ["undetermined", "outer", "outer"]
+    going_on = list(feed(before, outer, first, rate_hz=PAIR_RATE_HZ))
+    figures = ("drive-end.direction", "drive-end.direction.change", "drive-end.direction.bursts")
+    for name in figures:
+        assert [d.statistics[name] for d in said] == [d.statistics[name] for d in going_on]
+    (by_hits,) = {d.evidence["outer"] > d.evidence["inner"] for d in said}
+    assert by_hits
 
 
 def machine_file(url: str, rate_hz: float = RATE_HZ) -> object:

@@ -19,7 +19,7 @@ def detection(residual: np.ndarray, **more: float) -> WhittleDetector:
 
 
 def isolation_rule(residual: np.ndarray, **more: float) -> IsolationRule:
-    return IsolationRule(S3, RATE_HZ, isolation_spectrum(S3, residual, RATE_HZ), **more)
+    return IsolationRule(S3, RATE_HZ, isolation_spectrum(residual, RATE_HZ), **more)
 
 
 def noise(seconds: float, seed: int = 0) -> np.ndarray:
@@ -86,9 +86,35 @@ def test_a_rate_too_low_for_the_bearing_leaves_every_fault_open():
     """The rolling elements of S1 answer at 12.9 kHz: at 6 kHz no line tells its races apart."""
     y = np.random.default_rng(0).standard_normal((30_000, 2))
     residual = TwoSensorResidual(S1, 6_000.0).process(y)
-    rule = IsolationRule(S1, 6_000.0, isolation_spectrum(S1, residual, 6_000.0))
+    rule = IsolationRule(S1, 6_000.0, isolation_spectrum(residual, 6_000.0))
     assert not len(rule.lines_hz)
     assert rule.judge(100.0 * residual).verdict == "inner_or_outer"
+
+
+@pytest.mark.parametrize("louder", [(2.0, 2.0), (3.0, 1.0), (1.0, 3.0)])
+def test_steady_noise_is_a_change_and_no_race(louder):
+    monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
+    finding = monitor.take(noise(0.5, 7) * louder)
+    assert (finding.verdict, finding.group) == ("changed", ("changed",))
+    assert finding.detection.detected
+    assert 0.7 < finding.bursts < 1.3
+    assert finding.isolation is None
+
+
+def test_a_level_that_differs_from_run_to_run_is_no_fault():
+    healthy = learn_pair(S3, RATE_HZ, noise(3.0))
+    louder = 10.0 ** (1.5 / 20.0) * noise(2.5, 8)
+    assert TwoSensorMonitor(healthy, false_alarm_rate=1e-4).take(louder).detection.detected
+    allowing = TwoSensorMonitor(healthy, false_alarm_rate=1e-4, repeatability_db=0.8)
+    assert not allowing.take(louder).detection.detected
+
+
+def test_a_spectrum_of_another_rate_is_refused():
+    healthy = learn_pair(S3, RATE_HZ, noise(3.0))
+    with pytest.raises(ValueError, match=r"\d+ lines; there are \d+ at 24000 samples"):
+        WhittleDetector(S3, 24_000.0, healthy.detection)
+    with pytest.raises(ValueError, match=r"lines; there are \d+ at 24000 samples"):
+        IsolationRule(S3, 24_000.0, healthy.isolation)
 
 
 def test_short_records_and_dead_sensors_are_named():
