@@ -71,5 +71,5 @@ class FloodWatch:
             )
         if self.flooding and 2 * count < limit.events:
             self.flooding = False
-            return f"no more than {count} alarms in the last {minutes:g} min"
+            return f"only {count} alarms in the last {minutes:g} min"
         return None

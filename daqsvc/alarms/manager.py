@@ -124,7 +124,7 @@ class AlarmManager:
     @property
     def multiplies(self) -> bool:
         """Whether the machine starts up, and limits are multiplied."""
-        return self._start_up.multiplies
+        return self._start_up.multiplies(self._clock.monotonic_ns())
 
     def take(self, diagnosis: Diagnosis) -> list[AlarmEvent]:
         """Take in a diagnosis and return what changed, in order; often nothing.
@@ -235,7 +235,7 @@ class AlarmManager:
             if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":
                 ruled.sensors = frozenset(diagnosis.sensors)
         yield from self._suppression(diagnosis, at)
-        given = Circumstances(self._start_up.multiplies, frozenset(self._doubts.not_ok_sensors()))
+        given = Circumstances(self._start_up.multiplies(at.t_ns), frozenset(self._doubts.not_ok_sensors()))
         for ruled in followers:
             if diagnosis.quality != "good" or ruled.alarm.is_held(Hold.SUPPRESSED):
                 ruled.watch.hold(diagnosis)

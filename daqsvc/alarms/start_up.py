@@ -61,14 +61,17 @@ class StartUpSignal:
     def __init__(self, start_up: StartUp | None) -> None:
         self._start_up = start_up
         self._since_ns: int | None = None
-        self._overrun = False
         self._anchor: tuple[int, float] | None = None
         self._moving = False
 
-    @property
-    def multiplies(self) -> bool:
-        """Whether limits are multiplied now."""
-        return self._since_ns is not None and not self._overrun
+    def multiplies(self, t_ns: int) -> bool:
+        """Whether limits are multiplied at ``t_ns``, monotonic time."""
+        start_up = self._start_up
+        return (
+            start_up is not None
+            and self._since_ns is not None
+            and t_ns - self._since_ns <= start_up.at_most_ns
+        )
 
     def take(self, diagnosis: Diagnosis) -> None:
         """Take in a diagnosis; one of another detector, or without the measure, says nothing."""
@@ -83,19 +86,14 @@ class StartUpSignal:
             if self._since_ns is None:
                 self._since_ns = diagnosis.t_ns
         else:
-            self._since_ns, self._overrun = None, False
+            self._since_ns = None
 
     def overrun(self, now_ns: int) -> tuple[Level, str]:
-        """Whether the start-up has lasted too long by ``now_ns``, as a condition of the service.
-
-        From then on limits are no longer multiplied.
-        """
+        """Whether the start-up has lasted too long by ``now_ns``, as a condition of the service."""
         start_up = self._start_up
         if start_up is None or self._since_ns is None:
             return Level.NORMAL, "the start-up is over"
-        if now_ns - self._since_ns > start_up.at_most_ns:
-            self._overrun = True
-        if not self._overrun:
+        if self.multiplies(now_ns):
             return Level.NORMAL, "the machine starts up"
         return Level.ALERT, (
             f"by {start_up.measure} of {start_up.detector} the machine has been starting up for more than "
