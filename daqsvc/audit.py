@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import uuid
 from typing import TYPE_CHECKING, Any, Literal
@@ -99,7 +100,7 @@ class AuditLog:
             "verb": command.verb.value,
             "alarm": command.alarm,
             "occurrence": command.occurrence,
-            "duration_s": command.duration_s,
+            "duration_s": _in_json(command.duration_s),
             "reason": command.reason,
         }
 
@@ -113,6 +114,11 @@ class AuditLog:
                 f"the audit log {self.path} cannot be written: {error.strerror or error}; "
                 "no command is obeyed unless it can be written down: make room or correct its permissions"
             ) from error
+
+
+def _in_json(number: float | None) -> float | str | None:
+    """A number; what JSON has no number for in words, because it has been asked for all the same."""
+    return number if number is None or math.isfinite(number) else f"{number}"
 
 
 def _append_durably(path: Path, line: bytes) -> None:
