@@ -16,7 +16,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
 
     from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
     from paho.mqtt.reasoncodes import ReasonCode
@@ -76,11 +76,19 @@ class Connection(aiomqtt.Client):
         port: of the broker.
         in_flight: how many messages may wait for their PUBACK at a time.
         protocol: MQTT version.
+        on_overlooked: called for each message from the broker that is dropped because too many wait.
         options: further arguments of `aiomqtt.Client`.
     """
 
     def __init__(
-        self, hostname: str, port: int, *, in_flight: int, protocol: aiomqtt.ProtocolVersion, **options: Any
+        self,
+        hostname: str,
+        port: int,
+        *,
+        in_flight: int,
+        protocol: aiomqtt.ProtocolVersion,
+        on_overlooked: Callable[[], None] = lambda: None,
+        **options: Any,
     ) -> None:
         self.is_mqtt5 = protocol is aiomqtt.ProtocolVersion.V5
         if self.is_mqtt5:
@@ -94,7 +102,7 @@ class Connection(aiomqtt.Client):
             max_queued_incoming_messages=INCOMING,
             **options,
         )
-        self.overlooked = 0
+        self._on_overlooked = on_overlooked
         self._in_flight = in_flight
         self._window = asyncio.Semaphore(in_flight)
         self._acknowledgements: dict[int, asyncio.Future[ReasonCode]] = {}
@@ -161,6 +169,18 @@ class Connection(aiomqtt.Client):
                 self._acknowledgements.pop(info.mid, None)
         if answer.is_failure:
             raise PublishRefusedError(f"the broker refuses messages: {answer}")
+
+    def tell(self, topic: str, payload: bytes) -> None:
+        """Publish with QoS 0, not retained: nobody says whether it arrives.
+
+        Raises:
+            aiomqtt.MqttError: the connection is lost.
+        """
+        if self._disconnected.done():
+            raise self._loss()
+        info = self._client.publish(topic, payload, 0)
+        if info.rc != 0:
+            raise aiomqtt.MqttCodeError(info.rc, "could not publish")
 
     async def watch(self, *topics: str, fresh_only: bool = False) -> list[str]:
         """Subscribe with QoS 1.
@@ -286,7 +306,7 @@ class Connection(aiomqtt.Client):
 
     def _on_message(self, client: Client, userdata: Any, message: MQTTMessage) -> None:
         if self._queue.full():
-            self.overlooked += 1
+            self._on_overlooked()
         else:
             super()._on_message(client, userdata, message)
 

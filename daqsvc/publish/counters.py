@@ -38,3 +38,7 @@ class PublishCounters:
     def count_telemetry_refused(self) -> None:
         """One more telemetry message was refused."""
         self.telemetry_refused += 1
+
+    def count_overlooked(self) -> None:
+        """One more message from the broker was dropped."""
+        self.overlooked += 1

@@ -115,7 +115,10 @@ class Discovery:
             made[f"alarm/{alarm}"] = {**self._problem(alarm), "entity_category": "diagnostic"}
         for reading in self.settings.readings:
             made[f"{reading.kind}/{reading.detector}/{reading.key}"] = self._sensor(reading)
-        return {name: {**entity, "unique_id": f"{self._id}/{name}"} for name, entity in sorted(made.items())}
+        return {
+            _safe_id(name): {**entity, "unique_id": f"{self._id}/{name}"}
+            for name, entity in sorted(made.items())
+        }
 
     def _problem(self, alarm: str) -> dict[str, Any]:
         summary = self.topics.summary(self.settings.machine)

@@ -52,8 +52,17 @@ class HomeAssistantLink:
 
     def note(self, message: OutboxMessage) -> None:
         """Take in an alarm's message that the broker has."""
-        if self._summary.note(message):
-            self._changed.set()
+        try:
+            if self._summary.note(message):
+                self._changed.set()
+        except ValueError as error:
+            log.warning(
+                "message %d on %s is not in the summary of %s: %s",
+                message.sequence,
+                message.topic,
+                self._settings.machine,
+                error,
+            )
 
     def take(self, message: aiomqtt.Message) -> bool:
         """Take in a message from the broker; whether it was meant for this link."""

@@ -164,7 +164,6 @@ class MqttPublisher:
                     await self._serve(connection, credentials)
                 finally:
                     self.counters.connected = False
-                    self.counters.overlooked += connection.overlooked
                     connection.abandon()
         finally:
             self._running.set_result(None)
@@ -216,6 +215,7 @@ class MqttPublisher:
             settings.port,
             in_flight=IN_FLIGHT,
             protocol=self._protocol,
+            on_overlooked=self.counters.count_overlooked,
             identifier=settings.client_id,
             username=settings.username,
             password=credentials.password,

@@ -100,8 +100,8 @@ class Session:
             asyncio.create_task(self._stopping.wait(), name="mqtt-stopping"),
         }
         if self._home_assistant is not None:
-            link = self._home_assistant.run(self._connection)
-            others.add(asyncio.create_task(link, name="mqtt-home-assistant"))
+            telling = self._tell_home_assistant(self._home_assistant)
+            others.add(asyncio.create_task(telling, name="mqtt-home-assistant"))
         try:
             await self._until_stopped(deliveries | others)
             await self._hand_over(deliveries, others, left_s)
@@ -147,6 +147,11 @@ class Session:
         self._counters.acknowledged += 1
         if self._home_assistant is not None:
             self._home_assistant.note(message)
+
+    async def _tell_home_assistant(self, link: HomeAssistantLink) -> None:
+        for message in await self._outbox.retained():
+            link.note(message)
+        await link.run(self._connection)
 
     async def _telemetry(self) -> None:
         delivery = TelemetryDelivery(

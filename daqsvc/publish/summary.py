@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the annotations
@@ -44,6 +43,17 @@ class SummaryPayload(Stamped):
     alarms: dict[str, StandingPayload]
 
 
+class _Told(BaseModel):
+    """What is read of an alarm's message."""
+
+    alarm: str
+    state: AlarmState
+    level: Severity
+    occurrence: str | None
+    time: str
+    message: str
+
+
 class Summary:
     """The alarms of a machine, as the messages that the broker has acknowledged tell them.
 
@@ -59,19 +69,22 @@ class Summary:
         self._alarms = {name: _untold() for name in alarms}
 
     def note(self, message: OutboxMessage) -> bool:
-        """Take in a message of the outbox; whether it has told something of an alarm of the machine."""
+        """Take in a message of the outbox; whether it has told something of an alarm of the machine.
+
+        Raises:
+            ValueError: it is on an alarm's topic and no alarm's message.
+        """
         if not message.topic.startswith(self._topics.alarm_prefix(self._machine)):
             return False
-        told = json.loads(message.payload)
-        state = AlarmState(told["state"])
-        problem: Literal["ON", "OFF"] = "OFF" if state in _GONE else "ON"
-        self._alarms[told["alarm"]] = StandingPayload(
-            problem=None if state in _HIDDEN else problem,
-            state=state,
-            level=told["level"],
-            occurrence=told["occurrence"],
-            time=told["time"],
-            message=told["message"],
+        told = _Told.model_validate_json(message.payload)
+        problem: Literal["ON", "OFF"] = "OFF" if told.state in _GONE else "ON"
+        self._alarms[told.alarm] = StandingPayload(
+            problem=None if told.state in _HIDDEN else problem,
+            state=told.state,
+            level=told.level,
+            occurrence=told.occurrence,
+            time=told.time,
+            message=told.message,
         )
         return True
 

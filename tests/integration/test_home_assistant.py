@@ -1,0 +1,181 @@
+"""A machine shows up in Home Assistant by itself: what is published, when, and what is taken away again."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from dataclasses import replace
+
+import pytest
+from brokers import Consumer, TcpProxy, eventually, running_mosquitto
+from home_assistant_rules import check_discovery, rendered
+from mqtt_publishing import CLOCK, publishing
+from test_mqtt_commands import say
+
+from daqsvc.outbox.store import Outbox
+from daqsvc.publish.settings import HomeAssistantSettings, Reading
+
+pytestmark = pytest.mark.mosquitto
+RIG = HomeAssistantSettings(
+    machine="rig",
+    alarms=("rotor-fault",),
+    services=("sensor-ok/probe-x",),
+    readings=(Reading("levels/probe-x", "statistics", "rms", "um"),),
+)
+CONFIG = "homeassistant/device/daqsvc_2flab_2fedge-1_2frig/config"
+SUMMARY = "daqsvc/lab/edge-1/rig/summary"
+
+
+@pytest.fixture
+async def outbox(tmp_path):
+    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
+    await outbox.open()
+    yield outbox
+    await outbox.close()
+
+
+@pytest.fixture
+def mosquitto(tmp_path):
+    with running_mosquitto(tmp_path) as broker:
+        yield broker
+
+
+def alarm(state, level, occurrence="o-1"):
+    told = {
+        "alarm": "rotor-fault",
+        "state": state,
+        "level": level,
+        "occurrence": occurrence,
+        "time": "2026-11-21T12:00:00.000000Z",
+        "message": f"rotor-fault {level}",
+    }
+    return lambda sequence: json.dumps(told | {"id": f"edge-1-{sequence}"}).encode()
+
+
+async def retained(port, topic):
+    """What a client that comes now is told."""
+    async with Consumer(port) as later:
+        await eventually(lambda: later.on("/availability"), "the retained state arrives")
+        return [message.payload for message in later.messages if message.topic == topic]
+
+
+def standing(live):
+    """The alarm in the latest summary."""
+    return live.on("/summary")[-1].payload["alarms"]["rotor-fault"]
+
+
+def entity(live, name):
+    """How Home Assistant would show one entity, after all that was published."""
+    discovery = [m.payload for m in live.messages if m.topic == CONFIG][-1]
+    (found,) = [e for e in discovery["components"].values() if e.get("unique_id", "").endswith(name)]
+    states = [m.payload for m in live.messages if m.topic == found["state_topic"]]
+    return rendered(found["value_template"], states[-1]) if states else None
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_alarms_show_up_and_follow(mosquitto, outbox, protocol):
+    async with (
+        Consumer(mosquitto.port) as live,
+        publishing(outbox, mosquitto.port, protocol, home_assistant=RIG) as publisher,
+    ):
+        await eventually(lambda: live.on("/summary"), "the machine is told")
+        (discovery,) = [m.payload for m in live.messages if m.topic == CONFIG]
+        check_discovery(CONFIG, discovery)
+        assert entity(live, "alarm/rotor-fault") == "OFF", "an alarm that was never raised is known as off"
+        assert entity(live, "level/rotor-fault") == "normal"
+        topic = publisher.topics.alarm("rig", "rotor-fault")
+        for state, level, shown in [
+            ("active_unacknowledged", "alert", "ON"),
+            ("active_acknowledged", "danger", "ON"),
+            ("suppressed", "danger", "None"),
+            ("latched_acknowledged", "danger", "ON"),
+            ("returned_unacknowledged", "alert", "OFF"),
+            ("normal", "normal", "OFF"),
+        ]:
+            await outbox.append(topic, alarm(state, level), retain=True)
+            await eventually(lambda: standing(live)["state"] == state, state)  # noqa: B023  awaited here
+            assert entity(live, "alarm/rotor-fault") == shown
+            assert entity(live, "level/rotor-fault") == level
+        publisher.telemetry(
+            "rig/diagnosis/levels/probe-x", json.dumps({"statistics": {"rms": 41.25}}).encode()
+        )
+        await eventually(lambda: live.on("/diagnosis/"), "the level arrives")
+        assert entity(live, "levels/probe-x/rms") == "41.25"
+        assert len(await retained(mosquitto.port, SUMMARY)) == 1
+
+
+async def test_a_restart_knows_how_the_alarms_stand_before_anything_happens(mosquitto, outbox):
+    async with publishing(outbox, mosquitto.port) as publisher:
+        topic = publisher.topics.alarm("rig", "rotor-fault")
+        await outbox.append(topic, alarm("active_acknowledged", "danger"), retain=True)
+        await eventually(lambda: outbox.counters.sent == 1, "the broker has it")
+    async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, home_assistant=RIG):
+        await eventually(lambda: live.on("/summary"), "the machine is told")
+        first = live.on("/summary")[0].payload["alarms"]["rotor-fault"]
+        assert (first["problem"], first["state"]) == ("ON", "active_acknowledged")
+
+
+async def test_discovery_is_told_again_at_reconnect_and_at_home_assistants_birth(
+    mosquitto, outbox, monkeypatch
+):
+    monkeypatch.setattr("daqsvc.publish.home_assistant_link.BIRTH_DELAY_S", 0.05)
+
+    async with (
+        Consumer(mosquitto.port, CONFIG) as live,
+        TcpProxy(mosquitto.port) as wire,
+        publishing(outbox, wire.port, home_assistant=RIG) as publisher,
+    ):
+        await eventually(lambda: len(live.messages) == 1, "the machine is told")
+        await asyncio.to_thread(say, mosquitto.port, "homeassistant/status", "online")
+        await eventually(lambda: len(live.messages) == 2, "it is told at the birth")
+        await asyncio.to_thread(say, mosquitto.port, "homeassistant/status", "offline")
+        wire.cut()
+        await eventually(lambda: publisher.counters.connections == 2, "connected again")
+        await eventually(lambda: len(live.messages) == 3, "it is told at the reconnect")
+
+
+async def test_what_the_machine_file_no_longer_has_disappears(mosquitto, outbox):
+    renamed = replace(RIG, alarms=("rotor-rub",))
+    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+        await eventually_told(mosquitto, "rotor-fault")
+    async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, home_assistant=renamed):
+        await eventually(lambda: any(not m.retained for m in live.on("/summary")), "the machine is told")
+        told = [m.payload["components"] for m in live.messages if m.topic == CONFIG and not m.retained]
+    removal, last = told
+    old = RIG.alarms[0]
+    gone = {name for name, entity in removal.items() if set(entity) == {"platform"}}
+    assert len(gone) == 2
+    assert all(old in name.replace("_2f", "/") for name in gone)
+    assert gone.isdisjoint(last)
+    assert set(removal) == gone | set(last)
+
+
+async def eventually_told(mosquitto, alarm):
+    async with Consumer(mosquitto.port, "homeassistant/#") as live:
+        await eventually(lambda: live.messages and alarm in str(live.messages[-1].payload), "it is told")
+
+
+async def test_switched_off_the_machine_is_taken_away(mosquitto, outbox):
+    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+        await eventually_told(mosquitto, "rotor-fault")
+    off = replace(RIG, enabled=False)
+    async with publishing(outbox, mosquitto.port, home_assistant=off) as publisher:
+        async with Consumer(mosquitto.port) as live:
+            await eventually(lambda: publisher.counters.connected, "connected")
+            await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
+            await eventually(lambda: live.on("/alarms/"), "alarms pass")
+        await eventually(lambda: mosquitto.log_text.count("Received PUBLISH") > 3, "it is taken away")
+        assert await retained(mosquitto.port, CONFIG) == []
+        assert await retained(mosquitto.port, SUMMARY) == []
+
+
+async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, outbox, caplog):
+    acl = "topic read #\ntopic write daqsvc/#\n"
+    directory = tmp_path / "strict"
+    directory.mkdir()
+    with running_mosquitto(directory, acl=acl) as strict:
+        async with publishing(outbox, strict.port, home_assistant=RIG) as publisher:
+            await eventually(lambda: "Home Assistant is not told of rig" in caplog.text, "it is said")
+            await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
+            await eventually(lambda: outbox.counters.sent == 1, "alarms pass")
+            assert publisher.counters.connections == 1
