@@ -60,6 +60,15 @@ class Consumer:
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
 
+    async def nap(self, duration_s: float) -> None:
+        """Go away for a while; the broker keeps the session and what comes in the meantime."""
+        self._client.disconnect()
+        await asyncio.to_thread(self._client.loop_stop)
+        await asyncio.sleep(duration_s)
+        await asyncio.to_thread(self._client.reconnect)
+        self._client.loop_start()
+        await self.is_listening()
+
     async def is_listening(self) -> None:
         """Wait until the broker has it as a subscriber."""
         until = time.monotonic() + PATIENCE_S
