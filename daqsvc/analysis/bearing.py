@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.analysis.bearing_checks import accelerometer_quality
+from daqsvc.analysis.bearing_checks import accelerometer_quality, with_repairs
 from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import DataQuality
@@ -88,7 +88,7 @@ def analyse_bearings(
         recording=str(recording.source),
         baseline=source,
         setup=setup,
-        quality=quality,
+        quality=with_repairs(quality, races),
         finding=find(races, change, setup.change.false_alarm_probability),
         races=races,
         unfit=unfit,

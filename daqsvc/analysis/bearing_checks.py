@@ -10,12 +10,13 @@ from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.quality import count_bad
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.analysis.quality import DataQuality
+    from daqsvc.bearing.race.verdict import RaceVerdict
 
     Floats = NDArray[np.float64]
 
@@ -46,4 +47,17 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
                 f"{name}: vibrates with {rms:.3g} {unit} r.m.s., which no housing does: the unit looks "
                 "wrong; correct --unit (g, m/s2 or V)"
             )
+    return quality
+
+
+def with_repairs(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> DataQuality:
+    """The same with what the race test found wrong with the samples and put right.
+
+    Args:
+        quality: what is known so far.
+        races: what each channel shows, of those that could be judged.
+    """
+    for name, race in races.items():
+        for repair in race.repairs:
+            quality = quality.with_problem(f"{name}: {repair}")
     return quality

@@ -176,7 +176,7 @@ class BearingAnalysis:
         seen = "by its harmonics" if race.speed_seen else "as stated: no harmonic of the shaft stands out"
         lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
         lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
-        lines += race.notes
+        lines += [note for note in race.notes if note not in race.repairs]  # those are problems of the data
         return "\n  ".join([*lines, *self.quality.problems])
 
     def _headline(self, finding: BearingFinding) -> str:
