@@ -89,15 +89,15 @@ def _gap_check(sensor: Sensor) -> GapCheck | None:
 
 
 def check_calibrations(machine: MachineFile) -> None:
-    """See whether the calibrations that a machine file names can be used.
+    """See whether the calibrations that a machine file names can be used, and its bearings are known.
 
     Raises:
-        AssemblyError: one cannot; the message names file, key, value and remedy.
+        AssemblyError: one cannot, or is not; the message names file, key, value and remedy.
     """
     pipeline = machine.pipeline
     if pipeline.rotor_synchronous is not None:
         _healthy_rotor(machine, pipeline.rotor_synchronous)
-    if pipeline.bearing is not None and pipeline.bearing.calibration is not None:
+    if pipeline.bearing is not None:
         _bearing(machine, None)
 
 

@@ -116,7 +116,7 @@ class BearingDetector:
         self._speed_rpm = abs(speed_rpm)
         self.rules = rules or ChangeRules()
         self._race = race or RaceRules()
-        self._keyphasor = keyphasor
+        self.keyphasor = keyphasor
         self._learning = HealthyGathering(self.bearings, rate_hz, calibrate_s)
         self._keep = keep
         self._watches, self._directions = self._new_watches(), self._new_directions()
@@ -239,10 +239,10 @@ class BearingDetector:
     def _follow_speed(self, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
         """Measure the speed; begin anew where it has changed. Yields what is against the look."""
         self._speed_unknown = False
-        if self._keyphasor is None:
+        if self.keyphasor is None:
             return
         try:
-            speed = measure_speed(samples[:, self._keyphasor.column], self._keyphasor, self._rate_hz)
+            speed = measure_speed(samples[:, self.keyphasor.column], self.keyphasor, self._rate_hz)
         except SpeedError as error:
             self._speed_unknown = True
             self._begin_anew()

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from bearing_signals import healthy
 from machine_files import MACHINES, changed, only_problem, problems_of
 
-from daqsvc import assembly
+from daqsvc import assembly, assembly_bearing
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_file import save_bearing_baseline
+from daqsvc.cli import main
 from daqsvc.diagnosis.bearing import BearingDetector
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe
 from daqsvc.settings import describe, parse_machine_file
 
 EXAMPLE = MACHINES / "bearing.toml"
@@ -155,6 +159,78 @@ def test_a_rate_too_low_for_the_rolling_elements_stops_it() -> None:
         detector(machine((TYPE, pair), ("rate_hz = 25_600.0", "rate_hz = 7_000.0")))
 
 
+def test_a_calibration_of_other_masses_or_without_the_pair_stops_it(right, tmp_path) -> None:
+    pair, path = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}', tmp_path / "motor.toml"
+    given = machine((TYPE, pair))
+    names, orders = ("accel-fe", "accel-de"), bearing_orders("6205")
+    samples = dict(zip(names, (healthy(8.0, seed, rate_hz=25_600.0) for seed in (1, 2)), strict=True))
+    bearings = {"accel-de": orders, "accel-fe": orders}
+    together = [names, ("accel-fe",)]
+    models = assembly_bearing.pair_models(given, given.pipeline.bearing)
+    learnt = learn_baseline(samples, 25_600.0, 1772.0, bearings, together, pairs=models)
+    named = ("calibrate_s = 30.0", f'calibration = "{path}"')
+    save_bearing_baseline(learnt, path)
+    kept = detector(machine((TYPE, pair), named)).baseline.pairs[names]
+    assert kept.parameters == models[names].parameters
+    np.testing.assert_array_equal(kept.detection.covariance, learnt.pairs[names].detection.covariance)
+    with pytest.raises(assembly.AssemblyError, match="learnt with other masses, springs or dampers"):
+        detector(machine((TYPE, pair.replace("1e8", "1.1e8")), named))
+    save_bearing_baseline(replace(learnt, pairs={}), path)
+    with pytest.raises(assembly.AssemblyError, match="holds nothing of accel-fe and accel-de together"):
+        detector(machine((TYPE, pair), named))
+
+
+KEYPHASOR = """
+[[sensors]]
+name = "key"
+type = "keyphasor"
+stream = "housing"
+channel = "fe"
+unit = "V"
+threshold_v = -6.0
+edge = "falling"
+"""
+FAN_END = (
+    '[[sensors]]\nname = "accel-fe"\ntype = "accelerometer"\nstream = "housing"\nchannel = "fe"\nunit = "g"\n'
+)
+
+
+def with_keyphasor(*replacements):
+    """One bearing, and a keyphasor on the other channel."""
+    text = changed(EXAMPLE, (FAN_END, KEYPHASOR), ("calibrate_s", 'keyphasor = "key"\ncalibrate_s'))[0]
+    second = text.index("[[pipeline.bearing.bearings]]", text.index("[[pipeline.bearing.bearings]]") + 1)
+    text = text[:second] + text[text.index("[[alarms]]") :]
+    for old, new in replacements:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def test_a_keyphasor_is_taken_up() -> None:
+    made = detector(parse_machine_file(with_keyphasor(), EXAMPLE))
+    assert made.keyphasor == KeyphasorProbe("key", 1, -6.0, 0.5, "falling")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("kay", "there is no such sensor"), ("accel-de", 'must be a sensor of type "keyphasor"')],
+)
+def test_a_speed_sensor_that_is_none_is_refused(name, message) -> None:
+    problems = problems_of(with_keyphasor(('keyphasor = "key"', f'keyphasor = "{name}"')), EXAMPLE)
+    assert [p.message for p in problems if p.key == "pipeline.bearing.keyphasor"] == [message]
+
+
+def test_check_refuses_a_bearing_that_nobody_knows_with_near_names(tmp_path, capsys) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(changed(EXAMPLE, (TYPE, 'type = "6206-XX"'))[0])
+    assert main(["check", str(path)]) != 0
+    said = capsys.readouterr().err
+    assert (
+        "pipeline.bearing.bearings[0].type: bearing '6206-XX' is not in the catalogue; near names: " in said
+    )
+    assert "6206" in said.split("near names: ")[1]
+
+
 def test_an_alarm_follows_it_only_if_it_is_there() -> None:
     problem, _ = only_problem(ROTOR, ('detector = "rotor-synchronous"', 'detector = "bearing"'))
     assert "not configured" in problem.message
@@ -197,7 +273,8 @@ def test_a_calibration_that_fits_is_taken(right, tmp_path) -> None:
 def test_a_calibration_that_does_not_fit_stops_it(tmp_path, rate_hz, speed_rpm, sensors, said) -> None:
     path = tmp_path / "motor.toml"
     save_bearing_baseline(baseline(rate_hz, speed_rpm, *sensors), path)
-    with pytest.raises(assembly.AssemblyError, match=said):
+    key = rf"pipeline\.bearing\.calibration = '.*motor\.toml': .*{said}"
+    with pytest.raises(assembly.AssemblyError, match=key):
         detector(machine(("calibrate_s = 30.0", f'calibration = "{path}"')))
 
 
