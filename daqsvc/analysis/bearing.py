@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.analysis.bearing_checks import accelerometer_quality, with_repairs
+from daqsvc.analysis.bearing_inputs import meant_in_hz, stated_speed_problem, unit_problems
 from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import DataQuality
@@ -49,6 +50,8 @@ def analyse_bearings(
     """
     samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
     quality = accelerometer_quality(recording.names, recording.samples, setup.unit)
+    for problem in (stated_speed_problem(recording, setup.speed_rpm), *unit_problems(recording, setup.unit)):
+        quality = quality.with_problem(problem) if problem else quality
     source = None if baseline is None else baseline.source
     races: dict[str, RaceVerdict] = {}
     unfit: dict[str, str] = {}
@@ -75,6 +78,8 @@ def analyse_bearings(
             unfit=unfit,
         )
 
+    if not any(race.speed_seen for race in races.values()) and (wrong := meant_in_hz(recording, setup)):
+        return refuse(wrong)
     if not races:
         return refuse("; ".join(f"{name}: {why}" for name, why in unfit.items()))
     healthy = None if baseline is None else baseline.residuals[tuple(races)]
@@ -153,9 +158,33 @@ class BearingAnalyst:
                 refused=str(error),
             )
         else:
-            analysis = analyse_bearings(loaded, self.setup, baseline)
+            analysis = self._analyse(loaded, baseline)
             if figures is not None and analysis.races:
                 from daqsvc.analysis.bearing_plots import draw_envelopes  # noqa: PLC0415 - brings matplotlib
 
                 draw_envelopes(analysis, figures)
         return Outcome(analysis.as_json(), analysis.describe(), analysis.refused is not None)
+
+    def _analyse(self, recording: Recording, baseline: BearingBaseline | None) -> BearingAnalysis:
+        """Judge against the healthy run, unless that is none: it must not hide anything."""
+        if self.healthy is None:
+            return analyse_bearings(recording, self.setup)
+        source = self.healthy.recording.source
+        damage, doubt = self.healthy.against
+        if damage:
+            alone = analyse_bearings(recording, self.setup)
+            return alone.with_problem(
+                f"the healthy run {source} is not used: {damage}; give one of the machine in good order"
+            )
+        analysis = analyse_bearings(recording, self.setup, baseline)
+        if not doubt:
+            return analysis
+        if analysis.leading is not None and analysis.leading.speed_seen:
+            alone = analyse_bearings(recording, self.setup)
+            return alone.with_problem(
+                f"the healthy run {source} is not used: {doubt}, as those of the recording do; correct "
+                "--baseline-fs, or give one at this speed"
+            )
+        return analysis.with_problem(
+            f"the healthy run {source}: {doubt}; see whether its rate and speed are right"
+        )

@@ -11,15 +11,16 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.analysis.bearing_checks import accelerometer_quality
 from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.bearing_setup import BearingSetup
-from daqsvc.analysis.statements import Statements, listen
+from daqsvc.analysis.statements import Statements
 from daqsvc.assembly_bearing import bearing_detector, orders_of
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import load_bearing_baseline
 from daqsvc.diagnosis.bearing_finding import BearingFinding
 from daqsvc.diagnosis.bearing_standing import UNDETERMINED
+from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.bearing.race.verdict import RaceWord
     from daqsvc.diagnosis.bearing import BearingDetector
+    from daqsvc.diagnosis.bearing_look import Look
+    from daqsvc.diagnosis.bearing_standing import Standing
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import Bearing, MachineFile
@@ -107,19 +110,44 @@ def analyse_machine_bearings(
         ValueError: a bearing is not known, or the calibration cannot be used.
     """
     detector = bearing_detector(machine, None, calibration)
-    said = list(listen(detector, samples, recording.rate_hz, progress))
+    said: list[Diagnosis] = []
+    looks: list[Look] = []
+    for statements in _watch(detector, samples, recording.rate_hz, progress):
+        said += statements
+        if detector.seen is not None and (not looks or detector.seen is not looks[-1]):
+            looks.append(detector.seen)
+    everything = Statements(detector.name, tuple(said), recording.rate_hz)
+    return MachineBearings(_analysis(machine, recording, detector, said, looks), everything)
+
+
+def _watch(
+    detector: BearingDetector,
+    samples: Floats,
+    rate_hz: float,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[Sequence[Diagnosis]]:
+    """Have the detector see a recording block by block, so that no look is missed; what it says each time."""
+    period_ns = NS_PER_S / rate_hz
     whole = len(samples) // detector.block * detector.block
-    end_ns = round((len(samples) - 1) * NS_PER_S / recording.rate_hz)
-    if (last := detector.finish(samples[whole:].astype(np.float32), end_ns)) is not None:
-        said.append(last)
-    statements = Statements(detector.name, tuple(said), recording.rate_hz)
-    return MachineBearings(_analysis(machine, recording, detector, said), statements)
+    for begin in range(0, whole, detector.block):
+        end = begin + detector.block
+        window = Window(begin, samples[begin:end].astype(np.float32), round((end - 1) * period_ns), period_ns)
+        yield detector.process(window)
+        if progress is not None:
+            progress(end, len(samples))
+    last = detector.finish(samples[whole:].astype(np.float32), round((len(samples) - 1) * period_ns))
+    if last is not None:
+        yield [last]
 
 
 def _analysis(
-    machine: MachineFile, recording: Recording, detector: BearingDetector, said: list[Diagnosis]
+    machine: MachineFile,
+    recording: Recording,
+    detector: BearingDetector,
+    said: list[Diagnosis],
+    looks: list[Look],
 ) -> BearingAnalysis:
-    """What the detector stands by at the end."""
+    """What the detector stands by at the end, with the figures of the look that shows it most."""
     setup = _setup(machine, detector)
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
     quality = accelerometer_quality(setup.channels, recording.samples[:, columns], setup.unit)
@@ -133,7 +161,8 @@ def _analysis(
         setup=setup,
         quality=quality,
     )
-    look, standing = detector.seen, detector.standing
+    standing = detector.standing
+    look = _decisive(looks, standing)
     if len(poor) > len(good):
         return replace(analysis, refused=poor[-1].reason)
     if look is None or look.finding is None or standing.decision == UNDETERMINED:
@@ -165,6 +194,21 @@ def _analysis(
         healthy=healthy,
         change=look.change,
     )
+
+
+def _decisive(looks: list[Look], standing: Standing) -> Look | None:
+    """The look that a standing verdict rests on: the strongest that found the same, or else the last."""
+    same = [
+        look
+        for look in looks
+        if look.finding is not None
+        and (look.finding.verdict, look.finding.where) == (standing.decision, standing.where)
+    ]
+    if not same:
+        return looks[-1] if looks else None
+    if standing.decision == "changed":
+        return max(same, key=lambda look: 0.0 if look.change is None else look.change.departure)
+    return max(same, key=lambda look: 0.0 if look.finding is None else look.finding.severity)
 
 
 def _setup(machine: MachineFile, detector: BearingDetector) -> BearingSetup:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.analysis.result import finite
@@ -48,6 +48,10 @@ class BearingAnalysis:
     unfit: Mapping[str, str] = field(default_factory=dict)
     healthy: HealthyResidual | None = None
     change: ResidualChange | None = None
+
+    def with_problem(self, problem: str) -> BearingAnalysis:
+        """The same with one more problem of data quality."""
+        return replace(self, quality=self.quality.with_problem(problem))
 
     @property
     def leading(self) -> RaceVerdict | None:
@@ -173,7 +177,7 @@ class BearingAnalysis:
                 f"what it was ({change.rise_db[0]:+.1f} dB, limit {change.limit_db[0]:.1f} dB; largest rise "
                 f"of a band {change.rise_db[1:].max():+.1f} dB)"
             )
-        seen = "by its harmonics" if race.speed_seen else "as stated: no harmonic of the shaft stands out"
+        seen = "by its harmonics" if race.speed_seen else "not confirmed by its harmonics"
         lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
         lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
         lines += [note for note in race.notes if note not in race.repairs]  # those are problems of the data

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.analysis.bearing_inputs import against_healthy_run
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_baseline import BearingBaseline, learn_baseline, resampled
 from daqsvc.bearing.identify_change import ChangeRules
@@ -16,7 +17,7 @@ from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -105,22 +106,36 @@ class BearingSetup:
 
 
 def _found(path: str, wanted: Mapping[str, str]) -> dict[str, str]:
-    """Channels of a file by name, by a pattern, or by what only one of its names ends with.
+    """Channels of a file by name, by a pattern, or by what only one of its names ends with."""
+    there = list_channels(path)
+    return {name: matching(path, variable, there) for name, variable in wanted.items()}
+
+
+def matching(path: str, variable: str, there: Iterable[str]) -> str:
+    """The channel of a file that a name means, or a pattern, or what only one of the names there ends with.
 
     Sets of recordings often number their variables: ``DE_time`` is ``X105_DE_time`` in one file and
     ``X106_DE_time`` in the next.
+
+    Args:
+        path: the file.
+        variable: what is meant.
+        there: the channels of the file.
+
+    Returns:
+        The channel; ``variable`` itself if there is none.
+
+    Raises:
+        RecordingError: several may be meant.
     """
-    there = list_channels(path)
-    found = {}
-    for name, variable in wanted.items():
-        matches = [one for one in there if one.endswith(variable) or fnmatch.fnmatchcase(one, variable)]
-        if variable not in there and len(matches) > 1:
-            raise RecordingError(
-                f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; "
-                "name one of them"
-            )
-        found[name] = matches[0] if matches and variable not in there else variable
-    return found
+    matches = [one for one in there if one.endswith(variable) or fnmatch.fnmatchcase(one, variable)]
+    if not matches or variable in matches:
+        return variable
+    if len(matches) > 1:
+        raise RecordingError(
+            f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; name one of them"
+        )
+    return matches[0]
 
 
 @dataclass(slots=True)
@@ -135,6 +150,14 @@ class HealthyRun:
     setup: BearingSetup
     recording: Recording
     _learnt: dict[float, BearingBaseline] = field(default_factory=dict)
+    _against: tuple[str, str] | None = None
+
+    @property
+    def against(self) -> tuple[str, str]:
+        """What speaks against it as a healthy run, see `against_healthy_run`."""
+        if self._against is None:
+            self._against = against_healthy_run(self.recording, self.setup)
+        return self._against
 
     def at(self, rate_hz: float) -> BearingBaseline:
         """The healthy machine at a sampling rate.

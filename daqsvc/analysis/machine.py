@@ -11,6 +11,7 @@ import numpy as np
 from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
 from daqsvc.analysis.bearing_machine import analyse_machine_bearings, check_bearings, present
+from daqsvc.analysis.bearing_setup import matching
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
@@ -146,7 +147,7 @@ class MachineAnalyst:
         for sensor in machine.sensors:
             mapped = self.channels.get(sensor.name, self.channels.get(sensor.channel))
             if mapped is not None:
-                found[sensor.name] = mapped
+                found[sensor.name] = matching(recording, mapped, there)
             elif sensor.name in there:
                 found[sensor.name] = sensor.name
             elif sensor.channel in there:

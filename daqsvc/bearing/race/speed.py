@@ -119,11 +119,11 @@ def shaft_rate(
     beside = scan.best(np.abs(scan.share - 1.0) <= NEAR)
     if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
         rate_hz, sharp = beside, True
+    scan.refuse_other(rate_hz)
     doubt = scan.doubt(rate_hz)
     # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
     if wrong is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
         raise RaceInputError("shaft speed or sample rate", f"is wrong: {wrong}", REMEDY) from wrong
-    scan.refuse_other(rate_hz)
     return ShaftRate(rate_hz, not doubt, sharp, doubt, scan)
 
 
