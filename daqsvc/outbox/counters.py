@@ -13,9 +13,9 @@ class TelemetryCounters:
         accepted: messages taken in.
         sent: messages that the broker has taken.
         depth: messages kept for the broker.
-        dropped_full: the oldest ones, dropped because the limit in bytes was reached or the disk nearly full.
+        dropped_full: the oldest ones, dropped because the limit in bytes was reached.
         dropped_old: messages dropped because they were too old.
-        dropped_disk: messages that a broken or unwritable file cost, as far as they could be counted.
+        dropped_disk: messages that a nearly full disk or a broken file cost, as far as they could be counted.
         write_errors: transactions that failed.
         quarantined: corrupt files set aside.
         in_memory: 1 while the file cannot be used and telemetry is kept in memory, else 0.

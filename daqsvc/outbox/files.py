@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import sqlite3
@@ -24,6 +25,8 @@ WAL_MAX_BYTES = 8 * 1024 * 1024
 
 ASIDE_KEPT = 3
 """Corrupt files that are kept; a failing disk must not fill itself with them."""
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 
 NS_PER_MS = 1_000_000
 
@@ -168,7 +171,7 @@ def is_corrupt(error: Exception) -> bool:
 
 def is_full(error: Exception) -> bool:
     """Whether an error says that there is no room left on the disk."""
-    return _primary_code(error) == sqlite3.SQLITE_FULL
+    return _primary_code(error) == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in _NO_ROOM
 
 
 def corruption(verdict: str) -> sqlite3.DatabaseError:

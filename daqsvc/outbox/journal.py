@@ -7,6 +7,7 @@ import logging
 import sqlite3
 from typing import TYPE_CHECKING
 
+from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
     connect,
     corruption,
@@ -96,6 +97,9 @@ class Journal:
         self._mark = SequenceMark(path.with_name(path.name + ".sequence"))
         self._wall_ns = wall_ns
         self._limits = limits
+        self._ballast = Ballast(
+            path.with_name(path.name + ".ballast"), limits.ballast_bytes, limits.reserve_bytes
+        )
         self._connection: sqlite3.Connection | None = None
         self._lock: BinaryIO | None = None
         self._next = 0
@@ -135,6 +139,7 @@ class Journal:
                     raise
                 self.quarantine(error)
             self._tidy()
+            self._ballast.take()
         except (OSError, sqlite3.Error) as error:
             raise self._unusable(error) from error
 
@@ -270,31 +275,38 @@ class Journal:
                 "UPDATE messages SET sent = 1 WHERE sequence = ? AND NOT sent", [(s,) for s in sent]
             ).rowcount
             self._sent_since_trim += max(marked, 0)
-            if self._sent_since_trim >= TRIM_EVERY:
+            trims = self._sent_since_trim >= TRIM_EVERY
+            if trims:
                 self._trim(connection)
+        if trims:
+            self._ballast.take()
         if rows:
             self._next = sequence
             self._mark.note(sequence - 1)
         return outcomes, max(marked, 0)
 
-    def make_room(self) -> int:
-        """Delete, on a full disk, messages that the broker has: their room takes what comes.
+    def make_room(self) -> bool:
+        """Make room on a full disk: throw the ballast off, or delete messages that the broker has.
 
         Returns:
-            How many were deleted.
+            Whether there was something to gain.
 
         Raises:
             sqlite3.Error: not even that is possible.
         """
+        if self._ballast.throw_off():
+            log.warning("outbox %s: the disk is full; the room that was held for this is in use", self.path)
+            return True
         connection = self._open_connection()
         with _transaction(connection):
-            return connection.execute(
+            deleted = connection.execute(
                 f"""
                 DELETE FROM messages WHERE sequence IN
                 (SELECT sequence FROM messages WHERE sent AND sequence NOT IN ({_IS_LATEST})
                  ORDER BY sequence LIMIT {TRIM_EVERY})
                 """  # noqa: S608  constants only
             ).rowcount
+        return deleted > 0
 
     def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that are not sent, in order, at most ``limit``."""

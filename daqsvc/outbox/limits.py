@@ -23,6 +23,7 @@ class OutboxLimits:
         telemetry_max_bytes: size of the telemetry's file from which on the oldest messages are dropped.
         telemetry_max_age_ns: age from which on a telemetry message is dropped.
         reserve_bytes: free space that telemetry leaves on the disk to the alarms.
+        ballast_bytes: room on the disk that is held for alarms on a full one (see `outbox.ballast`).
     """
 
     alarms_max_bytes: int = 256 * MIB
@@ -32,3 +33,4 @@ class OutboxLimits:
     telemetry_max_bytes: int = 64 * MIB
     telemetry_max_age_ns: int = NS_PER_DAY
     reserve_bytes: int = 64 * MIB
+    ballast_bytes: int = 16 * MIB

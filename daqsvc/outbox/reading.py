@@ -12,6 +12,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 JOURNAL_NAME = "outbox.sqlite"
 """What the service calls the journal in its store."""
+
+ATTEMPTS, RETRY_S = 4, 0.05
 
 _COLUMNS = "sequence, topic, payload, retain, sent, wall_ns, checksum"
 
@@ -81,9 +84,7 @@ def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -
     """
     path = store / JOURNAL_NAME
     try:
-        with _opened(path) as connection:
-            connection.execute("BEGIN")  # all that follows tells of one moment
-            return _view(path, connection, history, topic)
+        return _read(path, history, topic)
     except FileNotFoundError:
         raise OutboxError(
             f"there is no journal {path}: the service has not run with this store yet, or keeps it "
@@ -97,6 +98,23 @@ def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -
         raise OutboxError(
             f"the journal {path} cannot be read: {error}; the service sets a corrupt one aside when it starts"
         ) from error
+
+
+def _read(path: Path, history: int, topic: str | None) -> JournalView:
+    """Read; again, if the service comes or goes meanwhile and takes the write-ahead log with it."""
+    for _ in range(ATTEMPTS - 1):
+        try:
+            return _read_once(path, history, topic)
+        except (sqlite3.Error, FileNotFoundError):
+            path.stat()
+            time.sleep(RETRY_S)
+    return _read_once(path, history, topic)
+
+
+def _read_once(path: Path, history: int, topic: str | None) -> JournalView:
+    with _opened(path) as connection:
+        connection.execute("BEGIN")  # all that follows tells of one moment
+        return _view(path, connection, history, topic)
 
 
 def _view(path: Path, connection: sqlite3.Connection, history: int, topic: str | None) -> JournalView:

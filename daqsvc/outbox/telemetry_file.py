@@ -175,30 +175,29 @@ class TelemetryFile:
         self._counters.depth += len(rows) - taken - old - too_many
 
     def _drop_oldest(self, connection: sqlite3.Connection) -> int:
-        allowed, nearly_full = self._allowed_bytes(connection)
+        allowed = self._allowed_bytes(connection)
         dropped = 0
         while used_bytes(connection) > allowed:
             rows = connection.execute(_DROP_OLDEST, (DROP_AT_ONCE,)).rowcount
             if not rows:
                 break
             dropped += rows
-        if dropped and nearly_full:
-            connection.execute("PRAGMA incremental_vacuum").fetchall()
         return dropped
 
-    def _allowed_bytes(self, connection: sqlite3.Connection) -> tuple[int, bool]:
-        """The limit of the moment, and whether it is the disk that sets it.
+    def _allowed_bytes(self, connection: sqlite3.Connection) -> int:
+        """The limit of the moment.
 
         Raises:
-            sqlite3.OperationalError: there is no room for a file at all.
+            sqlite3.OperationalError: the disk is nearly full. To make the file smaller would take room
+                first, so it has to go.
         """
         if self._is_in_memory():
-            return MEMORY_BYTES, False
+            return MEMORY_BYTES
         spare = free_bytes(self._path.parent) - self._limits.reserve_bytes
-        room = pragma(connection, "page_count") * pragma(connection, "page_size") + spare
-        if room < SMALLEST_BYTES:
+        if spare < 0:
             raise sqlite3.OperationalError("the disk is nearly full")
-        return min(self._limits.telemetry_max_bytes, room), room < self._limits.telemetry_max_bytes
+        file_bytes = pragma(connection, "page_count") * pragma(connection, "page_size")
+        return min(self._limits.telemetry_max_bytes, file_bytes + spare)
 
     def _pending(self, after: int, limit: int) -> list[TelemetryMessage]:
         rows = self._open_connection().execute(

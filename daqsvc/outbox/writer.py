@@ -31,8 +31,8 @@ MARK_LINGER_S = 0.05
 
 RETRY_FIRST_S, RETRY_MOST_S = 0.1, 5.0
 
-COMMIT_AT_MOST = 2000
-"""Messages in one transaction, so that neither memory nor the write-ahead log grows with the backlog."""
+COMMIT_AT_MOST = 500
+"""Messages, and marks, in one transaction, so that the write-ahead log does not grow with the backlog."""
 
 READ_FAILURES_MAX = 3
 """Reads in a row that may fail before the file is given up as if it were corrupt."""
@@ -229,10 +229,10 @@ class JournalWriter:
         return failure
 
     def _commit(self, batch: Batch, post: _Post) -> None:
-        now = batch.drafts[:COMMIT_AT_MOST]
-        outcomes, marked = self._journal.commit([draft for draft, _ in now], batch.sent)
+        now, sent = batch.drafts[:COMMIT_AT_MOST], batch.sent[:COMMIT_AT_MOST]
+        outcomes, marked = self._journal.commit([draft for draft, _ in now], sent)
         settled = [(done, outcome) for (_, done), outcome in zip(now, outcomes, strict=True)]
-        batch.drafts, batch.sent = batch.drafts[COMMIT_AT_MOST:], []
+        batch.drafts, batch.sent = batch.drafts[COMMIT_AT_MOST:], batch.sent[COMMIT_AT_MOST:]
         post(self._reports.committed, settled, marked, self._journal.last_sequence)
 
     def _recover(self, error: Exception, post: _Post, *, give_up: bool) -> bool:
@@ -247,7 +247,7 @@ class JournalWriter:
                 post(self._reports.replaced, self._journal.unsent())
                 return True
             if is_full(error):
-                return self._journal.make_room() > 0
+                return self._journal.make_room()
         except (sqlite3.Error, OSError) as again:
             if not is_full(again):
                 log.error("outbox %s cannot be recovered: %s", self._journal.path, again)  # noqa: TRY400
