@@ -66,7 +66,8 @@ def present(given: Bearing | None, sensors: tuple[str, ...]) -> Bearing | None:
         for bearing in given.bearings
         if bearing.sensor in sensors
     )
-    return given.model_copy(update={"bearings": bearings}) if bearings else None
+    keyphasor = given.keyphasor if given.keyphasor in sensors else None
+    return given.model_copy(update={"bearings": bearings, "keyphasor": keyphasor}) if bearings else None
 
 
 def check_bearings(machine: MachineFile, calibration: Path | None) -> None:
@@ -222,5 +223,7 @@ def _setup(machine: MachineFile, detector: BearingDetector) -> BearingSetup:
         bearings={bearing.name: bearing.orders for bearing in detector.bearings},
         designations={bearing.name: bearing.type for bearing in given.bearings if bearing.type is not None},
         unit=cast("AccelerationUnit", unit),
-        change=ChangeRules(false_alarm_probability=given.false_alarm_probability),
+        change=ChangeRules(
+            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+        ),
     )
