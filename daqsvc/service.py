@@ -17,7 +17,6 @@ from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_mqtt import mqtt_settings
 from daqsvc.assembly_store import outbox_limits
-from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
@@ -116,6 +115,7 @@ class Service:
             store,
             self.clock,
             mqtt_settings(machine),
+            handling=alarm_handling(machine),
             limits=outbox_limits(machine),
         )
         self.control = ControlServer(store, machine.machine.name, self.desk.obey)

@@ -285,21 +285,29 @@ alert = 0.5
 latching = true
 """
 
+ALLOWED = """
+[mqtt.commands]
+enabled = true
+allow = ["acknowledge", "reset", "shelve"]
+
+[alarm_handling]
+shelve_at_most_s = 60
+"""
+
 
 @pytest.mark.mosquitto
 async def test_commands_over_mqtt_reach_the_alarms_and_the_audit_log(tmp_path: Path) -> None:
     with running_mosquitto(tmp_path) as broker:
         async with CanGateway() as gateway, Consumer(broker.port) as consumer:
             gateway.rms_g = 1.0
-            allowed = '[mqtt.commands]\nenabled = true\nallow = ["acknowledge", "reset"]\n'
-            text = MACHINE.format(gateway=gateway.port, broker=broker.port, alarms=ALARMS) + allowed
+            text = MACHINE.format(gateway=gateway.port, broker=broker.port, alarms=ALARMS) + ALLOWED
             machine = parse_machine_file(text, tmp_path / "motor.toml")
             base = "daqsvc/lab/edge-1/motor/commands"
 
-            async def ask(verb: str, alarm: str, identifier: str) -> dict[str, Any]:
+            async def ask(verb: str, alarm: str, identifier: str, **keys: Any) -> dict[str, Any]:
                 issued = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
                 told = {"schema": "daqsvc.command/1", "id": identifier, "alarm": alarm, "by": "ann"}
-                payload = json.dumps(told | {"issued_at": issued})
+                payload = json.dumps(told | {"issued_at": issued} | keys)
                 consumer._client.publish(f"{base}/{verb}", payload, qos=1)
 
                 def answers() -> list[dict[str, Any]]:
@@ -319,11 +327,14 @@ async def test_commands_over_mqtt_reach_the_alarms_and_the_audit_log(tmp_path: P
                 await eventually(lambda: len(consumer.on("/alarms/shaking")) == 2, "the event arrives")
                 assert [consumer.on("/alarms/shaking")[-1].payload["id"]] == acknowledged["events"]
                 assert not (await ask("acknowledge", "none", "c3"))["accepted"]
-                assert not (await ask("shelve", "shaking", "c4"))["accepted"]
-                assert (service.desk.commands.accepted, service.desk.commands.refused) == (1, 2)
+                too_long = await ask("shelve", "shaking", "c4", duration_s=61)
+                assert "state a time above 0 and up to 60 s" in too_long["reason"]
+                assert not (await ask("bypass", "shaking", "c5"))["accepted"]
+                assert (service.desk.commands.accepted, service.desk.commands.refused) == (1, 3)
     told = [(line["source"], line["verb"], line["outcome"]) for line in log(tmp_path / "store")][1::2]
     assert told == [
         (f"mqtt {base}/reset", "reset", "refused"),
         (f"mqtt {base}/acknowledge", "acknowledge", "accepted"),
         (f"mqtt {base}/acknowledge", "acknowledge", "refused"),
+        (f"mqtt {base}/shelve", "shelve", "refused"),
     ], "what is not allowed over MQTT never comes to the desk"
