@@ -238,10 +238,9 @@ class Alarm:
             request: who asks.
             nothing: stands in for the cause of an alarm that has never been judged.
         """
-        minutes = (until_ns - request.at.t_ns) / 60e9
         before = self._cover(Hold.SHELVED)
         self._shelved_until_ns = until_ns
-        message = f"{self.name} shelved for {minutes:.4g} min{_signed(request)}"
+        message = f"{self.name} shelved{_signed(request, f' for {_lasting(until_ns - request.at.t_ns)}')}"
         return self._event(EventKind.SHELVED, self._cause or nothing, request, message, before)
 
     def unshelve(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
@@ -387,7 +386,14 @@ class Alarm:
         )
 
 
-def _signed(request: Request) -> str:
-    """Who asked and why, as the end of a sentence."""
+def _signed(request: Request, lasting: str = "") -> str:
+    """Who asked, for how long, and why, as the end of a sentence."""
     by = f" by {request.by}" if request.by else ""
-    return by + (f": {request.reason}" if request.reason else "")
+    return by + lasting + (f": {request.reason}" if request.reason else "")
+
+
+def _lasting(duration_ns: int) -> str:
+    """A duration for a person, in its largest unit."""
+    seconds = duration_ns / 1e9
+    size, unit = next((s, u) for s, u in ((3600.0, "h"), (60.0, "min"), (0.0, "s")) if seconds >= s)
+    return f"{seconds / (size or 1.0):.4g} {unit}"

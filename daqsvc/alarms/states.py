@@ -9,10 +9,11 @@ it is lifted, a latched alarm is still latched and an unacknowledged one still w
 from __future__ import annotations
 
 from enum import Enum, IntEnum, StrEnum
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     from daqsvc.diagnosis.record import Severity
 
@@ -132,6 +133,11 @@ _LATCHING_MOVES: _Moves = _MOVES | {
 }
 
 
+def moves(*, latching: bool) -> Mapping[tuple[AlarmState, Stimulus], AlarmState]:
+    """Every move of an alarm's own state; whatever is not in it moves nothing."""
+    return MappingProxyType(_LATCHING_MOVES if latching else _MOVES)
+
+
 def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> AlarmState:
     """The state after a stimulus.
 
@@ -145,8 +151,7 @@ def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> Alar
     Raises:
         RefusedError: a person's acknowledgement or reset that the state does not allow.
     """
-    moves = _LATCHING_MOVES if latching else _MOVES
-    after = moves.get((state, stimulus))
+    after = moves(latching=latching).get((state, stimulus))
     if after is not None:
         return after
     if stimulus is Stimulus.ACKNOWLEDGE:

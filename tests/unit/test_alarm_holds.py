@@ -23,7 +23,7 @@ def test_a_shelved_alarm_goes_on_behind_its_cover_and_reappears_when_its_time_is
     rig.rms(50.0)
     shelved = rig.shelve("vibration-x", 60.0, reason="bearing is ordered")
     assert (shelved.from_state, shelved.to_state) == (S.ACTIVE_UNACKNOWLEDGED, S.SHELVED)
-    assert shelved.message == "vibration-x shelved for 1 min by ann: bearing is ordered"
+    assert shelved.message == "vibration-x shelved by ann for 1 min: bearing is ordered"
     assert (shelved.by, shelved.reason) == ("ann", "bearing is ordered")
     assert shelved.shelved_until_wall_ns == shelved.wall_ns + 60_000_000_000
     (escalated,) = rig.rms(70.0)
