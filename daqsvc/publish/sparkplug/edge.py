@@ -27,6 +27,7 @@ from daqsvc.publish.sparkplug.metrics import (
     declared,
     diagnosis_metrics,
     node_properties,
+    quiet_alarm,
 )
 from daqsvc.publish.sparkplug.node import EdgeNode
 from daqsvc.publish.sparkplug.session import EdgeSession, HostAwayError, SparkplugCounters
@@ -81,6 +82,8 @@ class SparkplugEdge:
         self._memory = Memory(settings.memory)
         self._board = Board()
         self._board.put(None, node_properties(daqsvc.__version__, topics.site, topics.box))
+        for alarm in settings.alarms:
+            self._board.put(None, quiet_alarm(settings.device, alarm))
         self._board.put(settings.device, declared(settings.readings))
         self._watched = {reading.detector for reading in settings.readings}
         self._there = True

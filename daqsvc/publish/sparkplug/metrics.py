@@ -68,24 +68,32 @@ def alarm_metrics(payload: bytes) -> list[Metric]:
         ValueError: it is no alarm payload.
     """
     told = AlarmPayload.model_validate_json(payload)
-    state = AlarmState(told.state)
+    state, level = AlarmState(told.state), Level.of(told.level)
+    words = (told.message, told.occurrence, told.id)
+    return _alarm(f"{told.machine}/{told.alarm}", state, level, words, told.wall_ns // NS_PER_MS)
+
+
+def quiet_alarm(machine: str, alarm: str) -> list[Metric]:
+    """The metrics of an alarm that has never been raised."""
+    return _alarm(f"{machine}/{alarm}", AlarmState.NORMAL, Level.NORMAL, ("", None, None), None)
+
+
+def _alarm(
+    name: str, state: AlarmState, level: Level, words: tuple[str, str | None, str | None], at_ms: int | None
+) -> list[Metric]:
+    message, occurrence, event = words
     values: list[tuple[str, DataType, bool | int | str | None]] = [
         ("State", DataType.STRING, state.value),
-        ("Level", DataType.INT32, int(Level.of(told.level))),
+        ("Level", DataType.INT32, int(level)),
         ("Active", DataType.BOOLEAN, state.is_active),
         ("Acknowledged", DataType.BOOLEAN, state in _ACKNOWLEDGED),
-        ("Message", DataType.STRING, told.message),
-        ("Occurrence", DataType.STRING, told.occurrence),
-        ("Event", DataType.STRING, told.id),
+        ("Message", DataType.STRING, message),
+        ("Occurrence", DataType.STRING, occurrence),
+        ("Event", DataType.STRING, event),
     ]
     return [
-        Metric(
-            name=f"Alarms/{told.machine}/{told.alarm}/{name}",
-            timestamp_ms=told.wall_ns // NS_PER_MS,
-            datatype=datatype,
-            value=value,
-        )
-        for name, datatype, value in values
+        Metric(name=f"Alarms/{name}/{part}", timestamp_ms=at_ms, datatype=datatype, value=value)
+        for part, datatype, value in values
     ]
 
 

@@ -141,8 +141,11 @@ class EdgeSession:
                 await self._await_host(heard, listening, stopped)
             if stopped.done():
                 return
-            await self._be_born()
-            await self._tell_history()
+            present = await self._outbox.latest()
+            for message in present:
+                self._board.put(None, self._metrics_of(message))
+            self._be_born()
+            await self._tell_history(max((message.sequence for message in present), default=0))
             await self._tell(heard, listening, stopped)
             await self._tell_alarms(await self._outbox.following(self._cursor, READ_AHEAD))
         finally:
@@ -218,21 +221,21 @@ class EdgeSession:
             waiting.cancel()
             await asyncio.gather(waiting, return_exceptions=True)
 
-    async def _be_born(self) -> None:
+    def _be_born(self) -> None:
         """Publish all births, with present values."""
-        for message in await self._outbox.latest():
-            self._board.put(None, self._metrics_of(message))
         node = self._board.of(None, self._now_ms)
         devices = {self._device: self._board.of(self._device, self._now_ms)} if self._there() else {}
         self._told = _values(devices.get(self._device, ()))
         for publication in self._node.births(self._bd_seq, self._now_ms, node, devices):
-            await self._publish(publication)
+            self._publish(publication)
         self._counters.births += 1
         self.was_born = True
 
-    async def _tell_history(self) -> None:
-        """Tell, as history, the alarm events that no broker has taken yet: the births had the newest only."""
-        newest = max((message.sequence for message in await self._outbox.latest()), default=0)
+    async def _tell_history(self, newest: int) -> None:
+        """Tell, as history, the alarm events up to ``newest`` that no broker has taken yet.
+
+        The births told the latest of each alarm only.
+        """
         while self._cursor < newest:
             messages = await self._outbox.following(self._cursor, READ_AHEAD)
             messages = [message for message in messages if message.sequence <= newest]
@@ -241,7 +244,7 @@ class EdgeSession:
             for message in messages:
                 metrics = [replace(metric, historical=True) for metric in self._metrics_of(message)]
                 if metrics and self._node.knows(None, metrics):
-                    await self._publish(self._node.data(None, self._now_ms, metrics))
+                    self._publish(self._node.data(None, self._now_ms, metrics))
                     self._counters.historical += 1
             await self._confirm(messages[-1].sequence)
 
@@ -267,7 +270,7 @@ class EdgeSession:
                     listening.result()
                 if asked.done():
                     if self._hear(asked.result()):
-                        await self._be_born()
+                        self._be_born()
                     asked = asyncio.create_task(heard.get())
                 if self._host is not None and not self._host.online:
                     raise HostAwayError(f"primary host {self._host.host_id} has left this broker")
@@ -276,7 +279,7 @@ class EdgeSession:
                     arriving = asyncio.create_task(self._outbox.next_following(self._cursor, READ_AHEAD))
                 if loop.time() >= due_s:
                     due_s = loop.time() + TELL_S
-                    await self._tell_device()
+                    self._tell_device()
         finally:
             for task in (arriving, asked):
                 task.cancel()
@@ -289,27 +292,27 @@ class EdgeSession:
             if not changed:
                 continue
             if self._node.knows(None, changed):
-                await self._publish(self._node.data(None, self._now_ms, changed))
+                self._publish(self._node.data(None, self._now_ms, changed))
             else:
                 # An alarm that no birth has named: new births tell its present state.
-                await self._be_born()
+                self._be_born()
             self._counters.alarms += 1
         if messages:
             await self._confirm(messages[-1].sequence)
 
-    async def _tell_device(self) -> None:
+    def _tell_device(self) -> None:
         """Tell what has changed at the machine, and whether it can be reached."""
         there = self._there()
         if not there:
             if self._node.lives(self._device):
-                await self._publish(self._node.device_death(self._device, self._now_ms))
+                self._publish(self._node.device_death(self._device, self._now_ms))
             return
         present = self._board.of(self._device, self._now_ms)
         changed = [m for m in present if m.name not in self._told or self._told[m.name] != m.value]
         if not self._node.lives(self._device) or not self._node.knows(self._device, changed):
-            await self._publish(self._node.device_birth(self._device, self._now_ms, present))
+            self._publish(self._node.device_birth(self._device, self._now_ms, present))
         elif changed:
-            await self._publish(self._node.data(self._device, self._now_ms, changed))
+            self._publish(self._node.data(self._device, self._now_ms, changed))
             self._counters.data += 1
         self._told = _values(present)
 
@@ -342,8 +345,8 @@ class EdgeSession:
             self._counters.unreadable += 1
             return []
 
-    async def _publish(self, publication: Publication) -> None:
-        await self._connection.publish(publication.topic, publication.payload, qos=publication.qos)
+    def _publish(self, publication: Publication) -> None:
+        self._connection.tell(publication.topic, publication.payload)
 
     async def _confirm(self, sequence: int) -> None:
         """Have the broker answer, which shows that it has all that was sent before, and remember that."""

@@ -36,6 +36,7 @@ class SparkplugSettings:
         servers: brokers in the order of preference, one connection at a time.
         client_id: MQTT client id, another than that of the box's own topics.
         primary_host: host application to wait for; None waits for nobody.
+        alarms: names of the machine's alarms, known before any of them is raised.
         readings: figures of the detectors that are metrics of the device.
         memory: file for what must survive a restart.
     """
@@ -47,4 +48,5 @@ class SparkplugSettings:
     client_id: str
     memory: Path
     primary_host: str | None = None
+    alarms: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
