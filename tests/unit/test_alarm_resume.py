@@ -194,3 +194,38 @@ def test_what_cannot_be_read_is_left_out_and_logged_once(caplog):
     (record,) = caplog.records
     assert record.getMessage().startswith("4 alarm states of the journal cannot be read")
     assert alarm_event(good) == event
+
+
+def test_a_suppression_that_an_earlier_version_told_is_taken_over():
+    (_, event) = history(manager(ROTOR), mode("F1", "alert"), rms(9.0, "not_ok"))[::-1]
+    assert event.kind is K.SUPPRESSED
+    told = json.loads(alarm_payload(event, 7).to_json())
+    for key in ("reason", "holds", "covered", "shelved_until_wall_ns", "first_out", "chattering", "found"):
+        del told[key]
+    del told["doubts"]
+    before = alarm_event(json.dumps(told).encode())
+    assert (before.holds, before.covered) == ((S.SUPPRESSED,), S.ACTIVE_UNACKNOWLEDGED)
+    after = manager(ROTOR)
+    after.resume([before], SPEAKERS)
+    assert after.alarms["rotor-fault"].state is S.SUPPRESSED
+    assert kinds(after.take(mode("F1", "alert")))[0] == ("rotor-fault", K.UNSUPPRESSED)
+    assert after.alarms["rotor-fault"].state is S.ACTIVE_UNACKNOWLEDGED
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"state": "shelved", "holds": ["shelved"], "covered": "normal"},  # until when?
+        {"state": "shelved", "holds": ["shelved"], "shelved_until_wall_ns": 5},  # over what?
+        {"holds": ["suppressed"], "covered": "normal"},
+        {"state": "suppressed", "holds": ["suppressed"], "covered": "shelved"},
+        {"holds": ["normal"], "covered": "normal"},
+        {"covered": "normal"},
+        {"shelved_until_wall_ns": 5},
+    ],
+)
+def test_a_payload_whose_covers_contradict_each_other_is_refused(forged):
+    (event,) = history(manager(ROTOR), mode("F1", "alert"))
+    payload = json.loads(alarm_payload(event, 7).to_json()) | forged
+    with pytest.raises(ValueError, match="none of this program's"):
+        alarm_event(json.dumps(payload).encode())

@@ -59,8 +59,12 @@ def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():
     assert handling.flood == FloodLimit(10, 600_000_000_000)
     assert handling.start_up is None
     assert handling.shelve_at_most_s == 28_800.0
-    none = "[alarm_handling]\nchatter_raises = 0\nflood_alarms = 0\nshelve_at_most_s = 60.0\n\n[mqtt]"
-    handling = alarm_handling(parsed(("[mqtt]", none)))
+    switched_off = parsed(
+        ("chatter_raises = 5", "chatter_raises = 0"),
+        ("flood_alarms = 10", "flood_alarms = 0"),
+        ("28_800.0", "60.0"),
+    )
+    handling = alarm_handling(switched_off)
     assert (handling.chatter, handling.flood, handling.shelve_at_most_s) == (None, None, 60.0)
 
 
