@@ -161,6 +161,17 @@ def test_drop_outs_are_bridged_if_few_and_refused_if_many(*, held: bool) -> None
             judge(packets(share, held=held, seed=12))
 
 
+@pytest.mark.parametrize("level", [0.0, -50.0, 50.0])
+def test_drop_outs_to_a_value_beyond_all_others_are_no_clipping(level: float) -> None:
+    samples = strikes("outer", seed=18)
+    for begin in range(1_000, 59_000, 6_000):
+        samples[begin : begin + 20] = level
+    assert "the channel stands still 10 times" in judge(samples).repairs[0]
+    clipped = np.clip(strikes("inner", seed=18), -2.5, 2.5)
+    clipped[1_000:1_010] = 2.5
+    assert not stuck(clipped).any()
+
+
 def test_a_coarse_converter_rests_by_itself() -> None:
     assert not stuck(np.round(0.6 * strikes(None, seed=13))).any()
     fine = strikes(None, seed=13)

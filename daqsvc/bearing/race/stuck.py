@@ -17,6 +17,8 @@ LEAST_RUN = 4
 COARSE_RUN = 64
 COARSE = 0.5
 """Least difference over the median one beyond which a converter is coarse: its channel rests by itself."""
+NEAR_LIMIT = 0.025
+"""So near to the extremes of all others, as a share of their range, a value is a limit."""
 FALSE_RUNS = 1e-2
 """Runs that a whole record shows by itself, at most."""
 
@@ -42,6 +44,12 @@ def stuck(samples: Real) -> NDArray[np.bool_]:
     least = max(LEAST_RUN, math.ceil(1.0 + math.log(FALSE_RUNS / n) / math.log(max(repeated, 1e-9))))
     if not len(moving) or moving.min() > COARSE * np.median(moving):
         least = max(least, COARSE_RUN)
-    values = samples[starts]
-    long = (lengths >= least) & (values != samples.min()) & (values != samples.max())
-    return np.repeat(long, lengths)
+    long = lengths >= least
+    rest = samples[np.repeat(~long, lengths)]
+    if not len(rest):
+        return np.zeros(n, dtype=np.bool_)
+    # A clipped channel comes to its limit steadily; what rests far beyond all the rest has dropped out.
+    low, high = float(rest.min()), float(rest.max())
+    near, values = NEAR_LIMIT * (high - low), samples[starts]
+    clipped = (np.abs(values - low) <= near) | (np.abs(values - high) <= near)
+    return np.repeat(long & ~clipped, lengths)
