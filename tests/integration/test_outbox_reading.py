@@ -58,6 +58,7 @@ def holds_a_read_lock(path):
 async def outbox(tmp_path):
     outbox = Outbox(tmp_path / "store" / JOURNAL_NAME, SystemClock())
     await outbox.open()
+    await outbox.pending_telemetry(0, 1)  # its files are there, too, and hold still while they are copied
     yield outbox
     await outbox.close()
 
