@@ -32,6 +32,11 @@ class Backoff:
         # Jitter spreads reconnects, it keeps no secret.
         self._rng = rng or random.Random()  # noqa: S311
 
+    @property
+    def ceiling_ns(self) -> int:
+        """The longest that the next wait may be."""
+        return self._ceiling_ns
+
     def next_ns(self) -> int:
         """How long to wait before the next try."""
         wait_ns = self._rng.randint(0, self._ceiling_ns)

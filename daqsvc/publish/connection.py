@@ -214,8 +214,11 @@ class Connection(aiomqtt.Client):
         Raises:
             aiomqtt.MqttError: the connection is lost.
         """
-        async for message in self.messages:
-            yield message
+        try:
+            async for message in self.messages:
+                yield message
+        except aiomqtt.MqttError:
+            raise self._loss() from None
 
     @property
     def shown_certificate(self) -> bytes | None:

@@ -51,6 +51,9 @@ STABLE_S = 10.0
 FIRST_RETRY_NS = 800_000_000
 """Ceiling of the first wait after a loss."""
 
+SUSPICIOUS_LOSSES = 3
+"""So many connections in a row that broke soon after they were made make a rival likely."""
+
 TAKEN_OVER_S = 60.0
 """Least wait after another client has come with the same client id: two that fight help nobody."""
 
@@ -100,6 +103,7 @@ class MqttPublisher:
             self._home_assistant = HomeAssistantLink(settings.home_assistant, self.topics, clock)
         self._expiry: dict[str, int] = {}
         self._backoff = Backoff(FIRST_RETRY_NS)
+        self._quick_losses = 0
         self._outage_reported = False
         self._protocol = (
             aiomqtt.ProtocolVersion.V311 if settings.protocol == "3.1.1" else aiomqtt.ProtocolVersion.V5
@@ -201,7 +205,11 @@ class MqttPublisher:
             return None
         self.counters.connections += 1
         self.counters.connected = True
-        if self._outage_reported:
+        if self._quick_losses >= SUSPICIOUS_LOSSES:
+            log.info(
+                "connected to MQTT broker %s once more", self._name
+            )  # it has been said that this goes on
+        elif self._outage_reported:
             self._outage_reported = False
             log.warning("MQTT broker %s is back", self._name)
         else:
@@ -258,19 +266,34 @@ class MqttPublisher:
             log.info("credentials for MQTT broker %s were replaced; connecting again", self._name)
             await connection.close(GOODBYE_S)
         except TakenOverError:
-            self._report_rival()
+            self._report_rival("this connection was ended by another client")
             await self._wait(TAKEN_OVER_S + self._backoff.next_ns() / NS_PER_S)
         except (aiomqtt.MqttError, OSError) as error:
-            self._report_outage(str(error))
             of_use_s = asyncio.get_running_loop().time() - since_s
             if isinstance(error, SilentBrokerError):
                 # Connected but deaf: the time that it took to notice was no use to anybody.
                 of_use_s -= PUBACK_S
-            if of_use_s > STABLE_S and not isinstance(error, PublishRefusedError):
-                self._backoff.reset()
+            self._judge(of_use_s, error)
             await self._wait(self._backoff.next_ns() / NS_PER_S)
         else:
             await self._say_goodbye(connection)
+
+    def _judge(self, of_use_s: float, error: Exception) -> None:
+        """Report a loss, and how soon to come back after it.
+
+        Only a connection that has lasted longer than the waits by now is a reason to be quick again:
+        otherwise two clients with one id, who end each other's connections, would never calm down.
+        """
+        if of_use_s > max(STABLE_S, 2 * self._backoff.ceiling_ns / NS_PER_S):
+            self._backoff.reset()
+        refused = isinstance(error, PublishRefusedError | SilentBrokerError)
+        self._quick_losses = self._quick_losses + 1 if of_use_s < STABLE_S and not refused else 0
+        if of_use_s > STABLE_S:
+            self._outage_reported = False
+        if self._quick_losses == SUSPICIOUS_LOSSES:
+            how = f"{SUSPICIOUS_LOSSES} connections have broken at once, perhaps because of another client"
+            self._report_rival(how)
+        self._report_outage(str(error))
 
     async def _say_goodbye(self, connection: Connection) -> None:
         """Publish that the box goes offline; if that fails, the last will says so."""
@@ -330,11 +353,11 @@ class MqttPublisher:
             self._outage_reported = True
             log.warning("MQTT broker %s is away: %s; trying again until it is back", self._name, reason)
 
-    def _report_rival(self) -> None:
+    def _report_rival(self, how: str) -> None:
         self._outage_reported = True
         log.error(
-            "another client has connected to MQTT broker %s as client_id %r and so ended this connection; "
-            "give each box its own box name, or its own mqtt.client_id. Trying again in about a minute",
+            "MQTT broker %s: %s with client_id %r; give each box its own box name or mqtt.client_id",
             self._name,
+            how,
             self._settings.client_id,
         )
