@@ -336,7 +336,7 @@ class AlarmManager:
         elif ours and name in {quality_alarm(detector, sensors) for detector, sensors in speakers.items()}:
             self._resume_unruled(event)
             self._doubts.resume(doubt for doubt in event.doubts if doubt.detector in speakers)
-        elif ours and is_condition(event):
+        elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
             self._resume_unruled(event)
             self._conditions.add(name)
             if name == ALARM_FLOOD and event.own_state.is_active:

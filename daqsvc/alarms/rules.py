@@ -241,6 +241,7 @@ class MeasureWatch:
         self._measure = measure
         self._trip_multiply = trip_multiply
         self._reported_absent = False
+        self._factor = 1.0
         self.monitor = SetpointMonitor(setpoint)
         self.setpoint = setpoint
 
@@ -248,8 +249,8 @@ class MeasureWatch:
         """The level and the value; None, and everything holds, without the measure."""
         value = diagnosis.statistics.get(self._measure)
         if value is not None:
-            factor = self._trip_multiply if given.starting else 1.0
-            return self.monitor.update(value, diagnosis.t_ns, factor), value
+            self._factor = self._trip_multiply if given.starting else 1.0
+            return self.monitor.update(value, diagnosis.t_ns, self._factor), value
         self.monitor.hold()
         if not self._reported_absent:
             self._reported_absent = True
@@ -268,7 +269,8 @@ class MeasureWatch:
         measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
         limit = self.setpoint.limit(level)
         if limit is not None:
-            return f"{measured}, {level.label} limit {limit:.4g}{unit}"
+            multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 else ""
+            return f"{measured}, {level.label} limit {limit:.4g}{unit}{multiplied}"
         return f"{measured}, below its limit of {self.setpoint.lowest:.4g}{unit}"
 
 

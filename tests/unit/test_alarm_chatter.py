@@ -118,6 +118,15 @@ def test_a_flood_outlives_a_restart_until_a_whole_window_shows_that_it_is_over()
     assert kinds(after.tick(2.0)) == [("alarm-flood", "returned")]
 
 
+def test_a_flood_that_nobody_counts_any_more_is_returned_by_the_restart():
+    rig = flooded()
+    rig.rms(50.0, sensor="p5")
+    rig.handling = AlarmHandling()
+    after = rig.restarted({f"levels/p{i}": (f"p{i}",) for i in range(6)})
+    assert kinds(after.events[-1:]) == [("alarm-flood", "returned")]
+    assert "alarm-flood" not in after.manager.alarms
+
+
 def test_without_limits_nothing_chatters_and_nothing_is_a_flood():
     rig = AlarmRig(LEVEL)
     for _ in range(50):
