@@ -157,7 +157,7 @@ class BearingAnalysis:
         finding, race = self.finding, self.leading
         if finding is None or race is None:
             return f"{self.recording}: not judged: {self.refused}"
-        lines = [f"{self.recording}: {self._headline(finding)}"]
+        lines = [f"{self.recording}: {self._headline(finding, race)}"]
         lines.append(
             ", ".join(
                 f"{part} z {e.z:.1f} size {e.depth:.2f}" + ("" if e.testable else " (not testable)")
@@ -183,7 +183,8 @@ class BearingAnalysis:
         lines += [note for note in race.notes if note not in race.repairs]  # those are problems of the data
         return "\n  ".join([*lines, *self.quality.problems])
 
-    def _headline(self, finding: BearingFinding) -> str:
+    @staticmethod
+    def _headline(finding: BearingFinding, race: RaceVerdict) -> str:
         words = {
             "normal": "normal",
             "changed": "changed, cause not known",
@@ -195,7 +196,8 @@ class BearingAnalysis:
         said = words[finding.verdict]
         others = [words[name] for name in finding.group if name != finding.verdict and name in words]
         if finding.verdict not in {"normal", "changed", "inner_or_outer"} and others:
-            said += f" or {' or '.join(others)}"
+            told = "and perhaps" if race.both else "or"
+            said += f" {told} {' or '.join(others)}"
         if finding.verdict in {"normal", "changed"}:
             return said
         return f"{said} at {finding.where}, severity {finding.severity:.1f}"

@@ -19,15 +19,21 @@ STEEPNESS = 4.0
 
 LEAST_FACTOR = 1e-3
 
+RACES: tuple[Part, ...] = ("inner", "outer")
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The word, what it cannot be told from, the shares of belief, and how thin it is."""
+    """The word, what it cannot be told from, the shares of belief, and how thin it is.
+
+    ``both``: both races are in the group because each has lines of its own, though they can be told apart.
+    """
 
     verdict: RaceWord
     group: tuple[str, ...]
     probability: Mapping[str, float]
     margin: float
+    both: bool = False
 
 
 def decide(
@@ -67,9 +73,12 @@ def decide(
     best = max(candidates, key=weight.__getitem__)
     rivals = [weight[best] / weight[part] for part in candidates if part != best]
     margin = min([passed[best], *rivals])
+    if best != "ball" and all(passed[race] >= rules.both_factor for race in RACES):
+        other: Part = "outer" if best == "inner" else "inner"
+        return Decision(best, (best, other), belief, margin, both=True)
     group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
-    both_races = "inner" in group and "outer" in group
-    return Decision("inner_or_outer" if both_races else best, group, belief, margin)
+    open_race = all(race in group for race in RACES)
+    return Decision("inner_or_outer" if open_race else best, group, belief, margin)
 
 
 def weight_of(part: Part, e: PartEvidence, rules: RaceRules) -> float:

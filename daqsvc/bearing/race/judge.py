@@ -15,7 +15,7 @@ import scipy.fft
 
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, highest_order
-from daqsvc.bearing.race.decision import decide
+from daqsvc.bearing.race.decision import RACES, decide
 from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
 from daqsvc.bearing.race.knocks import levelled
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
@@ -122,6 +122,9 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     evidence = features.evidence
     notes = [*features.notes, *features.repairs]
     notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
+    if decision.both:
+        z = " and ".join(f"{evidence[part].z:.1f}" for part in RACES)
+        notes.append(f"inner and outer race both stand out (z {z}): both may be damaged")
     if features.speed_doubt:
         notes.append(f"the speed is not confirmed: {features.speed_doubt}")
     repairs = len(features.repairs)
@@ -138,6 +141,7 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         false_alarm_probability=len(PARTS) * false_alarm_probability(rules.z_limit),
         level_db=None if change_db is None else change_db[0],
         notes=tuple(notes),
+        both=decision.both,
         repairs=features.repairs,
         spectrum=features.spectrum,
     )

@@ -28,6 +28,8 @@ class RaceRules:
             limit of steadiness falls in proportion.
         ball_weight: what a ball's severity counts against a race's.
         group_factor: parts whose weights are within this factor cannot be told apart.
+        both_factor: factor by which both races must pass their limits, each by lines that the other does not
+            explain, for both to be called damaged.
         unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
         ball_testable_bins: the same for a ball, below which it is not tested at all.
         changed_db: change of the whole level that makes a record "changed" against a baseline.
@@ -56,6 +58,7 @@ class RaceRules:
     steady_z: float = 20.0
     ball_weight: float = 0.6
     group_factor: float = 1.15
+    both_factor: float = 1.2
     unresolved_bins: float = 4.0
     ball_testable_bins: float = 2.5
     changed_db: float = 2.0

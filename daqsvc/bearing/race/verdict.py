@@ -113,7 +113,8 @@ class RaceVerdict:
 
     Attributes:
         verdict: the one word; ``"changed"`` needs a baseline.
-        group: parts that the evidence cannot tell apart, the verdict among them.
+        group: parts that the evidence cannot tell apart, the verdict among them; or both races.
+        both: whether both races are in the group because each has lines of its own: both may be damaged.
         evidence: what speaks for each part.
         probability: share of belief per word, summing to one, of the words that were weighed.
         lines: kinematic lines found, strongest first.
@@ -142,5 +143,6 @@ class RaceVerdict:
     false_alarm_probability: float
     level_db: float | None = None
     notes: tuple[str, ...] = ()
+    both: bool = False
     repairs: tuple[str, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)
