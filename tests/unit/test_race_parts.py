@@ -182,7 +182,7 @@ def evidence(**z_and_depth: tuple[float, float]) -> dict[Part, PartEvidence]:
     [
         ({}, "normal", ("normal",)),
         ({"inner": (20.0, 0.5)}, "inner", ("inner",)),
-        ({"outer": (20.0, 0.5), "inner": (10.0, 0.4)}, "outer", ("outer",)),
+        ({"outer": (20.0, 0.5), "inner": (10.0, 0.33)}, "outer", ("outer",)),
         ({"outer": (20.0, 0.5), "inner": (20.0, 0.48)}, "outer", ("outer", "inner")),
         ({"outer": (7.0, 0.5), "inner": (7.0, 0.48)}, "inner_or_outer", ("inner", "outer")),
         ({"outer": (20.0, 0.5), "ball": (20.0, 0.8)}, "outer", ("outer", "ball")),
