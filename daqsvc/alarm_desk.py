@@ -25,6 +25,7 @@ from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload
 from daqsvc.publish.recall import recall
+from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.topics import Topics
 from daqsvc.self_check import SelfCheck, Vitals
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.publish.mqtt import MqttSettings
+    from daqsvc.publish.sparkplug.settings import SparkplugSettings
 
 logger = logging.getLogger(__name__)
 
@@ -83,6 +85,7 @@ class AlarmDesk:
         mqtt: how to reach the broker; None keeps everything in the journal.
         handling: what holds for all alarms.
         limits: how much the journal may keep.
+        sparkplug: what the box is to Sparkplug, beside its own topics; None for nothing.
     """
 
     def __init__(
@@ -95,6 +98,7 @@ class AlarmDesk:
         *,
         handling: AlarmHandling | None = None,
         limits: OutboxLimits | None = None,
+        sparkplug: SparkplugSettings | None = None,
     ) -> None:
         limits = limits or OutboxLimits()
         self.identity = identity
@@ -108,6 +112,11 @@ class AlarmDesk:
             else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock, commands=self.obey)
         )
         self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
+        self.sparkplug = (
+            None
+            if mqtt is None or sparkplug is None
+            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock)
+        )
         self._clock = clock
         self._self_check = SelfCheck(store, limits.reserve_bytes)
         self._free_bytes: int | None = None
@@ -136,8 +145,10 @@ class AlarmDesk:
 
     async def run(self) -> None:
         """Publish until `stop`; returns at once without a broker."""
-        if self.publisher is not None:
-            await self.publisher.run()
+        tellers = [teller for teller in (self.publisher, self.sparkplug) if teller is not None]
+        async with asyncio.TaskGroup() as telling:
+            for teller in tellers:
+                telling.create_task(teller.run(), name=type(teller).__name__)
 
     async def keep_time(self) -> None:
         """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
@@ -159,6 +170,8 @@ class AlarmDesk:
         """Take in a diagnosis; what follows from it is on its way to the disk when this returns."""
         for event in self.manager.take(diagnosis):
             self._post(event)
+        if self.sparkplug is not None:
+            self.sparkplug.observe(diagnosis)
 
     async def obey(self, command: AlarmCommand, source: str) -> CommandOutcome:
         """Carry out a person's command, one after the other: written down, obeyed, committed, answered.
@@ -206,8 +219,8 @@ class AlarmDesk:
 
     async def stop(self, deadline_s: float) -> None:
         """Hand over to the broker what is left, and end `run`; see `MqttPublisher.stop`."""
-        if self.publisher is not None:
-            await self.publisher.stop(deadline_s)
+        tellers = [teller for teller in (self.publisher, self.sparkplug) if teller is not None]
+        await asyncio.gather(*(teller.stop(deadline_s) for teller in tellers))
 
     async def close(self, timeout_s: float) -> None:
         """Close the journal; see `Outbox.close`."""

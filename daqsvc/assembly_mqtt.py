@@ -1,4 +1,4 @@
-"""From a machine file to the broker, and to what Home Assistant is told."""
+"""From a machine file to the broker, and to what Home Assistant and Sparkplug hosts are told."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, get_args
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings, MqttSettings, Reading
+from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
+from daqsvc.settings.broker_url import host_of, is_tls, port_of
 from daqsvc.settings.models import BEARING, ROTOR_BANK, ROTOR_SYNCHRONOUS, Keyphasor, ProximityProbe
 
 if TYPE_CHECKING:
@@ -43,6 +45,33 @@ def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
         telemetry_expiry_s=given.telemetry_expiry_s,
         commands=_commands(machine),
         home_assistant=_home_assistant(machine),
+    )
+
+
+def sparkplug_settings(machine: MachineFile, store: Path) -> SparkplugSettings | None:
+    """What the box is to Sparkplug; None if the machine file does not ask for it.
+
+    Args:
+        machine: the machine file.
+        store: directory of what survives a restart.
+    """
+    mqtt = machine.mqtt
+    if mqtt is None or mqtt.sparkplug is None:
+        return None
+    given = mqtt.sparkplug
+    return SparkplugSettings(
+        group=given.group or machine.site,
+        edge_node=given.edge_node or machine.box,
+        device=given.device or machine.machine.name,
+        machine=machine.machine.name,
+        servers=tuple(
+            Server(host_of(url), port_of(url), is_tls(url)) for url in given.servers or (mqtt.url,)
+        ),
+        client_id=given.client_id or f"{machine.mqtt_client_id}-sparkplug",
+        memory=store / "sparkplug.json",
+        primary_host=given.primary_host,
+        alarms=(*(alarm.name for alarm in machine.alarms), *_services(machine)),
+        readings=tuple(_readings(machine)),
     )
 
 

@@ -15,7 +15,7 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
-from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
@@ -117,6 +117,7 @@ class Service:
             mqtt_settings(machine),
             handling=alarm_handling(machine),
             limits=outbox_limits(machine),
+            sparkplug=sparkplug_settings(machine, store),
         )
         self.control = ControlServer(store, machine.machine.name, self.desk.obey)
 
@@ -212,6 +213,8 @@ class Service:
             self._publish_status()
 
     def _publish_status(self) -> None:
+        if self.desk.sparkplug is not None:
+            self.desk.sparkplug.reach(there=any(driver.link.state == "up" for driver in self.drivers))
         if self.publisher is not None:
             payload = status_payload(self.machine.site, self.machine.box, self.figures(), self.clock)
             self.publisher.telemetry("status", payload.to_json())
@@ -245,6 +248,7 @@ class Service:
             "control": asdict(self.control.counters),
             "outbox": asdict(self.desk.outbox.counters),
             "mqtt": {} if self.publisher is None else self.publisher.figures(),
+            "sparkplug": {} if self.desk.sparkplug is None else asdict(self.desk.sparkplug.counters),
         }
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.bearing_checks import bearing_checks
+from daqsvc.settings.broker_url import is_tls
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
     check_bus_load,
@@ -94,6 +95,8 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
         if draft.mqtt is not None:
             yield _transport(draft.mqtt)
             yield _credentials(draft.mqtt)
+            yield _sparkplug(draft, draft.mqtt)
+            yield _open_to_commands(draft.mqtt)
 
 
 def _names(draft: MachineFile) -> Iterator[Finding]:
@@ -170,28 +173,75 @@ def _transport(mqtt: Mqtt) -> Iterator[Finding]:
             "contradicts mqtts://, which always verifies the broker",
             "remove it; a broker with a certificate of your own is trusted by ca_file",
         )
-    if not mqtt.tls and mqtt.ca_file is not None:
+    for key in ("ca_file", "cert_file"):
+        if not mqtt.tls and getattr(mqtt, key) is not None:
+            yield Finding(
+                ("mqtt", key),
+                "has no effect with mqtt://, which uses no certificates",
+                "write mqtts:// in the url, or remove it",
+                fatal=False,
+            )
+
+
+def _sparkplug(draft: MachineFile, mqtt: Mqtt) -> Iterator[Finding]:
+    given = mqtt.sparkplug
+    if given is None:
+        return
+    for number, server in enumerate(given.servers):
+        if is_tls(server) != mqtt.tls:
+            yield Finding(
+                ("mqtt", "sparkplug", "servers", number),
+                "has other encryption than mqtt.url, whose credentials it would get",
+                f"write {'mqtts' if mqtt.tls else 'mqtt'}:// in both",
+            )
+    if given.client_id is not None and given.client_id == (
+        mqtt.client_id or f"daqsvc-{draft.site}-{draft.box}"
+    ):
         yield Finding(
-            ("mqtt", "ca_file"),
-            "has no effect with mqtt://, which uses no certificates",
-            "write mqtts:// in the url, or remove it",
-            fatal=False,
+            ("mqtt", "sparkplug", "client_id"),
+            f'is "{given.client_id}" like that of [mqtt]: a broker ends one connection for the other',
+            "remove it, or write another",
         )
 
 
 def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
-    if mqtt.password_file is None:
+    yield from _one_source(mqtt, "password_file", "password_credential")
+    yield from _one_source(mqtt, "key_file", "key_credential")
+    for key in ("key_file", "key_credential"):
+        if getattr(mqtt, key) is not None and mqtt.cert_file is None:
+            yield Finding(
+                ("mqtt", key), "is a key without a certificate", "add cert_file to [mqtt], or remove it"
+            )
+    given = [key for key in ("password_file", "password_credential") if getattr(mqtt, key) is not None]
+    if not given:
         return
     host = mqtt.host  # not usable if the user stands in the url: that has been said, with what to do
     if mqtt.username is None:
         yield Finding(
-            ("mqtt", "password_file"), "is a password without a user", "add username to [mqtt], or remove it"
+            ("mqtt", given[0]), "is a password without a user", "add username to [mqtt], or remove it"
         )
     if not mqtt.tls and not _is_this_host(host):
         yield Finding(
-            ("mqtt", "password_file"),
+            ("mqtt", given[0]),
             f"the password would go to {host} unencrypted",
             "write mqtts:// in the url",
+            fatal=False,
+        )
+
+
+def _one_source(mqtt: Mqtt, file: str, credential: str) -> Iterator[Finding]:
+    if getattr(mqtt, file) is not None and getattr(mqtt, credential) is not None:
+        yield Finding(
+            ("mqtt", credential), f"is given besides {file}, and only one can be right", "remove one of them"
+        )
+
+
+def _open_to_commands(mqtt: Mqtt) -> Iterator[Finding]:
+    if mqtt.commands.enabled and not mqtt.tls and not _is_this_host(mqtt.host):
+        yield Finding(
+            ("mqtt", "commands", "enabled"),
+            f"commands would come from {mqtt.host} unencrypted, and from whoever answers there",
+            "write mqtts:// in the url, or enabled = false",
             fatal=False,
         )
 

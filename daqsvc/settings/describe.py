@@ -294,11 +294,25 @@ def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
 def _broker(machine: MachineFile, mqtt: Mqtt) -> str:
     trust = f"certificates from {mqtt.ca_file}" if mqtt.ca_file is not None else "the system's certificates"
     parts = [f"{mqtt.host} port {mqtt.port}, {f'TLS, {trust}' if mqtt.tls else 'without TLS'}"]
+    if mqtt.tls and mqtt.cert_file is not None:
+        parts.append(f"shows certificate {mqtt.cert_file}")
     if mqtt.username is not None:
-        secret = f", password from {mqtt.password_file}" if mqtt.password_file is not None else ""
-        parts.append(f"user {mqtt.username}{secret}")
+        source = mqtt.password_file or (
+            f"credential {mqtt.password_credential}" if mqtt.password_credential else None
+        )
+        parts.append(f"user {mqtt.username}{f', password from {source}' if source else ''}")
     parts.append(f"client {machine.mqtt_client_id}, keep-alive {mqtt.keepalive_s} s")
     parts.append(f"topics {mqtt.topic_root}/{machine.site}/{machine.box}/...")
+    if mqtt.commands.enabled:
+        parts.append(f"takes commands: {', '.join(mqtt.commands.allow) or 'none'}")
+    if mqtt.home_assistant is not None and mqtt.home_assistant.enabled:
+        parts.append(f"tells Home Assistant below {mqtt.home_assistant.prefix}/")
+    if mqtt.sparkplug is not None:
+        group, node = mqtt.sparkplug.group or machine.site, mqtt.sparkplug.edge_node or machine.box
+        host = mqtt.sparkplug.primary_host
+        parts.append(
+            f"Sparkplug B edge node {group}/{node}{f', waits for host {host}' if host is not None else ''}"
+        )
     return "; ".join(parts)
 
 

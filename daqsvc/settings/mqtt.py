@@ -4,46 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
-from urllib.parse import SplitResult, urlsplit
 
-from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
+from pydantic import Field
 
+from daqsvc.settings.broker_url import BrokerUrl, host_of, is_tls, port_of
 from daqsvc.settings.section import Name, Positive, Section
-
-_DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
-
-
-def _split_url(url: str) -> SplitResult:
-    """The parts of a broker's address; the value is kept out of every message, it may hold a password."""
-    remedy = {"remedy": 'write "mqtts://broker.example:8883", or "mqtt://..." with insecure = true'}
-    try:
-        parts = urlsplit(url)
-        port = parts.port
-    except ValueError:
-        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy) from None
-    if parts.username is not None or parts.password is not None:
-        raise PydanticCustomError(
-            "broker_url_secret",
-            "must not hold a user name or password",
-            {
-                "remedy": "take them out of the url, write username and password_file instead, "
-                "and change the password: it has been in a file that others can read"
-            },
-        )
-    if parts.scheme not in _DEFAULT_PORTS or not parts.hostname or port == 0:
-        raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy)
-    if parts.path not in {"", "/"} or parts.query or parts.fragment:
-        raise PydanticCustomError(
-            "broker_url", "has something after host and port", {"remedy": "end the url after the port"}
-        )
-    return parts
-
-
-def _broker_url(url: str) -> str:
-    _split_url(url)
-    return url
-
+from daqsvc.settings.sparkplug import Sparkplug  # noqa: TC001 - pydantic reads the annotations
 
 Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypass", "unbypass"]
 """What may be asked of an alarm."""
@@ -86,9 +52,7 @@ class Mqtt(Section):
     """
 
     url: Annotated[
-        str,
-        AfterValidator(_broker_url),
-        Field(description="address of the broker", examples=["mqtts://broker.example:8883"]),
+        BrokerUrl, Field(description="address of the broker", examples=["mqtts://broker.example:8883"])
     ]
     insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
     client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
@@ -127,19 +91,19 @@ class Mqtt(Section):
     )
     commands: MqttCommands = Field(default=MqttCommands(), description="commands that come over the broker")
     home_assistant: HomeAssistant | None = Field(default=None, description="discovery by Home Assistant")
+    sparkplug: Sparkplug | None = Field(default=None, description="the box as a Sparkplug B edge node, too")
 
     @property
     def tls(self) -> bool:
         """Whether the connection is encrypted and the broker's certificate verified."""
-        return urlsplit(self.url).scheme == "mqtts"
+        return is_tls(self.url)
 
     @property
     def host(self) -> str:
         """Host name or address of the broker."""
-        return urlsplit(self.url).hostname or ""
+        return host_of(self.url)
 
     @property
     def port(self) -> int:
         """TCP port of the broker: as in the url, else 1883, with TLS 8883."""
-        parts = urlsplit(self.url)
-        return parts.port or _DEFAULT_PORTS[parts.scheme]
+        return port_of(self.url)

@@ -104,6 +104,7 @@ async def edge_node(outbox, tmp_path, *ports, primary_host=None, protocol="5"):
         group="lab",
         edge_node="edge-1",
         device="rig",
+        machine="rig",
         servers=tuple(Server(LOOPBACK, port, tls=False) for port in ports),
         client_id="edge-1-sparkplug",
         memory=tmp_path / "sparkplug.json",

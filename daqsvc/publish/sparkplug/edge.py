@@ -83,7 +83,7 @@ class SparkplugEdge:
         self._board = Board()
         self._board.put(None, node_properties(daqsvc.__version__, topics.site, topics.box))
         for alarm in settings.alarms:
-            self._board.put(None, quiet_alarm(settings.device, alarm))
+            self._board.put(None, quiet_alarm(settings.machine, alarm))
         self._board.put(settings.device, declared(settings.readings))
         self._watched = {reading.detector for reading in settings.readings}
         self._there = True

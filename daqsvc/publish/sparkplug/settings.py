@@ -33,6 +33,7 @@ class SparkplugSettings:
         group: Sparkplug group id.
         edge_node: edge node id.
         device: id of the device that the machine is.
+        machine: name of the machine, by which its alarms are known.
         servers: brokers in the order of preference, one connection at a time.
         client_id: MQTT client id, another than that of the box's own topics.
         primary_host: host application to wait for; None waits for nobody.
@@ -44,6 +45,7 @@ class SparkplugSettings:
     group: str
     edge_node: str
     device: str
+    machine: str
     servers: tuple[Server, ...]
     client_id: str
     memory: Path
