@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import BinaryIO
 
+FileError = (sqlite3.Error, OSError, UnicodeDecodeError)
+"""What goes wrong with a file. Names out of a damaged one are no text, which comes as the last of these."""
+
 SIDE_FILES = ("", "-wal", "-shm")
 """Suffixes of the files that make up one SQLite database."""
 
@@ -25,6 +28,17 @@ WAL_MAX_BYTES = 8 * 1024 * 1024
 
 ASIDE_KEPT = 3
 """Corrupt files that are kept; a failing disk must not fill itself with them."""
+
+_DAMAGED = {
+    sqlite3.SQLITE_CORRUPT,
+    sqlite3.SQLITE_NOTADB,
+    sqlite3.SQLITE_ERROR,
+    sqlite3.SQLITE_SCHEMA,
+    sqlite3.SQLITE_TOOBIG,
+    sqlite3.SQLITE_CONSTRAINT,
+    sqlite3.SQLITE_MISMATCH,
+    sqlite3.SQLITE_FORMAT,
+}
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 
@@ -165,8 +179,12 @@ def delete(path: Path) -> None:
 
 
 def is_corrupt(error: Exception) -> bool:
-    """Whether an error says that the file itself is broken, rather than the disk full or busy."""
-    return _primary_code(error) in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+    """Whether an error says that the file itself is broken, rather than the disk full or busy.
+
+    All statements of the outbox are constants, so one that a file does not understand, or whose constraints
+    it violates, tells of damage as well. So does one whose message Python cannot decode.
+    """
+    return isinstance(error, UnicodeDecodeError) or _primary_code(error) in _DAMAGED
 
 
 def is_full(error: Exception) -> bool:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
+    FileError,
     connect,
     corruption,
     is_corrupt,
@@ -20,7 +21,7 @@ from daqsvc.outbox.files import (
     take_possession,
     used_bytes,
 )
-from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum
+from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.salvage import readable
 from daqsvc.outbox.sequence import SequenceMark
 
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
+
+UNLIKELY_VERSION = 1000
+"""From here on a version is damage, not progress."""
 
 TRIM_EVERY = 256
 """Messages marked as sent from one look at the limits to the next."""
@@ -134,13 +138,13 @@ class Journal:
             self._mark.read()
             try:
                 self._connect()
-            except sqlite3.DatabaseError as error:
+            except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
                 if not is_corrupt(error):
                     raise
                 self.quarantine(error)
             self._tidy()
             self._ballast.take()
-        except (OSError, sqlite3.Error) as error:
+        except FileError as error:
             raise self._unusable(error) from error
 
     def _unusable(self, error: Exception) -> OutboxError:
@@ -153,18 +157,19 @@ class Journal:
         """Trim, and have the file itself tell where the numbers go on; on a full disk, both can wait."""
         connection = self._open_connection()
         try:
+            self._mark.advance(self.last_sequence)
             with _transaction(connection):
                 connection.execute("DELETE FROM sqlite_sequence WHERE name = 'messages'")
                 connection.execute(
                     "INSERT INTO sqlite_sequence VALUES ('messages', ?)", (self.last_sequence,)
                 )
                 self._trim(connection)
-        except sqlite3.OperationalError as error:
+        except (sqlite3.OperationalError, OSError) as error:
             if not is_full(error):
                 raise
             log.warning("outbox %s: %s; the journal is not trimmed", self.path, error)
 
-    def quarantine(self, error: sqlite3.DatabaseError) -> None:
+    def quarantine(self, error: Exception) -> None:
         """Set a corrupt file aside and begin a new one with what can still be read of it.
 
         Raises:
@@ -212,7 +217,9 @@ class Journal:
     def _prepare(self, connection: sqlite3.Connection) -> int | None:
         """Bring the tables up to date; the highest number that the file knows, None if it is new."""
         version = pragma(connection, "user_version")
-        if version not in {0, 1, SCHEMA_VERSION}:
+        if not 0 <= version < UNLIKELY_VERSION:
+            raise corruption(f"schema version {version}")
+        if version > SCHEMA_VERSION:
             raise OutboxError(
                 f"outbox {self.path} has schema version {version}, this program knows {SCHEMA_VERSION}; "
                 f"update the program or move the file away"
@@ -224,7 +231,11 @@ class Journal:
                 f"BEGIN IMMEDIATE; {statements} {now} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;"
             )
         used = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'messages'").fetchone()
-        return int(used[0]) if used else None
+        if used is None:
+            return None
+        if not (isinstance(used[0], int) and self._mark.can_be_used(used[0])):
+            raise corruption(f"it ends with message {used[0]}, which was never given")
+        return used[0]
 
     def _salvage(self, aside: Path) -> None:
         connection = self._open_connection()
@@ -361,8 +372,7 @@ class Journal:
         )
         messages = []
         for sequence, topic, payload, retain, told in rows:
-            # Files of the first version have no checksums.
-            if told is not None and told != checksum(sequence, topic, payload):
+            if not is_sound(sequence, topic, payload, told):
                 raise corruption(f"message {sequence} has changed on the disk")
             messages.append(OutboxMessage(sequence, topic, payload, bool(retain)))
         return messages
@@ -377,15 +387,18 @@ class Journal:
         ).fetchone()
         spare_from = newest[0] if newest else 0
         for _ in range(TRIM_AT_MOST // TRIM_EVERY):
-            rows = connection.execute(
-                "SELECT sequence, wall_ns FROM messages "  # noqa: S608  constants only
-                f"WHERE sent AND sequence NOT IN ({_IS_LATEST}) ORDER BY sequence LIMIT {TRIM_EVERY}"
-            ).fetchall()
-            if used_bytes(connection) <= self._limits.alarms_max_bytes:
-                rows = [(s, wall_ns) for s, wall_ns in rows if s <= spare_from and wall_ns < oldest_ns]
-            if not rows:
+            over = used_bytes(connection) > self._limits.alarms_max_bytes
+            deleted = connection.execute(
+                f"""
+                DELETE FROM messages WHERE sequence IN
+                (SELECT sequence FROM messages
+                 WHERE sent AND sequence NOT IN ({_IS_LATEST}) AND (? OR (sequence <= ? AND wall_ns < ?))
+                 ORDER BY sequence LIMIT {TRIM_EVERY})
+                """,  # noqa: S608  constants only
+                (over, spare_from, oldest_ns),
+            ).rowcount
+            if deleted < TRIM_EVERY:
                 break
-            connection.executemany("DELETE FROM messages WHERE sequence = ?", [(s,) for s, _ in rows])
         if pragma(connection, "freelist_count") > SLACK_PAGES:
             connection.execute(f"PRAGMA incremental_vacuum({SLACK_PAGES // 8})").fetchall()
 

@@ -70,6 +70,13 @@ class Draft:
         return OutboxMessage(sequence, self.topic, payload, self.retain)
 
 
+def is_sound(number: object, topic: object, payload: object, told: object) -> bool:
+    """Whether a row is what was written: ``told`` is its checksum, None in files of the first version."""
+    if not (isinstance(number, int) and isinstance(topic, str) and isinstance(payload, bytes)):
+        return False
+    return told is None or told == checksum(number, topic, payload)
+
+
 def checksum(number: int, topic: str, payload: bytes) -> int:
     """CRC-32 over what must not change on the disk; `PRAGMA quick_check` sees no flipped bit in a payload."""
     return zlib.crc32(payload, zlib.crc32(f"{number} {topic}\n".encode()))

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from daqsvc.outbox.files import pragma
+from daqsvc.outbox.files import FileError, pragma
 from daqsvc.outbox.journal import SCHEMA_VERSION
-from daqsvc.outbox.messages import OutboxError, checksum
+from daqsvc.outbox.messages import OutboxError, is_sound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -94,7 +94,7 @@ def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -
         raise OutboxError(
             f"the journal {path} may not be read: {error.strerror}; run this as the service's user or as root"
         ) from error
-    except (sqlite3.Error, OSError) as error:
+    except FileError as error:
         raise OutboxError(
             f"the journal {path} cannot be read: {error}; the service sets a corrupt one aside when it starts"
         ) from error
@@ -105,7 +105,7 @@ def _read(path: Path, history: int, topic: str | None) -> JournalView:
     for _ in range(ATTEMPTS - 1):
         try:
             return _read_once(path, history, topic)
-        except (sqlite3.Error, FileNotFoundError):
+        except (sqlite3.Error, UnicodeDecodeError, FileNotFoundError):
             path.stat()
             time.sleep(RETRY_S)
     return _read_once(path, history, topic)
@@ -148,7 +148,7 @@ def _sound(rows: Iterable[tuple[int, str, bytes, int, int, int, int | None]]) ->
     return [
         JournalEntry(sequence, topic, payload, bool(retain), bool(sent), wall_ns)
         for sequence, topic, payload, retain, sent, wall_ns, told in rows
-        if told is None or told == checksum(sequence, topic, payload)
+        if is_sound(sequence, topic, payload, told)
     ]
 
 

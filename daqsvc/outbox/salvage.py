@@ -8,7 +8,7 @@ import sqlite3
 from itertools import islice
 from typing import TYPE_CHECKING, TypeAlias
 
-from daqsvc.outbox.messages import checksum
+from daqsvc.outbox.messages import is_sound
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,15 +47,13 @@ def readable(path: Path, below: int) -> Iterator[Row]:
                 log.info("corrupt outbox %s could be read up to a point, %s: %s", path, order, error)
 
 
-def _is_sound(row: tuple[object, ...], below: int) -> bool:
+def _is_sound(row: Row, below: int) -> bool:
     sequence, topic, payload, retain, sent, wall_ns, told = row
     return (
-        isinstance(sequence, int)
+        told is not None
+        and is_sound(sequence, topic, payload, told)
         and sequence < below
-        and isinstance(topic, str)
-        and isinstance(payload, bytes)
         and retain in {0, 1}
         and sent in {0, 1}
         and isinstance(wall_ns, int)
-        and told == checksum(sequence, topic, payload)
     )

@@ -93,6 +93,10 @@ class SequenceMark:
         # A new file's numbers start at the wall clock: how many of the old one are gone cannot be told.
         return max(self._used - stored, 0) if stored is not None else 0
 
+    def can_be_used(self, number: int) -> bool:
+        """Whether ``number`` may have been given, as far as the side file tells."""
+        return not self._ceiling or 0 <= number <= self._ceiling
+
     def advance(self, last: int) -> None:
         """Have the ceiling above ``last`` before that number is used.
 

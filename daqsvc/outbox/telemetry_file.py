@@ -14,6 +14,7 @@ import time
 from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.outbox.files import (
+    FileError,
     connect,
     corruption,
     delete,
@@ -23,7 +24,7 @@ from daqsvc.outbox.files import (
     set_aside,
     used_bytes,
 )
-from daqsvc.outbox.messages import TelemetryMessage, checksum
+from daqsvc.outbox.messages import TelemetryMessage, checksum, is_sound
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -112,7 +113,7 @@ class TelemetryFile:
         """Open or create the file; if it cannot be used, the messages are kept in memory."""
         try:
             self._open_file()
-        except (sqlite3.Error, OSError) as error:
+        except FileError as error:
             self._into_memory(error)
 
     def apply(self, arrived: Sequence[Arrival], sent: Iterable[int]) -> None:
@@ -126,7 +127,7 @@ class TelemetryFile:
         self._come_back()
         try:
             self._apply(arrived, sent)
-        except (sqlite3.Error, OSError) as error:
+        except FileError as error:
             self._counters.write_errors += 1
             if self._is_in_memory():
                 raise
@@ -137,7 +138,7 @@ class TelemetryFile:
         """Messages above ``after`` that are not too old, in order, at most ``limit``."""
         try:
             return self._pending(after, limit)
-        except sqlite3.Error as error:
+        except FileError as error:
             if self._is_in_memory():
                 raise
             self._replace(error)
@@ -207,7 +208,7 @@ class TelemetryFile:
         )
         messages = []
         for number, topic, payload, expires_ns, told in rows:
-            if told != checksum(number, topic, payload):
+            if not is_sound(number, topic, payload, told):
                 raise corruption(f"message {number} has changed on the disk")
             messages.append(TelemetryMessage(number, topic, payload, expires_ns))
         return messages
@@ -222,7 +223,7 @@ class TelemetryFile:
             raise sqlite3.OperationalError("the disk is nearly full")
         try:
             self._connection = self._connect()
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             if not is_corrupt(error):
                 raise
             self._set_aside(error)
@@ -259,7 +260,7 @@ class TelemetryFile:
             try:
                 self._set_aside(error)
                 self._open_file()
-            except (sqlite3.Error, OSError) as again:
+            except FileError as again:
                 self._into_memory(again)
         else:
             self._into_memory(error)
@@ -299,7 +300,7 @@ class TelemetryFile:
         if self._connection is None:
             return rows
         size = 0
-        with contextlib.suppress(sqlite3.Error):  # what cannot be read is counted as dropped
+        with contextlib.suppress(*FileError):  # what cannot be read is counted as dropped
             for row in self._connection.execute(f"{_ROWS} ORDER BY number DESC"):
                 size += len(row[1]) + len(row[2]) + DROP_AT_ONCE
                 if size > MEMORY_BYTES // 2:
@@ -321,7 +322,7 @@ class TelemetryFile:
             self._open_file()
             with self._transaction() as connection:
                 connection.executemany(_INSERT, rows)
-        except (sqlite3.Error, OSError) as error:
+        except FileError as error:
             if self._connection is not memory:
                 self.close()
             self._connection = memory

@@ -6,13 +6,12 @@ import asyncio
 import contextlib
 import logging
 import queue
-import sqlite3
 import threading
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
-from daqsvc.outbox.files import is_corrupt, is_full
+from daqsvc.outbox.files import FileError, is_corrupt, is_full
 from daqsvc.outbox.messages import Draft, OutboxError
 
 if TYPE_CHECKING:
@@ -61,8 +60,8 @@ class Batch:
 class Failure:
     """What went wrong in one turn of the writer, if anything."""
 
-    write: sqlite3.Error | OSError | None = None
-    read: sqlite3.Error | None = None
+    write: Exception | None = None
+    read: Exception | None = None
 
 
 class Reports(Protocol):
@@ -150,7 +149,7 @@ class JournalWriter:
                 self._make_way()
                 self._journal.open()
                 unsent = self._journal.unsent()
-            except (OutboxError, sqlite3.Error) as error:
+            except (OutboxError, *FileError) as error:
                 post(fail, opened, error)
                 return
             post(succeed, opened, unsent)
@@ -217,14 +216,14 @@ class JournalWriter:
         try:
             while batch.drafts or batch.sent:
                 self._commit(batch, post)
-        except (sqlite3.Error, OSError) as error:
+        except FileError as error:
             failure.write = error
         try:
             while batch.reads:
                 query, answer = batch.reads[0]
                 post(succeed, answer, query())
                 batch.reads.pop(0)
-        except sqlite3.Error as error:
+        except FileError as error:
             failure.read = error
         return failure
 
@@ -242,13 +241,13 @@ class JournalWriter:
         the broker has makes room.
         """
         try:
-            if isinstance(error, sqlite3.DatabaseError) and (give_up or is_corrupt(error)):
+            if give_up or is_corrupt(error):
                 self._journal.quarantine(error)
                 post(self._reports.replaced, self._journal.unsent())
                 return True
             if is_full(error):
                 return self._journal.make_room()
-        except (sqlite3.Error, OSError) as again:
+        except FileError as again:
             if not is_full(again):
                 log.error("outbox %s cannot be recovered: %s", self._journal.path, again)  # noqa: TRY400
         return False

@@ -1,0 +1,154 @@
+"""A journal damaged at random: the service starts, tells no lie, and uses no number twice."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.reading import JOURNAL_NAME, read_journal
+from daqsvc.outbox.store import Outbox
+
+TOPICS = ["daqsvc/lab/edge-1/rig/alarms/a", "daqsvc/lab/edge-1/rig/alarms/b"]
+COUNT = 120
+
+
+def payload(sequence):
+    return (b"number %d " % sequence) * (1 + sequence % 40)
+
+
+async def fill(path):
+    outbox = Outbox(path, SystemClock())
+    await outbox.open()
+    numbers = [await outbox.append(TOPICS[n % 2], payload, retain=True) for n in range(COUNT)]
+    for number in numbers[: COUNT // 2]:
+        outbox.mark_sent(number)
+    await outbox.pending_telemetry(0, 1)
+    return outbox, numbers
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    """The same journal properly closed and as kill -9 leaves it; and the numbers used."""
+    directory = tmp_path_factory.mktemp("stores")
+
+    async def made():
+        outbox, numbers = await fill(directory / "closed" / JOURNAL_NAME)
+        await outbox.pending(0, 1)
+        shutil.copytree(directory / "closed", directory / "killed")
+        await outbox.close()
+        return numbers
+
+    numbers = asyncio.run(made())
+    return {"closed": directory / "closed", "killed": directory / "killed"}, numbers
+
+
+async def restarted(store, numbers):
+    """Open the damaged store and look at all of it; then go on."""
+    outbox = Outbox(store / JOURNAL_NAME, SystemClock())
+    await outbox.open()
+    try:
+        async with asyncio.timeout(20):
+            for _ in range(2):
+                for message in [
+                    *await outbox.pending(0, 10**6),
+                    *await outbox.latest(),
+                    *await outbox.retained(),
+                ]:
+                    assert message.sequence in numbers
+                    assert message.topic == TOPICS[numbers.index(message.sequence) % 2]
+                    assert message.payload == payload(message.sequence)
+            after = await outbox.append(TOPICS[0], payload, retain=True)
+            pending = await outbox.pending(0, 10**6)
+        assert after > max(numbers)
+        assert pending[-1].sequence == after
+        assert outbox.counters.depth == len(pending)
+        return pending, outbox.counters
+    finally:
+        await outbox.close()
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_flipped_bytes(stores, data):
+    kept, numbers = stores
+    with tempfile.TemporaryDirectory() as scratch:
+        store = Path(scratch) / "store"
+        state = data.draw(st.sampled_from(sorted(kept)))
+        shutil.copytree(kept[state], store)
+        (store / f"{JOURNAL_NAME}-shm").unlink(missing_ok=True)  # the index is memory, not disk
+        part = data.draw(
+            st.sampled_from([p for p in ("", "-wal") if (store / f"{JOURNAL_NAME}{p}").exists()])
+        )
+        damaged = store / f"{JOURNAL_NAME}{part}"
+        content = bytearray(damaged.read_bytes())
+        for _ in range(data.draw(st.sampled_from([1, 1, 3, 100]))):
+            # Half of the hits go where it hurts: the headers of the file and of its pages.
+            page = data.draw(st.integers(0, max(len(content) // 4096 - 1, 0)))
+            at = data.draw(
+                st.one_of(
+                    st.integers(0, len(content) - 1), st.integers(0, 120).map(lambda n, p=page: p * 4096 + n)
+                )
+            )
+            content[at % len(content)] ^= data.draw(st.integers(1, 255))
+        damaged.write_bytes(content)
+        with contextlib.suppress(OutboxError):
+            view = read_journal(store)
+            assert all(entry.payload == payload(entry.sequence) for entry in view.history)
+        asyncio.run(restarted(store, numbers))
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_torn_files(stores, data):
+    kept, numbers = stores
+    with tempfile.TemporaryDirectory() as scratch:
+        store = Path(scratch) / "store"
+        shutil.copytree(kept["closed"], store)
+        whole = (store / JOURNAL_NAME).read_bytes()
+        begin = data.draw(st.integers(0, len(whole)))
+        end = data.draw(st.integers(begin, len(whole)))
+        torn = data.draw(st.sampled_from([whole[:begin], whole[:begin] + bytes(end - begin) + whole[end:]]))
+        (store / JOURNAL_NAME).write_bytes(torn)
+        asyncio.run(restarted(store, numbers))
+
+
+def test_one_bad_page_costs_the_messages_on_it_and_no_others(stores, tmp_path):
+    kept, numbers = stores
+    store = tmp_path / "store"
+    shutil.copytree(kept["closed"], store)
+    path = store / JOURNAL_NAME
+    content = bytearray(path.read_bytes())
+    # A number in the middle of what is not sent yet.
+    hit = numbers[len(numbers) * 3 // 4]
+    page = content.index(payload(hit)) // 4096
+    lost = {n for n in numbers if payload(n) in content[page * 4096 : (page + 1) * 4096]}
+    content[page * 4096 : (page + 1) * 4096] = b"\xff" * 4096
+    path.write_bytes(content)
+    pending, counters = asyncio.run(restarted(store, numbers))
+    assert hit in lost
+    assert counters.quarantined == 1
+    saved = {message.sequence for message in pending[:-1]}
+    assert saved >= set(numbers[COUNT // 2 :]) - {n for n in numbers if min(lost) - 3 <= n <= max(lost) + 3}
+    assert len(saved) > COUNT // 3
+
+
+def test_a_flipped_bit_in_a_payload_costs_that_message_only(stores, tmp_path):
+    """SQLite's own check sees nothing of it."""
+    kept, numbers = stores
+    store = tmp_path / "store"
+    shutil.copytree(kept["closed"], store)
+    path = store / JOURNAL_NAME
+    hit = numbers[-5]
+    path.write_bytes(path.read_bytes().replace(b"number %d " % hit, b"nomber %d " % hit))
+    pending, counters = asyncio.run(restarted(store, numbers))
+    assert counters.quarantined == 1
+    assert [m.sequence for m in pending[:-1]] == [n for n in numbers[COUNT // 2 :] if n != hit]
