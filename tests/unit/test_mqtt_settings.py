@@ -9,11 +9,12 @@ from machine_files import LAVAL, changed, only_problem
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.assembly_mqtt import mqtt_settings
-from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
 URL = 'url = "mqtts://broker.example:8883"'
 ROOT = 'topic_root = "daqsvc"'
+ALLOWED = 'allow = ["acknowledge", "shelve", "unshelve"]'
 
 
 def machine(*replacements):
@@ -33,9 +34,6 @@ def machine(*replacements):
             "besides key_file",
             "remove one",
         ),
-        ('[mqtt.commands]\nallow = ["reboot"]', "mqtt.commands.allow[0]", "acknowledge", "acknowledge"),
-        ("[mqtt.commands]\nmax_age_s = 0", "mqtt.commands.max_age_s", "greater than 0", "max_age_s"),
-        ("[mqtt.commands]\nmax_bytes = 10", "mqtt.commands.max_bytes", "256 or more", "max_bytes"),
         ('[mqtt.home_assistant]\nprefix = "a/#"', "mqtt.home_assistant.prefix", "between", "write e.g."),
     ],
 )
@@ -44,6 +42,20 @@ def test_what_does_not_fit_is_named(addition, key, message, remedy):
     assert problem.key == key
     assert message in problem.message
     assert remedy in problem.remedy
+
+
+@pytest.mark.parametrize(
+    ("line", "key", "message"),
+    [
+        ('allow = ["reboot"]', "mqtt.commands.allow[0]", "acknowledge"),
+        ("max_age_s = 0", "mqtt.commands.max_age_s", "greater than 0"),
+        ("max_bytes = 10", "mqtt.commands.max_bytes", "256 or more"),
+    ],
+)
+def test_commands_that_cannot_be_are_named(line, key, message):
+    problem, _ = only_problem(LAVAL, (ALLOWED, line))
+    assert problem.key == key
+    assert message in problem.message
 
 
 def test_plaintext_needs_to_be_meant():
@@ -55,7 +67,6 @@ def test_plaintext_needs_to_be_meant():
 def test_what_would_go_unencrypted_to_another_host_is_warned_of():
     plain = machine(
         (URL, 'url = "mqtt://broker.example"\ninsecure = true\ncert_file = "box.crt"'),
-        (ROOT, f"{ROOT}\n[mqtt.commands]\nenabled = true"),
     )
     assert {warning.key for warning in plain.warnings} == {
         "mqtt.ca_file",
@@ -73,19 +84,20 @@ def test_files_start_at_the_directory_of_the_machine_file():
 
 
 def test_without_being_asked_nothing_is_taken_and_nobody_else_is_told():
-    settings = mqtt_settings(load_machine_file(LAVAL))
+    text = LAVAL.read_text(encoding="utf-8")
+    settings = mqtt_settings(parse_machine_file(text[: text.index("[mqtt.commands]")], LAVAL))
     assert settings.commands is None
     assert settings.home_assistant is None
 
 
 def test_only_enabled_commands_are_taken():
-    listed = '[mqtt.commands]\nallow = ["acknowledge", "shelve"]'
-    assert mqtt_settings(machine((ROOT, f"{ROOT}\n{listed}"))).commands is None
-    enabled = machine((ROOT, f"{ROOT}\n{listed}\nenabled = true"))
+    listed = 'allow = ["acknowledge", "reset"]'
+    assert mqtt_settings(machine((ALLOWED, listed), ("enabled = true", ""))).commands is None
+    enabled = machine((ALLOWED, listed))
     commands = mqtt_settings(enabled).commands
     assert commands.machines == ("laval-rig",)
-    assert commands.allow == {Verb.ACKNOWLEDGE, Verb.SHELVE}
-    assert "takes commands: acknowledge, shelve" in describe(enabled)
+    assert commands.allow == {Verb.ACKNOWLEDGE, Verb.RESET}
+    assert "takes commands: acknowledge, reset" in describe(enabled)
 
 
 def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
