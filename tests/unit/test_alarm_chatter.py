@@ -63,6 +63,14 @@ def test_gaps_do_not_count_as_quiet():
     assert ("vibration-x", "quiet") in kinds(rig.rms(0.0) + rig.rms(0.0))
 
 
+def test_quiet_is_a_time_and_no_number_of_statements():
+    rig = chattering()
+    for _ in range(99):
+        assert rig.rms(0.0, seconds=0.1) == []
+    assert rig.status("vibration-x").chattering
+    assert ("vibration-x", "quiet") in kinds(rig.rms(0.0, seconds=0.1) + rig.rms(0.0, seconds=0.1))
+
+
 def test_slow_raises_are_no_chatter():
     rig = AlarmRig(LEVEL, handling=CHATTER)
     for _ in range(10):
