@@ -8,6 +8,8 @@ import json
 import os
 import socket
 import stat
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,9 +21,9 @@ from daqsvc.control import ControlError, ControlServer, Request, ask
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
-    from pathlib import Path
 
 MACHINE = "laval-rig"
+NOBODY = 65_534
 RESET = Request(schema="daqsvc.control/1", verb=Verb.RESET, alarm="a", by="b")
 
 
@@ -217,6 +219,22 @@ async def test_nothing_is_left_of_it_and_nobody_is_waited_for_when_it_closes(tmp
     assert await reader.read() == await idle_reader.read() == b""
     for each in (writer, idle_writer):
         each.close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
+async def test_nobody_but_its_own_user_may_command_the_service() -> None:
+    with tempfile.TemporaryDirectory(prefix="daqsvc-test-") as name:
+        store = Path(name)
+        store.chmod(0o755)  # noqa: ASYNC240
+        desk = Desk()
+        async with serving(store, desk) as server:
+            os.seteuid(NOBODY)
+            try:
+                with pytest.raises(ControlError, match="takes commands from its own user and from root only"):
+                    ask(store, RESET)
+            finally:
+                os.seteuid(0)
+            assert (server.counters.clients, desk.told) == (0, [])
 
 
 async def test_a_socket_that_a_killed_service_left_is_replaced(tmp_path: Path) -> None:
