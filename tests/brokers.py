@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -85,6 +86,11 @@ class Mosquitto:
             self._process.kill()
             self._process.wait()
             self._process = None
+
+    def reload(self) -> None:
+        """Have it read its certificates again, without ending a connection."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGHUP)
 
     @property
     def log_text(self) -> str:

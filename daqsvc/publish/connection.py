@@ -38,6 +38,9 @@ INCOMING = 64
 LARGEST_PACKET = 1 << 20
 """Bytes of the largest packet that an MQTT 5 broker may send to the box."""
 
+_HEAD_BYTES = 64
+"""More than the rest of a PUBLISH packet needs: fixed header, packet id, properties that we set."""
+
 _SESSION_TAKEN_OVER = 142
 _FAILURE = 128
 
@@ -105,6 +108,7 @@ class Connection(aiomqtt.Client):
         self._on_overlooked = on_overlooked
         self._in_flight = in_flight
         self._window = asyncio.Semaphore(in_flight)
+        self._largest_packet: int | None = None
         self._acknowledgements: dict[int, asyncio.Future[ReasonCode]] = {}
         self._disconnected.add_done_callback(self._give_up)
         self._abandoned = False
@@ -148,13 +152,20 @@ class Connection(aiomqtt.Client):
             correlation: what the asker wants to see again in the answer (MQTT 5 only).
 
         Raises:
-            PublishRefusedError: the broker will not take it; the connection stands.
+            PublishRefusedError: the broker will not take it, or it is too large; the connection stands.
             SilentBrokerError: no PUBACK came in time.
             aiomqtt.MqttError: the connection is lost.
         """
         async with self._window:
             if self._disconnected.done():
                 raise self._loss()
+            size = len(topic.encode()) + len(payload) + _HEAD_BYTES
+            if self._largest_packet is not None and size > self._largest_packet:
+                # Sent all the same, it would only end the connection, again and again.
+                raise PublishRefusedError(
+                    f"the message on {topic} needs {size} bytes and the broker takes {self._largest_packet}; "
+                    "raise the largest packet there (Mosquitto: max_packet_size)"
+                )
             info = self._client.publish(topic, payload, 1, retain, self._told(expiry_s, correlation))
             if info.rc != 0:
                 raise aiomqtt.MqttCodeError(info.rc, "could not publish")
@@ -301,7 +312,8 @@ class Connection(aiomqtt.Client):
         reason_code: ReasonCode,
         properties: Properties | None = None,
     ) -> None:
-        # paho does not keep to the broker's window, and the broker ends a connection that exceeds it.
+        # paho does not keep to the broker's limits, and the broker ends a connection that exceeds them.
+        self._largest_packet = getattr(properties, "MaximumPacketSize", None)
         least = min(getattr(properties, "ReceiveMaximum", self._in_flight), self._in_flight)
         if not self._connected.done() and least < self._in_flight:
             self._window = asyncio.Semaphore(least)

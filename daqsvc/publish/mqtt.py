@@ -62,6 +62,9 @@ GOODBYE_S = 0.3
 
 NS_PER_DAY = 86_400 * NS_PER_S
 
+SOON_DAYS = 15
+"""A day before anybody is alarmed by a certificate that ends, the broker is asked for the one it has now."""
+
 _UNSUPPORTED_PROTOCOL_VERSION = 132
 
 
@@ -245,6 +248,11 @@ class MqttPublisher:
         if authority is not None:
             self._expiry["ca"] = authority.not_after_ns
 
+    def _ends_soon(self) -> bool:
+        """Whether what the broker has shown, or the authority behind it, ends soon."""
+        limit_ns = self._clock.wall_ns() + SOON_DAYS * NS_PER_DAY
+        return any(self._expiry.get(name, limit_ns) < limit_ns for name in ("broker", "ca"))
+
     async def _serve(self, connection: Connection, credentials: Credentials) -> None:
         """Publish over one connection until it is lost or the publisher stops."""
         session = Session(
@@ -257,13 +265,14 @@ class MqttPublisher:
             counters=self.counters,
             intake=self._intake,
             home_assistant=self._home_assistant,
+            ends_soon=self._ends_soon,
             stopping=self._stopping,
         )
         since_s = asyncio.get_running_loop().time()
         try:
             await session.run(lambda: self._left_s() - GOODBYE_S)
         except CredentialsReplacedError:
-            log.info("credentials for MQTT broker %s were replaced; connecting again", self._name)
+            log.info("connecting to MQTT broker %s again, to use and see the certificates of now", self._name)
             await connection.close(GOODBYE_S)
         except TakenOverError:
             self._report_rival("this connection was ended by another client")

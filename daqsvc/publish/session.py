@@ -30,12 +30,15 @@ log = logging.getLogger(__name__)
 LOOK_S = 10.0
 """How often to look whether a certificate, key or password was replaced."""
 
+LOOK_AGAIN_S = 86_400.0
+"""After so long a connection is made anew to see the broker's certificate, if the one it showed ends soon."""
+
 ANSWER_EXPIRY_S = 60.0
 """How long the answer to a command is of use."""
 
 
 class CredentialsReplacedError(Exception):
-    """Certificate, key or password were replaced: time for a new connection."""
+    """Certificate, key or password were replaced, or the broker's may be: time for a new connection."""
 
 
 class Session:
@@ -51,6 +54,7 @@ class Session:
         counters: what is counted here.
         intake: takes commands; None if there are none over MQTT.
         home_assistant: None to leave Home Assistant alone.
+        ends_soon: whether the certificate that the broker has shown, or the one behind it, ends soon.
         stopping: ends the deliveries as soon as nothing is left.
     """
 
@@ -66,6 +70,7 @@ class Session:
         counters: PublishCounters,
         intake: CommandIntake | None,
         home_assistant: HomeAssistantLink | None,
+        ends_soon: Callable[[], bool],
         stopping: asyncio.Event,
     ) -> None:
         self._connection = connection
@@ -77,6 +82,7 @@ class Session:
         self._counters = counters
         self._intake = intake
         self._home_assistant = home_assistant
+        self._ends_soon = ends_soon
         self._stopping = stopping
 
     async def run(self, left_s: Callable[[], float]) -> None:
@@ -194,12 +200,19 @@ class Session:
     async def _look_after_credentials(self) -> None:
         """Ask for a new connection when files were replaced by others that can be used.
 
+        Also when the broker's certificate ends soon: it may long be renewed there, which only a new
+        connection shows.
+
         Raises:
-            CredentialsReplacedError: they were.
+            CredentialsReplacedError: they were, or may be.
         """
         known = self._credentials.stamp
+        loop = asyncio.get_running_loop()
+        since_s = loop.time()
         while True:
             await asyncio.sleep(LOOK_S)
+            if loop.time() - since_s > LOOK_AGAIN_S and self._ends_soon():
+                raise CredentialsReplacedError
             stamp = await asyncio.to_thread(stamp_of, self._settings)
             if stamp == known:
                 continue

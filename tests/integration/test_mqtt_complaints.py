@@ -94,6 +94,24 @@ async def test_a_smaller_window_at_the_broker_ends_the_connection_again_and_agai
 
 
 @pytest.mark.mosquitto
+async def test_a_message_too_large_for_the_broker_ends_the_connection_again_and_again(
+    tmp_path, outbox, caplog
+):
+    """MQTT 5, 3.1.2.11.4: it is not sent, and what to do is said; smaller ones before it have passed."""
+    with running_mosquitto(tmp_path, config="max_packet_size 1000") as mosquitto:
+        async with publishing(outbox, mosquitto.port) as publisher:
+            await append(outbox, 3)
+            await outbox.append(ALARM, lambda n: b"x" * 1000, retain=True)
+            await eventually(lambda: "raise the largest packet there" in caplog.text, "it is said")
+            assert f"the message on {ALARM} needs" in caplog.text
+            await eventually(lambda: outbox.counters.sent == 3, "the smaller ones have passed")
+            publisher.telemetry("status", b"x" * 1000)
+            await eventually(lambda: publisher.counters.telemetry_refused == 1, "telemetry is dropped")
+        assert "exceeds" not in mosquitto.log_text
+    assert len(await outbox.pending(0, 10)) == 1
+
+
+@pytest.mark.mosquitto
 async def test_one_log_line_per_message_above_ten_in_flight(mosquitto, outbox, caplog):
     """aiomqtt 2.5.1 warned over a thousand times in a run of 2000 messages."""
     caplog.set_level(logging.DEBUG)

@@ -169,6 +169,28 @@ async def test_a_renewal_is_no_outage_to_anybody(tmp_path, outbox, monkeypatch):
             assert [m.payload["state"] for m in live.on("/availability")] == ["online", "online"]
 
 
+async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_loss(
+    tmp_path, outbox, monkeypatch
+):
+    """A broker that is told to reload keeps its connections: the old certificate would alarm for ever."""
+    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.session.LOOK_AGAIN_S", 0.2)
+    ca = authority(tmp_path, "ca")
+    broker = signed(tmp_path, "broker", ca, host="IP:127.0.0.1", days=5)
+    renewed = signed(tmp_path, "renewed", ca, host="IP:127.0.0.1", days=29)
+    with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
+            await eventually(lambda: publisher.counters.connected, "connected")
+            assert publisher.certificate_expiry["broker"] / 1e9 == broker.not_after_s
+            renewed.replaces(broker)
+            mosquitto.reload()
+            ends_s = renewed.not_after_s
+            await eventually(lambda: publisher.certificate_expiry["broker"] / 1e9 == ends_s, "it is seen")
+            connections = publisher.counters.connections
+            await asyncio.sleep(0.5)
+            assert publisher.counters.connections == connections, "what lasts is not looked at again"
+
+
 async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, outbox, monkeypatch, caplog):
     monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.02)
     ca = authority(tmp_path, "ca")
