@@ -55,8 +55,11 @@ def bearing_orders(designation: str) -> BearingOrders:
         if name in known:
             return known[name]
     near = difflib.get_close_matches(bare, known, n=4, cutoff=0.5) or sorted(known)
+    stem = bare.partition("-")[0]
+    # Of a known bearing, only the seals were written in a way that nobody uses.
+    meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
     raise KeyError(
-        f"bearing {designation!r} is not in the catalogue; near names: {', '.join(near)}. "
+        f"bearing {designation!r} is not in the catalogue; near names: {', '.join(near)}{meant}. "
         "Give its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
     )
 

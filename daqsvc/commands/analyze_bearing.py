@@ -59,7 +59,12 @@ def _wrong(arguments: argparse.Namespace, machine: str | None) -> Iterator[str]:
         yield "--bearing, --orders: the machine file says which bearings there are; leave them out"
     if arguments.bearing is not None and arguments.orders is not None:
         yield "--bearing and --orders both say what the bearing is; leave out one of them"
-    given = {**rotor_options(arguments), "--calibration": arguments.calibration is not None}
+    if arguments.calibration is not None:
+        yield (
+            "--calibration: goes with a machine file, whose bearings it was learnt for; with --bearing or "
+            "--orders give the healthy recording itself, --baseline FILE"
+        )
+    given = rotor_options(arguments)
     if extra := [name for name, is_there in given.items() if is_there and name not in _SHARED]:
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
     missing = [

@@ -61,7 +61,9 @@ def order_misuse(arguments: argparse.Namespace, machine: str | None) -> str:
         if value is None
     ]
     if missing:
-        return f"to compare accelerometers with a healthy run, {', '.join(missing)} must be given too"
+        bearing = "to judge a bearing, --bearing or --orders; " if arguments.baseline is None else ""
+        told = ", ".join(missing)
+        return f"{bearing}to compare accelerometers with a healthy run, {told} must be given too"
     if arguments.speed_rpm.orbit:
         return "--speed-rpm orbit:N needs two probes; with --channels give the nominal speed alone"
     if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
