@@ -118,6 +118,7 @@ class FaultyProxy:
         self._target_port = target_port
         self._server: asyncio.Server | None = None
         self._links: set[_Link] = set()
+        self._handlers: set[asyncio.Task[None]] = set()
         self._bytes_to_live: int | None = None
 
     async def __aenter__(self) -> Self:
@@ -127,10 +128,12 @@ class FaultyProxy:
     async def __aexit__(self, *_: object) -> None:
         assert self._server is not None
         self._server.close()
-        self.reset()
+        self.blocked = True
+        while self._handlers:
+            self.reset()
+            await asyncio.wait(self._handlers, timeout=0.05)
         await self._server.wait_closed()
-        while self._links:
-            await asyncio.sleep(0.01)
+        await asyncio.sleep(0)  # a transport closes its socket on the next turn of the loop
 
     @property
     def port(self) -> int:
@@ -160,7 +163,12 @@ class FaultyProxy:
         self.slice_bytes = 0
         self._bytes_to_live = None
 
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        handler = asyncio.create_task(self._handle(reader, writer))
+        self._handlers.add(handler)
+        handler.add_done_callback(self._handlers.discard)
+
+    async def _handle(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             if self.blocked:
                 raise ConnectionRefusedError
@@ -178,6 +186,7 @@ class FaultyProxy:
             )
         finally:
             self._links.discard(link)
+            link.reset()
 
     async def _pump(
         self, link: _Link, source: asyncio.StreamReader, sink: asyncio.StreamWriter, *, up: bool

@@ -57,13 +57,11 @@ class Consumer:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._client.disconnect()
-        await asyncio.to_thread(self._client.loop_stop)
+        await self._leave()
 
     async def nap(self, duration_s: float) -> None:
         """Go away for a while; the broker keeps the session and what comes in the meantime."""
-        self._client.disconnect()
-        await asyncio.to_thread(self._client.loop_stop)
+        await self._leave()
         await asyncio.sleep(duration_s)
         await asyncio.to_thread(self._client.reconnect)
         self._client.loop_start()
@@ -85,6 +83,12 @@ class Consumer:
                 return False
             await asyncio.sleep(0.01)
         return True
+
+    async def _leave(self) -> None:
+        self._client.disconnect()
+        await asyncio.to_thread(self._client.loop_stop)
+        # The loop may be stopped before it has seen the end, and starting it again leaves a pair behind.
+        self._client._reset_sockets()
 
     def _connected(self, client: paho.Client, _userdata: object, flags: Any, *_: object) -> None:
         if flags.session_present:

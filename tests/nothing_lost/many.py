@@ -57,13 +57,14 @@ async def run_all(
 
 def table(reports: Sequence[Report]) -> str:
     """What the runs went through and what was kept, by broker."""
-    lines = ["broker      runs   kept  alarms  kills  repeats  lost by broker  worst delay"]
+    lines = ["broker      runs   kept  alarms  kills  crashes  repeats  lost by broker  worst delay"]
     for broker in sorted({report.course.broker for report in reports}, reverse=True):
         ours = [report for report in reports if report.course.broker == broker]
         verdicts = [report.verdict for report in ours]
         lines.append(
             f"{broker:10} {len(ours):5d}  {sum(not v.violations for v in verdicts):5d}"
             f"  {sum(v.alarms for v in verdicts):6d}  {sum(r.kills for r in ours):5d}"
+            f"  {sum(r.crashes for r in ours):7d}"
             f"  {sum(v.repeats for v in verdicts):7d}  {sum(v.forgotten for v in verdicts):14d}"
             f"  {max(v.worst_delay_s for v in verdicts):9.1f} s"
         )

@@ -70,6 +70,7 @@ class Report:
     verdict: Verdict
     befell: list[str]
     kills: int
+    crashes: int
     duration_s: float
     directory: Path
 
@@ -94,7 +95,10 @@ class Stage:
     befell: list[str] = field(default_factory=list)
     kills: int = 0
     failures: list[str] = field(default_factory=list)
+    crashes: int = 0
+    disk_is_full: bool = False
     disk_was_full: bool = False
+    disk_excuses: bool = False
     restart_after_s: float = 0.0
     forgotten: set[str] = field(default_factory=set)
 
@@ -110,6 +114,7 @@ class Stage:
         """Start the teller again whenever it ends, as systemd would, until it ends of itself."""
         with (self.directory / "teller.log").open("ab") as log:
             while True:
+                self.disk_excuses = self.disk_is_full
                 self.teller = await asyncio.create_subprocess_exec(
                     sys.executable, "-m", "nothing_lost.teller", str(self.store / "box"), str(self.witness),
                     str(self.course.seed), "127.0.0.1", str(self.proxy.port), self.course.protocol,
@@ -120,7 +125,8 @@ class Stage:
                 if code == 0:
                     return
                 killed = code == -signal.SIGKILL
-                if not killed and not self.disk_was_full:
+                self.crashes += not killed
+                if not (killed or self.disk_excuses):
                     self.failures.append(f"the teller ended by itself with code {code}; see teller.log")
                     return
                 await asyncio.sleep(self.restart_after_s if killed else 0.2)
@@ -230,13 +236,14 @@ class Stage:
     async def disk_full(self) -> None:
         if self.disk is None or self.teller is None:
             return
-        self.disk_was_full = True
+        self.disk_is_full = self.disk_was_full = self.disk_excuses = True
         self.disk.fill(self.teller.pid)
         await asyncio.sleep(self.some_s(0.1, 0.6))
         if self.rng.random() < 0.4:
             await self.kill()
             await asyncio.sleep(self.some_s(0.0, 0.8))
         self.disk.free(self.teller.pid)
+        self.disk_is_full = False
 
     def plan(self) -> list[tuple[int, Callable[[], Coroutine[None, None, None]]]]:
         """What will befall this run, each with the step of the script that is told by then."""
@@ -324,4 +331,6 @@ async def run(course: Course, directory: Path) -> Report:
         )
         verdict = Verdict.on(evidence)
         verdict.violations[:0] = stage.failures
-        return Report(course, verdict, stage.befell, stage.kills, time.monotonic() - begun_s, directory)
+        return Report(
+            course, verdict, stage.befell, stage.kills, stage.crashes, time.monotonic() - begun_s, directory
+        )
