@@ -6,16 +6,19 @@ stays in the settings. Secrets are in no message of this module and in no ``repr
 
 from __future__ import annotations
 
+import logging
 import os
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.publish.certificates import Certificate, certificates
+from daqsvc.publish.certificates import Certificate, CertificateError, certificates
 
 if TYPE_CHECKING:
     from daqsvc.publish.settings import MqttSettings
+
+log = logging.getLogger(__name__)
 
 CREDENTIALS_DIRECTORY = "CREDENTIALS_DIRECTORY"
 """Where systemd tells a service the directory of its credentials (systemd.exec, LoadCredential=)."""
@@ -45,7 +48,6 @@ def read_credentials(settings: MqttSettings) -> Credentials:
 
     Raises:
         OSError: a file cannot be read, or does not hold what it should; the message names it.
-        CertificateError: a certificate cannot be read.
     """
     stamp = stamp_of(settings)  # before reading: what is replaced meanwhile is seen as changed later
     password = _password(settings)
@@ -56,8 +58,8 @@ def read_credentials(settings: MqttSettings) -> Credentials:
     if settings.cert_file is not None:
         key = _key_file(settings)
         _show(context, settings.cert_file, key)
-        own = next(iter(certificates(settings.cert_file)), None)
-    trusted = () if settings.ca_file is None else tuple(certificates(settings.ca_file))
+        own = next(iter(_watched(settings.cert_file)), None)
+    trusted = () if settings.ca_file is None else tuple(_watched(settings.ca_file))
     return Credentials(password, context, own, trusted, stamp)
 
 
@@ -103,6 +105,15 @@ def _show(context: ssl.SSLContext, cert_file: Path, key_file: Path | None) -> No
         raise FileNotFoundError(
             f"{missing} is not there; put it there, or correct cert_file and key_file"
         ) from error
+
+
+def _watched(path: Path) -> list[Certificate]:
+    """The certificates of a file, to know when they end; none if only OpenSSL can read them."""
+    try:
+        return certificates(path)
+    except CertificateError as error:
+        log.warning("nobody will be told when the certificates in %s end: %s", path, error)
+        return []
 
 
 def _password(settings: MqttSettings) -> str | None:

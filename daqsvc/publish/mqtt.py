@@ -12,7 +12,7 @@ import aiomqtt
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
-from daqsvc.publish.certificates import certificate, voucher
+from daqsvc.publish.certificates import CertificateError, certificate, voucher
 from daqsvc.publish.command_intake import CommandIntake
 from daqsvc.publish.connection import (
     PUBACK_S,
@@ -202,7 +202,7 @@ class MqttPublisher:
             except BaseException:
                 connection.abandon()
                 raise
-        except (aiomqtt.MqttError, OSError, ValueError) as error:
+        except (aiomqtt.MqttError, OSError) as error:
             if not self._falls_back(error):
                 self._report_outage(str(error))
             return None
@@ -242,7 +242,11 @@ class MqttPublisher:
         der = connection.shown_certificate
         if der is None:
             return
-        shown = certificate(der)
+        try:
+            shown = certificate(der)
+        except CertificateError as error:
+            log.warning("nobody will be told when the certificate of %s ends: %s", self._name, error)
+            return
         self._expiry["broker"] = shown.not_after_ns
         authority = voucher(shown, credentials.trusted)
         if authority is not None:

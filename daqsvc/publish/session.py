@@ -219,7 +219,7 @@ class Session:
             known = stamp
             try:
                 await asyncio.to_thread(read_credentials, self._settings)
-            except (OSError, ValueError) as error:
+            except OSError as error:
                 log.warning("%s; the connection stands, but would not come back after a loss", error)
                 continue
             raise CredentialsReplacedError

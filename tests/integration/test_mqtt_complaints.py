@@ -186,8 +186,7 @@ async def test_all_boxes_come_back_at_the_same_instant(outbox, mosquitto):
         async with publishing(outbox, mosquitto.port) as publisher:
             waits.append(publisher._backoff.next_ns() / 1e9)
     assert max(waits) < 0.8
-    assert min(waits) < 0.2
-    assert max(waits) > 0.6
+    assert min(waits) < 0.4 < max(waits)
     assert len(set(waits)) == 40
 
 

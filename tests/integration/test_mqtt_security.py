@@ -14,6 +14,7 @@ from tls_files import authority, openssl, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.store import Outbox
+from daqsvc.publish.certificates import CertificateError
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
 from daqsvc.publish.payloads import status_payload
@@ -186,6 +187,7 @@ async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_lo
             mosquitto.reload()
             ends_s = renewed.not_after_s
             await eventually(lambda: publisher.certificate_expiry["broker"] / 1e9 == ends_s, "it is seen")
+            await eventually(lambda: publisher.counters.connected, "connected again")
             connections = publisher.counters.connections
             await asyncio.sleep(0.5)
             assert publisher.counters.connections == connections, "what lasts is not looked at again"
@@ -208,6 +210,23 @@ async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, out
             assert publisher.counters.connections == 1
             box.cert.write_bytes(whole)
             await eventually(lambda: publisher.counters.connections == 2, "the whole one is taken")
+
+
+async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
+    tmp_path, outbox, monkeypatch, caplog
+):
+    def unreadable(_der):
+        raise CertificateError("not an X.509 certificate: it is stranger than that")
+
+    monkeypatch.setattr("daqsvc.publish.certificates.certificate", unreadable)
+    monkeypatch.setattr("daqsvc.publish.mqtt.certificate", unreadable)
+    ca = authority(tmp_path, "ca")
+    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
+        async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
+            await eventually(lambda: publisher.counters.connected, "connected")
+            assert dict(publisher.certificate_expiry) == {}
+    assert f"when the certificates in {box.cert} end" in caplog.text
 
 
 async def test_an_encrypted_key_is_refused_and_nobody_is_asked_at_the_terminal(tmp_path, outbox, caplog):
