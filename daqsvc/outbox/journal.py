@@ -205,14 +205,15 @@ class Journal:
         if gone:
             self.vanished += gone
             log.error(
-                "outbox %s ends with message %d, but numbers up to %d were used: %d messages are gone from "
-                "the disk; it was damaged, or is an older copy",
+                "outbox %s ends with message %d, but numbers up to %d were used: up to %d messages are "
+                "gone from the disk; it was damaged, or is an older copy",
                 self.path,
                 stored,
                 (stored or 0) + gone,
                 gone,
             )
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
+        self._mark.begin(self.last_sequence)
 
     def _prepare(self, connection: sqlite3.Connection) -> int | None:
         """Bring the tables up to date; the highest number that the file knows, None if it is new."""

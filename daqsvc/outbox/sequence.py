@@ -93,6 +93,10 @@ class SequenceMark:
         # A new file's numbers start at the wall clock: how many of the old one are gone cannot be told.
         return max(self._used - stored, 0) if stored is not None else 0
 
+    def begin(self, last: int) -> None:
+        """Take all numbers up to ``last`` for used; durable with the next `advance`."""
+        self._used = max(self._used, last)
+
     def can_be_used(self, number: int) -> bool:
         """Whether ``number`` may have been given, as far as the side file tells."""
         return not self._ceiling or 0 <= number <= self._ceiling

@@ -20,6 +20,8 @@ from daqsvc.outbox.store import Outbox
 TOPICS = ["daqsvc/lab/edge-1/rig/alarms/a", "daqsvc/lab/edge-1/rig/alarms/b"]
 COUNT = 120
 
+MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # noqa: S108
+
 
 def payload(sequence):
     return (b"number %d " % sequence) * (1 + sequence % 40)
@@ -80,7 +82,7 @@ async def restarted(store, numbers):
 @given(data=st.data())
 def test_flipped_bytes(stores, data):
     kept, numbers = stores
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory(dir=MEMORY) as scratch:
         store = Path(scratch) / "store"
         state = data.draw(st.sampled_from(sorted(kept)))
         shutil.copytree(kept[state], store)
@@ -110,7 +112,7 @@ def test_flipped_bytes(stores, data):
 @given(data=st.data())
 def test_torn_files(stores, data):
     kept, numbers = stores
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory(dir=MEMORY) as scratch:
         store = Path(scratch) / "store"
         shutil.copytree(kept["closed"], store)
         whole = (store / JOURNAL_NAME).read_bytes()
