@@ -40,7 +40,7 @@ RULES = [
 GROUPS = {rule_.alarm: rule_.group for rule_ in RULES}
 SPEAKERS = {"levels/x": ("x",), "levels/y": ("y",), "levels/z": ("z",), "bank": ("x", "y")}
 HANDLING = AlarmHandling(
-    chatter=ChatterLimit(2, 20 * SECOND_NS, 4 * SECOND_NS),
+    chatter=ChatterLimit(1, 20 * SECOND_NS, 4 * SECOND_NS),
     flood=FloodLimit(6, 30 * SECOND_NS),
     start_up=StartUp(detector="bank", between=(100.0, 500.0), at_most_ns=10 * SECOND_NS),
     shelve_at_most_s=100.0,
@@ -131,6 +131,8 @@ class Alarms(RuleBasedStateMachine):
             self.occurrences.add(event.occurrence)
         else:
             assert event.occurrence == occurrence
+        if event.kind in ANNUNCIATIONS:
+            assert own(event) is AlarmState.ACTIVE_UNACKNOWLEDGED, "nobody is called"
         held = set() if before is None else set(before.holds)
         for hold, (covers, uncovers) in HOLD_KINDS.items():
             assert (hold in set(event.holds) - held) <= (event.kind is covers)
@@ -208,6 +210,12 @@ class Alarms(RuleBasedStateMachine):
         assert verb is not Verb.SHELVE or duration_s <= 100.0
         assert [(event.by, event.reason) for event in events] == [("ann", "why not")]
         self.tell(events)
+
+    @rule()
+    def see_everything(self):
+        for name, status in self.manager.alarms.items():
+            if status.state.value.endswith("_unacknowledged"):
+                self.tell(self.manager.obey(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=name, by="bob")))
 
     @rule(seconds=st.sampled_from([0, 1, 4, 35]))
     def wait(self, seconds):
