@@ -216,6 +216,7 @@ def _bearing(given: Bearing) -> str:
     return "; ".join(
         [
             *(_watched(bearing) for bearing in given.bearings),
+            *(() if given.keyphasor is None else (f"speed by {given.keyphasor}",)),
             healthy,
             f'false alarms of "changed" {given.false_alarm_probability:g} a look',
         ]

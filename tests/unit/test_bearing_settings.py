@@ -207,7 +207,9 @@ def with_keyphasor(*replacements):
 
 
 def test_a_keyphasor_is_taken_up() -> None:
-    made = detector(parse_machine_file(with_keyphasor(), EXAMPLE))
+    given = parse_machine_file(with_keyphasor(), EXAMPLE)
+    assert "by accel-de; speed by key;" in " ".join(describe(given).split())
+    made = detector(given)
     assert made.keyphasor == KeyphasorProbe("key", 1, -6.0, 0.5, "falling")
 
 
