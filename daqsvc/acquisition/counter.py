@@ -44,6 +44,10 @@ class CounterUnwrapper:
     the number of missed wraps comes from the clock; a counter that no number of wraps can explain is
     held back until the next frame continues from it, and only then believed to be a restart.
 
+    Frames that waited in a buffer, because the process was suspended, arrive late and all at once. If the
+    buffer overflowed, the first frame after them is a long step ahead in no time: such a step may be as long
+    as the frames before it were late.
+
     With ``M`` counts to a wrap, outages are resolved exactly while ``M`` lasts longer than twice the
     arrival jitter. A restart inside the reorder window cannot be told from late frames.
 
@@ -68,6 +72,7 @@ class CounterUnwrapper:
         self._raw = 0
         self._count = 0
         self._seen_ns = 0
+        self._late = 0.0
         self._highest = 0
         self._suspect: int | None = None
 
@@ -98,11 +103,15 @@ class CounterUnwrapper:
         """Place the longest beginning of a batch that continues the sequence; returns its length."""
         steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
         elapsed = (arrival_ns - np.concatenate(([self._seen_ns], arrival_ns[:-1]))) * self._rate
-        sane = (steps >= -self._back) & (steps <= elapsed + self._ahead)
+        # What lags by no more than the drift is a slow device, and not read late.
+        late = _lateness(self._late, elapsed * (1 - DRIFT) - steps)
+        unsure = self._ahead + 2 * DRIFT * late[:-1]
+        sane = (steps >= -self._back) & (steps <= elapsed + late[:-1] + unsure)
         # After half a wrap of silence a small step may hide whole wraps, unless it is the very next frame.
-        sane &= (elapsed < self._modulus / 2) | (steps == self._step)
+        sane &= (elapsed + late[:-1] < self._modulus / 2) | (steps == self._step)
         good = len(raw) if sane.all() else int(np.argmin(sane))
         if good:
+            self._late = float(late[good])
             count[:good] = self._count + np.cumsum(steps[:good])
             self._highest = max(self._highest, int(count[:good].max()))
             self._accept(int(raw[good - 1]), int(count[good - 1]), int(arrival_ns[good - 1]))
@@ -119,20 +128,31 @@ class CounterUnwrapper:
     ) -> None:
         """Place one frame that the sequence does not explain."""
         step = int(self._signed(np.array([raw - self._raw]))[0])
-        elapsed = (arrival_ns - self._seen_ns) * self._rate
-        advance = step + round((elapsed - step) / self._modulus) * self._modulus
-        if advance > 0 and abs(advance - elapsed) <= self._ahead + elapsed * DRIFT:
+        since = (arrival_ns - self._seen_ns) * self._rate
+        # Either this frame is as late as the one before it, or it has not waited at all.
+        advance = self._advance(step, since, since * DRIFT) or self._advance(
+            step, since + self._late, (since + 2 * self._late) * DRIFT
+        )
+        if advance:
             count[at] = self._count + advance
+            self._late = max(self._late + since - advance, 0.0)
         elif self._suspect is not None and 0 < (raw - self._suspect) % self._modulus <= 4 * self._step:
             # Never before anything placed already: two samples cannot share an index.
-            count[at] = max(self._count + round(elapsed), self._highest + self._step)
+            count[at] = max(self._count + round(since + self._late), self._highest + self._step)
             restarts.append(at)
+            self._late = 0.0
         else:
             self._suspect = raw
             kept[at] = False
             return
         self._highest = max(self._highest, int(count[at]))
         self._accept(raw, int(count[at]), arrival_ns)
+
+    def _advance(self, step: int, elapsed: float, unsure: float) -> int:
+        """Counts from the last frame to one that is ``step`` ahead but for wraps; 0 if none fits the time."""
+        advance = step + round((elapsed - step) / self._modulus) * self._modulus
+        fits = advance > 0 and abs(advance - elapsed) <= self._ahead + unsure
+        return advance if fits else 0
 
     def _accept(self, raw: int, count: int, arrival_ns: int) -> None:
         self._started = True
@@ -143,3 +163,18 @@ class CounterUnwrapper:
         half = self._modulus // 2
         signed: NDArray[np.int64] = (steps + half) % self._modulus - half
         return signed
+
+
+def _lateness(before: float, falling_behind: NDArray[np.floating]) -> NDArray[np.float64]:
+    """How late frames are, in counts: what they fall behind adds up, and nobody is ahead of his time.
+
+    Args:
+        before: how late the frame before the first one was.
+        falling_behind: ``[n]``, by how much each falls behind the one before it; negative if it catches up.
+
+    Returns:
+        ``[n + 1]``, from the frame before the first one to the last one.
+    """
+    total = np.concatenate(([0.0], np.cumsum(falling_behind)))
+    late: NDArray[np.float64] = np.maximum(before + total, total - np.minimum.accumulate(total))
+    return late

@@ -132,6 +132,32 @@ def test_a_stalled_host_is_no_loss() -> None:
     np.testing.assert_array_equal(placed.indices, frames * PER_FRAME)
 
 
+@settings(deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    bits=st.sampled_from([16, 32]),
+    stalled=st.integers(10, 20_000),
+    kept=st.integers(0, 2000),
+    split=st.integers(1, 500),
+)
+def test_what_a_buffer_loses_while_the_host_is_suspended_is_counted_exactly(
+    seed, bits, stalled, kept, split
+) -> None:
+    """Of up to 50 s of frames the buffer keeps the first ones, which are read with those that come then."""
+    frames = np.arange(1000 + stalled + 400)
+    t_ns = arrivals(frames, np.random.default_rng(seed), 10.0)
+    t_ns[1000 : 1000 + stalled] = t_ns[1000 + stalled]
+    lost = slice(1000 + min(kept, stalled), 1000 + stalled)
+    frames, t_ns = np.delete(frames, lost), np.delete(t_ns, lost)
+    base = TimeBase(RATE_HZ, bits, PER_FRAME, 1)
+    split += 900
+    parts = (slice(0, split), slice(split, None))
+    placed = [base.place(frames[part] % 2**bits, t_ns[part]) for part in parts]
+    assert base.state.restarts == 0
+    assert all(part.kept.all() for part in placed)
+    np.testing.assert_array_equal(np.concatenate([part.indices for part in placed]), frames * PER_FRAME)
+
+
 def test_time_never_leaves_the_host_clock_before_it_settles() -> None:
     base = TimeBase(RATE_HZ, 16, PER_FRAME, PER_FRAME)
     with pytest.raises(LookupError, match="no frame has arrived"):
