@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
+import signal
 import sys
 import tempfile
 import time
@@ -32,8 +34,21 @@ def main() -> int:
     begun_s = time.monotonic()
     directory = Path(tempfile.mkdtemp(prefix="nothing-lost-"))
     chosen = courses(arguments.runs, arguments.first_seed)
-    reports = asyncio.run(run_all(chosen, directory, arguments.at_a_time, tell))
+
+    async def run_them() -> list[Report]:
+        """End tidily when told to: processes and small disks outlive whoever forgets them."""
+        work = asyncio.ensure_future(run_all(chosen, directory, arguments.at_a_time, tell))
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, work.cancel)
+        return await work
+
+    try:
+        reports = asyncio.run(run_them())
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        print("stopped", file=sys.stderr)
+        return 130
     print(table(reports))
+    with contextlib.suppress(OSError):
+        directory.rmdir()  # unless it holds the traces of a run that failed
     print(f"{time.monotonic() - begun_s:.0f} s in all")
     return 1 if any(report.verdict.violations for report in reports) else 0
 
