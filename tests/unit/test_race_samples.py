@@ -106,7 +106,9 @@ def test_a_drift_is_followed_and_told() -> None:
     samples += np.linspace(0.0, 30.0, len(samples))
     v = judge(samples)
     assert v.verdict == "outer"
-    assert [note for note in v.repairs if "mean moves slowly between" in note] == list(v.repairs)
+    assert [note for note in v.repairs if "mean moves from 0.0" in note and "to 29." in note] == list(
+        v.repairs
+    )
 
 
 @pytest.mark.parametrize("part", PARTS)

@@ -118,9 +118,10 @@ def _steadied(samples: Real, revolution: int) -> tuple[Real, str]:
         return samples, ""
     middles = (np.arange(count) + 0.5) * revolution
     drift = np.interp(np.arange(len(samples)), middles, means)
+    first, last = means[np.sort([means.argmin(), means.argmax()])]
     told = (
-        f"the channel's mean moves slowly between {means.min():.4g} and {means.max():.4g} (it vibrates with "
-        f"{usual:.3g} r.m.s.): followed and subtracted; check the sensor's supply and temperature"
+        f"the channel's mean moves from {first:.4g} to {last:.4g}, slowly (it vibrates with {usual:.3g} "
+        "r.m.s.): followed and subtracted; check the sensor's supply and temperature"
     )
     return samples - drift, told
 
