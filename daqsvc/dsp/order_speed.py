@@ -122,16 +122,16 @@ class _Spectrum:
 
     def nats(self, hz: Floats, beside_hz: float) -> Floats:
         """Evidence for lines, summed over the channels, against the noise about a frequency."""
-        bins = np.arange(len(self.power))
         reach = max(0.25 * self.nominal_hz, 12.0 * self.resolution_hz)
-        about = np.abs(bins * self.step_hz - beside_hz) < reach
+        low, high = (round((beside_hz + side * reach) / self.step_hz) for side in (-1.0, 1.0))
         # Exponential variables: their median is ln 2 of their mean, and lines do not touch it.
-        noise = np.median(self.power[about], axis=0) / math.log(2.0)
+        noise = np.median(self.power[max(low, 0) : high + 1], axis=0) / math.log(2.0)
         noise = np.maximum(noise, 1e-12 * self.power.max(axis=0) + np.finfo(np.float64).tiny)
-        place = hz / self.step_hz
-        found = np.zeros(len(hz))
-        for column, level in zip(self.power.T, noise, strict=True):
-            found += np.interp(place, bins, column) / level
+        place = np.minimum(hz / self.step_hz, len(self.power) - 1.0)
+        below = np.minimum(place.astype(np.int64), len(self.power) - 2)
+        share = (place - below)[:, np.newaxis]
+        power = (1.0 - share) * self.power[below] + share * self.power[below + 1]
+        found: Floats = (power / noise).sum(axis=1)
         return found
 
 
