@@ -24,6 +24,7 @@ from daqsvc.outbox.files import (
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.salvage import readable
 from daqsvc.outbox.sequence import SequenceMark
+from daqsvc.outbox.tables import FILL_LATEST, SCHEMA_VERSION, UNLIKELY_VERSION, bring_up_to_date
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,11 +36,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SCHEMA_VERSION = 2
-
-UNLIKELY_VERSION = 1000
-"""From here on a version is damage, not progress."""
-
 TRIM_EVERY = 256
 """Messages marked as sent from one look at the limits to the next."""
 
@@ -48,35 +44,6 @@ TRIM_AT_MOST = 8 * TRIM_EVERY
 
 SLACK_PAGES = 2048
 """Free pages of the file that are kept for what comes, 8 MiB; more are given back to the disk."""
-
-_SCHEMA = """
-CREATE TABLE messages (
-    sequence INTEGER PRIMARY KEY AUTOINCREMENT,
-    topic TEXT NOT NULL,
-    payload BLOB NOT NULL,
-    retain INTEGER NOT NULL,
-    sent INTEGER NOT NULL DEFAULT 0,
-    wall_ns INTEGER NOT NULL DEFAULT 0,
-    checksum INTEGER
-);
-CREATE INDEX unsent ON messages (sequence) WHERE NOT sent;
-"""
-
-_SCHEMA_2 = """
-CREATE INDEX sent ON messages (sequence) WHERE sent;
-CREATE TABLE latest (topic TEXT PRIMARY KEY, sequence INTEGER NOT NULL) WITHOUT ROWID;
-"""
-
-_FROM_1_TO_2 = f"""
-ALTER TABLE messages ADD COLUMN wall_ns INTEGER NOT NULL DEFAULT 0;
-ALTER TABLE messages ADD COLUMN checksum INTEGER;
-DROP INDEX retained;
-{_SCHEMA_2}
-"""
-
-_FILL_LATEST = """
-INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP BY topic
-"""
 
 _INSERT = """
 INSERT INTO messages (sequence, topic, payload, retain, wall_ns, checksum) VALUES (?, ?, ?, ?, ?, ?)
@@ -226,11 +193,7 @@ class Journal:
                 f"update the program or move the file away"
             )
         if version < SCHEMA_VERSION:
-            statements = _SCHEMA + _SCHEMA_2 if version == 0 else _FROM_1_TO_2 + _FILL_LATEST + ";"
-            now = f"UPDATE messages SET wall_ns = {self._wall_ns()};"  # noqa: S608  a number
-            connection.executescript(
-                f"BEGIN IMMEDIATE; {statements} {now} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;"
-            )
+            bring_up_to_date(connection, version, self._wall_ns())
         used = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'messages'").fetchone()
         if used is None:
             return None
@@ -244,7 +207,7 @@ class Journal:
             connection.executemany(
                 "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", readable(aside, self._next)
             )
-            connection.execute(_FILL_LATEST)
+            connection.execute(FILL_LATEST)
         count = connection.execute("SELECT count(*) FROM messages").fetchone()[0]
         log.warning("outbox %s: %d messages were saved from the corrupt file", self.path, count)
 
@@ -290,11 +253,11 @@ class Journal:
             trims = self._sent_since_trim >= TRIM_EVERY
             if trims:
                 self._trim(connection)
-        if trims:
-            self._ballast.take()
         if rows:
             self._next = sequence
             self._mark.note(sequence - 1)
+        if trims:
+            self._tend(connection)
         return outcomes, max(marked, 0)
 
     def make_room(self) -> bool:
@@ -400,8 +363,19 @@ class Journal:
             ).rowcount
             if deleted < TRIM_EVERY:
                 break
-        if pragma(connection, "freelist_count") > SLACK_PAGES:
-            connection.execute(f"PRAGMA incremental_vacuum({SLACK_PAGES // 8})").fetchall()
+
+    def _tend(self, connection: sqlite3.Connection) -> None:
+        """Now and then: give some of the free pages back to the disk, and have the ballast on board.
+
+        Whatever was to be committed is; an error here must not have it committed again.
+        """
+        try:
+            if pragma(connection, "freelist_count") > SLACK_PAGES:
+                # A script, for `execute` would end this statement at its first page.
+                connection.executescript(f"PRAGMA incremental_vacuum({SLACK_PAGES // 2})")
+        except sqlite3.Error as error:
+            log.warning("outbox %s cannot be made smaller: %s", self.path, error)
+        self._ballast.take()
 
 
 @contextlib.contextmanager

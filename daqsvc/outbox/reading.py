@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from daqsvc.outbox.files import FileError, pragma
-from daqsvc.outbox.journal import SCHEMA_VERSION
 from daqsvc.outbox.messages import OutboxError, is_sound
+from daqsvc.outbox.tables import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

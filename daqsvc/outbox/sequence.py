@@ -15,9 +15,9 @@ and to the wall clock in ms, far above what was counted up from an earlier start
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
+import zlib
 from pathlib import Path
 
 from daqsvc.outbox.files import NS_PER_MS, replace_durably
@@ -59,21 +59,18 @@ class SequenceMark:
         self._ceiling, self._used, self._boot = 0, 0, ""
         self._this_boot = boot_id()
         try:
-            told = self._path.read_text(encoding="ascii", errors="replace").split()
+            line = self._path.read_bytes()
         except FileNotFoundError:
             return
-        try:
-            self._ceiling, self._used, self._boot = int(told[0]), int(told[1]), told[2]
-        except (ValueError, IndexError):
-            with contextlib.suppress(ValueError, IndexError):
-                self._ceiling = int(told[0])
+        told = line.split()
+        if len(told) != 4 or _hexadecimal(told[3]) != zlib.crc32(line[: line.rindex(b" ")]):
             log.warning(
-                "outbox mark %s is damaged; sequence numbers go on from %s",
+                "outbox mark %s is damaged; sequence numbers go on from the journal or, without one, from "
+                "the wall clock",
                 self._path,
-                f"{self._ceiling}, which it still tells"
-                if self._ceiling
-                else "the journal and the wall clock",
             )
+            return
+        self._ceiling, self._used, self._boot = int(told[0]), int(told[1]), told[2].decode("ascii")
 
     def first_free(self, stored: int | None, wall_ns: int) -> int:
         """The number to go on with.
@@ -116,7 +113,7 @@ class SequenceMark:
         if self._file is None:
             return
         try:
-            os.pwrite(self._file, f"{used:0{_DIGITS}d}".encode(), _DIGITS + 1)
+            os.pwrite(self._file, self._line(), 0)
         except OSError as error:
             # The message is on disk. Only the watch over a journal that forgets is poorer by this.
             if self._noted:
@@ -144,11 +141,28 @@ class SequenceMark:
         return properly_ended or self._boot == self._this_boot != UNKNOWN_BOOT
 
     def _write(self, ceiling: int, used: int) -> None:
-        line = f"{ceiling:0{_DIGITS}d} {used:0{_DIGITS}d} {self._this_boot}\n"
-        replace_durably(self._path, line.encode())
+        before = self._ceiling, self._used, self._boot
+        self._ceiling, self._used, self._boot = ceiling, used, self._this_boot
+        try:
+            replace_durably(self._path, self._line())
+        except OSError:
+            self._ceiling, self._used, self._boot = before
+            raise
         self.close()
         self._file = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)
-        self._ceiling, self._used, self._boot = ceiling, used, self._this_boot
+
+    def _line(self) -> bytes:
+        """The content of the side file; of one length for one boot, so that it can be written in place."""
+        told = f"{self._ceiling:0{_DIGITS}d} {self._used:0{_DIGITS}d} {self._boot}".encode()
+        return b"%b %08x\n" % (told, zlib.crc32(told))
+
+
+def _hexadecimal(text: bytes) -> int | None:
+    """The number that ``text`` is, if any."""
+    try:
+        return int(text, 16)
+    except ValueError:
+        return None
 
 
 def boot_id() -> str:

@@ -188,6 +188,28 @@ async def test_a_file_that_breaks_while_it_is_open_is_replaced(tmp_path, connect
     await outbox.close()
 
 
+async def test_a_file_that_cannot_be_read_is_replaced_by_what_can_be_saved(outbox, monkeypatch):
+    """A bad sector: the same page fails again and again, while others can be read."""
+    numbers = [await outbox.append(TOPIC, payload, retain=True) for _ in range(5)]
+    journal = outbox._journal
+    file, pending = journal._connection, journal.pending
+
+    def bad_sector(after, limit):
+        if journal._connection is file:
+            error = sqlite3.OperationalError("disk I/O error")
+            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_READ
+            raise error
+        return pending(after, limit)
+
+    monkeypatch.setattr(journal, "pending", bad_sector)
+    waiting = asyncio.create_task(outbox.pending(0, 10))
+    later = await outbox.append(TOPIC, payload, retain=True)
+    assert [m.sequence for m in await waiting] == [*numbers, later]
+    assert outbox.counters.read_errors == 3
+    assert outbox.counters.quarantined == 1
+    assert outbox.counters.depth == 6
+
+
 async def test_numbers_go_on_though_everything_is_lost_and_the_wall_clock_was_set_back(tmp_path):
     class SlowClock(SystemClock):
         def wall_ns(self):
@@ -287,6 +309,7 @@ async def test_kill_minus_nine_loses_nothing_that_was_promised(tmp_path):
     assert outbox.counters.quarantined == 0
     there = {m.sequence for m in await outbox.pending(0, 10**6)}
     assert there.issuperset(promised)
+    assert sorted(there) == list(range(min(there), max(there) + 1)), "a number is missing"
     await outbox.close()
 
 

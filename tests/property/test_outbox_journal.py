@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import zlib
 from pathlib import Path
 
 import pytest
@@ -129,8 +130,9 @@ class Restarts(RuleBasedStateMachine):
         self.jumped = True
         mark = self.store.path.with_name(JOURNAL_NAME + ".sequence")
         if mark.exists():
-            ceiling, _used, boot = mark.read_text().split()
-            mark.write_text(f"{ceiling} {0:020d} {boot}\n")
+            ceiling, _used, boot, _checksum = mark.read_text().split()
+            told = f"{ceiling} {0:020d} {boot}"
+            mark.write_text(f"{told} {zlib.crc32(told.encode()):08x}\n")
         log = self.store.path.with_name(JOURNAL_NAME + "-wal")
         if data.draw(st.booleans(), label="the disk lied") and log.exists():
             log.write_bytes(log.read_bytes()[: data.draw(st.integers(0, log.stat().st_size))])

@@ -1,0 +1,65 @@
+"""The tables of the journal, and how those of an earlier version become them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import sqlite3
+
+SCHEMA_VERSION = 2
+
+UNLIKELY_VERSION = 1000
+"""From here on a version is damage, not progress."""
+
+_SCHEMA = """
+CREATE TABLE messages (
+    sequence INTEGER PRIMARY KEY AUTOINCREMENT,
+    topic TEXT NOT NULL,
+    payload BLOB NOT NULL,
+    retain INTEGER NOT NULL,
+    sent INTEGER NOT NULL DEFAULT 0,
+    wall_ns INTEGER NOT NULL DEFAULT 0,
+    checksum INTEGER
+);
+CREATE INDEX unsent ON messages (sequence) WHERE NOT sent;
+"""
+
+_SCHEMA_2 = """
+CREATE INDEX sent ON messages (sequence) WHERE sent;
+CREATE TABLE latest (topic TEXT PRIMARY KEY, sequence INTEGER NOT NULL) WITHOUT ROWID;
+"""
+
+_FROM_1_TO_2 = f"""
+ALTER TABLE messages ADD COLUMN wall_ns INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE messages ADD COLUMN checksum INTEGER;
+DROP INDEX retained;
+{_SCHEMA_2}
+"""
+
+FILL_LATEST = """
+INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP BY topic
+"""
+
+
+def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int) -> None:
+    """Create the tables in a new file, or change those of an earlier version; all or nothing.
+
+    Args:
+        connection: to the file.
+        version: what the file has; 0 for a new one.
+        wall_ns: wall clock, for messages of a version that did not tell theirs.
+
+    Raises:
+        sqlite3.Error: the file is as it was.
+    """
+    statements = _SCHEMA + _SCHEMA_2 if version == 0 else f"{_FROM_1_TO_2} {FILL_LATEST};"
+    connection.executescript(
+        f"""
+        BEGIN IMMEDIATE;
+        {statements}
+        UPDATE messages SET wall_ns = {wall_ns};
+        PRAGMA user_version = {SCHEMA_VERSION};
+        COMMIT;
+        """  # noqa: S608  constants and a number
+    )

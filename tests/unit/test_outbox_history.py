@@ -1,0 +1,215 @@
+"""What the journal keeps of what is sent, what it says of numbers, and files of earlier versions."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from daqsvc.outbox import files, sequence
+from daqsvc.outbox.ballast import Ballast
+from daqsvc.outbox.files import ASIDE_KEPT, free_bytes
+from daqsvc.outbox.journal import TRIM_EVERY, Journal
+from daqsvc.outbox.limits import MIB, NS_PER_DAY, OutboxLimits
+from daqsvc.outbox.messages import Draft
+
+SIZE = 1000
+
+
+class Wall:
+    ns = 10**18
+
+    def __call__(self):
+        return self.ns
+
+
+@pytest.fixture
+def wall():
+    return Wall()
+
+
+def opened(path, wall, **limits):
+    journal = Journal(path, wall, OutboxLimits(ballast_bytes=0, **limits))
+    journal.open()
+    return journal
+
+
+def append(journal, count, topic="t", *, sent=True):
+    drafts = [Draft(topic, lambda n: b"%d " % n + b"x" * SIZE, retain=True)] * count
+    numbers, _ = journal.commit(drafts, [])
+    if sent:
+        for begin in range(0, count, TRIM_EVERY):
+            journal.commit([], numbers[begin : begin + TRIM_EVERY])
+    return numbers
+
+
+def kept(path):
+    with sqlite3.connect(path) as other:
+        numbers = [row[0] for row in other.execute("SELECT sequence FROM messages ORDER BY sequence")]
+    other.close()
+    return numbers
+
+
+def test_the_oldest_that_are_sent_go_beyond_the_size_and_the_file_stays_within(tmp_path, wall):
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall, alarms_max_bytes=MIB)
+    only = append(journal, 1, topic="once, long ago")
+    unsent = append(journal, 1, topic="waiting", sent=False)
+    numbers = []
+    for _ in range(8):
+        numbers += append(journal, 1000)
+    assert [m.sequence for m in journal.pending(0, 10)] == unsent
+    journal.close()
+    left = kept(path)
+    assert left[:2] == [*only, *unsent]
+    assert left[2:] == numbers[len(numbers) - len(left) + 2 :]
+    assert 0.2 * MIB < len(left) * SIZE < 1.4 * MIB  # a look at the limit for each 256 messages
+    assert path.stat().st_size < 5 * MIB  # after 8 MB: the pages are used again
+
+
+def test_a_file_that_was_large_gives_its_room_back(tmp_path, wall):
+    """A backlog of a long outage is gone in the end, and so is the room that it took."""
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall, alarms_max_bytes=MIB)
+    backlog = append(journal, 30_000, sent=False)
+    for begin in range(0, len(backlog), TRIM_EVERY):
+        journal.commit([], backlog[begin : begin + TRIM_EVERY])
+    for _ in range(30):
+        append(journal, TRIM_EVERY)
+    journal.close()
+    assert path.stat().st_size < 16 * MIB
+
+
+def test_what_is_sent_goes_when_it_is_old_but_the_newest_stay(tmp_path, wall):
+    path = tmp_path / "outbox.sqlite"
+    limits = {"alarms_keep_ns": 30 * NS_PER_DAY, "alarms_keep_at_least": 100}
+    journal = opened(path, wall, **limits)
+    old = append(journal, 500)
+    journal.close()
+    wall.ns += 20 * NS_PER_DAY
+    journal = opened(path, wall, **limits)
+    young = append(journal, 50)
+    journal.close()
+    wall.ns += 20 * NS_PER_DAY
+    opened(path, wall, **limits).close()
+    assert kept(path) == [*old[-50:], *young]
+    wall.ns += 3650 * NS_PER_DAY  # a wall clock that is wrong must not cost the history
+    opened(path, wall, **limits).close()
+    assert kept(path) == [*old[-50:], *young]
+
+
+FIRST_VERSION = """
+CREATE TABLE messages (sequence INTEGER PRIMARY KEY AUTOINCREMENT, topic TEXT NOT NULL, payload BLOB NOT NULL,
+    retain INTEGER NOT NULL, sent INTEGER NOT NULL DEFAULT 0);
+CREATE INDEX unsent ON messages (sequence) WHERE NOT sent;
+CREATE INDEX retained ON messages (topic, sequence) WHERE retain;
+INSERT INTO messages VALUES (5, 'a', x'41', 1, 1), (6, 'a', x'42', 1, 0), (7, 'b', x'43', 0, 0);
+PRAGMA user_version = 1;
+"""
+
+
+def test_a_file_of_the_first_version_is_taken_over(tmp_path, wall):
+    path = tmp_path / "outbox.sqlite"
+    with sqlite3.connect(path) as first:
+        first.executescript(FIRST_VERSION)
+    first.close()
+    path.with_name("outbox.sqlite.sequence").write_text("1031")  # how the side file was then
+    journal = opened(path, wall)
+    assert [(m.sequence, m.topic, m.payload, m.retain) for m in journal.pending(0, 10)] == [
+        (6, "a", b"B", True),
+        (7, "b", b"C", False),
+    ]
+    assert [m.sequence for m in journal.latest()] == [6]
+    assert append(journal, 1) == [8]
+    assert journal.quarantined == 0
+    journal.close()
+    assert kept(path) == [5, 6, 7, 8]
+
+
+def test_a_journal_that_is_an_older_copy_is_told_and_gives_no_number_again(tmp_path, wall, caplog):
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    append(journal, 3)
+    journal.close()
+    copy = path.read_bytes()
+    journal = opened(path, wall)
+    last = append(journal, 5)[-1]
+    journal.close()
+    path.write_bytes(copy)
+    journal = opened(path, wall)
+    assert journal.vanished == 5
+    assert "up to 5 messages are gone from the disk" in caplog.text
+    assert append(journal, 1) == [last + 1]
+    journal.close()
+    journal = opened(path, wall)
+    assert journal.vanished == 0, "it is told once"
+    journal.close()
+
+
+@pytest.mark.parametrize("damage", ["", "no number", "17", "00000000000000000017 what boot", "\xff\xff"])
+def test_a_damaged_side_file_costs_nothing_while_the_journal_is_whole(tmp_path, wall, damage):
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    last = append(journal, 3)[-1]
+    journal.close()
+    path.with_name("outbox.sqlite.sequence").write_text(damage, encoding="latin-1")
+    journal = opened(path, wall)
+    assert journal.quarantined == journal.vanished == 0
+    [after] = append(journal, 1)
+    assert after > last
+    journal.close()
+
+
+def test_a_system_without_boot_identity_is_taken_for_a_new_boot_each_time(tmp_path, wall, monkeypatch):
+    monkeypatch.setattr(sequence, "_BOOT_ID", tmp_path / "nowhere")
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    last = append(journal, 3)[-1]
+    journal._lock.close()  # kill -9
+    again = opened(path, wall)
+    [after] = append(again, 1)
+    assert last + 1 < after <= last + 1 + sequence.STEP
+    again.close()
+    journal.close()
+
+
+def test_only_so_many_corrupt_files_are_kept(tmp_path, wall):
+    path = tmp_path / "outbox.sqlite"
+    for number in range(ASIDE_KEPT + 3):
+        path.write_bytes(b"not a database %d" % number * 100)
+        os.utime(path, ns=(number * 10**9, number * 10**9))
+        opened(path, wall).close()
+    aside = {p.read_bytes() for p in tmp_path.glob("outbox.sqlite.corrupt-*")}
+    assert aside == {b"not a database %d" % n * 100 for n in range(3, ASIDE_KEPT + 3)}
+
+
+def test_new_names_are_durable_before_they_are_relied_on(tmp_path, wall, monkeypatch):
+    """A name that is not synced is gone after a power cut, and with it what was in the file."""
+    synced = []
+    real = os.fsync
+
+    def spy(handle):
+        synced.append(str(Path(f"/proc/self/fd/{handle}").readlink()))
+        real(handle)
+
+    monkeypatch.setattr(files.os, "fsync", spy)
+    store = tmp_path / "new" / "store"
+    journal = opened(store / "outbox.sqlite", wall)
+    assert synced[:2] == [str(tmp_path), str(tmp_path / "new")]
+    append(journal, 1)
+    mark = str(store / "outbox.sqlite.sequence.new")
+    assert synced.index(mark) < len(synced) - 1
+    assert synced[synced.index(mark) + 1] == str(store)
+    journal.close()
+
+
+def test_ballast_is_taken_where_there_is_room_and_thrown_off_once(tmp_path):
+    ballast = Ballast(tmp_path / "ballast", MIB, reserve_bytes=0)
+    ballast.take()
+    assert (tmp_path / "ballast").stat().st_blocks * 512 >= MIB
+    assert ballast.throw_off()
+    assert not ballast.throw_off()
+    Ballast(tmp_path / "ballast", MIB, reserve_bytes=free_bytes(tmp_path)).take()
+    assert not (tmp_path / "ballast").exists()
