@@ -243,3 +243,16 @@ def test_blanking_fades_and_levelling_leaves_no_line() -> None:
     np.testing.assert_array_equal(levelled(envelope, np.array([[0.4, 0.6]])), 1.0)
     assert levelled(envelope, np.empty((0, 2))) is envelope
     assert merged([(5, 9), (1, 3), (2, 4)]) == [(1, 4), (5, 9)]
+
+
+def test_missing_samples_are_noted_and_nothing_is_put_right() -> None:
+    samples = strikes("inner", seed=19)
+    samples[[100, 5_000]] = np.nan
+    samples[40_000:40_030] = np.nan
+    sound = check(samples)
+    assert sound.notes == ("32 samples are missing: bridged; check the bus and the device",)
+    assert sound.repairs == ()
+    ((first, last),) = sound.stretches
+    assert first < 40_000
+    assert last > 40_030
+    assert judge(samples).verdict == "inner"

@@ -90,10 +90,9 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
             f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
-    x, gaps, repairs = _bridged(x, rate_hz)
+    x, gaps, notes, repairs = _bridged(x, rate_hz)
     mended = repaired(x, rate_hz, round(60.0 * rate_hz / speed_rpm), (rules.low_hz, top_hz))
     x = mended.values
-    notes = []
     clipped = _clipped_share(x)
     if clipped > CLIPPED_SHARE:
         raise RaceInputError(
@@ -116,8 +115,8 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
     )
 
 
-def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str]]:
-    """Straight lines over missing samples and drop-outs, and where they are long; refuse what is dead."""
+def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], list[str]]:
+    """The channel with straight lines over what is missing, where they are long, notes, and repairs."""
     good = np.isfinite(x)
     missing = 1.0 - float(good.mean())
     if missing > MISSING_SHARE:
@@ -133,7 +132,7 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str]]:
         )
     held = stuck(x) & good
     if not missing and not held.any():
-        return x, [], []
+        return x, [], [], []
     lost = ~good | held
     told = []
     if held.any():
@@ -148,10 +147,12 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str]]:
     taper = round(GAP_TAPER_S * rate_hz)
     long = merged((max(first - taper, 0), min(last + taper, len(x))) for first, last in long)
     x = blanked(x, long, rate_hz)
-    if missing:
-        count = int(len(x) - good.sum())
-        told.append(f"{count} samples are missing: bridged; check the bus and the device")
-    return x, long, told
+    notes = (
+        [f"{int((~good).sum())} samples are missing: bridged; check the bus and the device"]
+        if missing
+        else []
+    )
+    return x, long, notes, told
 
 
 def _interpolated(x: Real, good: NDArray[np.bool_]) -> Real:
