@@ -25,12 +25,10 @@ class Tap:
     """What went over all connections.
 
     Attributes:
-        published: ids of alarm payloads in the order in which they were forwarded, repeats included.
-        acknowledged: ids that the broker has acknowledged to the service.
+        acknowledged: alarm payloads that the broker has acknowledged to the service, by their ids.
     """
 
-    published: list[str] = field(default_factory=list)
-    acknowledged: set[str] = field(default_factory=set)
+    acknowledged: dict[str, bytes] = field(default_factory=dict)
 
 
 class _Packets:
@@ -70,7 +68,7 @@ class _Link:
         self.silent = False
         self._tap = tap
         self._up, self._down = _Packets(), _Packets()
-        self._in_flight: dict[int, str] = {}
+        self._in_flight: dict[int, tuple[str, bytes]] = {}
 
     def watch(self, data: bytes, *, up: bool) -> None:
         """Note what has been forwarded."""
@@ -79,14 +77,13 @@ class _Link:
                 topic_end = 2 + int.from_bytes(body[:2], "big")
                 found = _ID.search(body)
                 if found:
-                    name = found[1].decode()
-                    self._in_flight[int.from_bytes(body[topic_end : topic_end + 2], "big")] = name
-                    self._tap.published.append(name)
+                    number = int.from_bytes(body[topic_end : topic_end + 2], "big")
+                    self._in_flight[number] = (found[1].decode(), body[body.index(b'{"', topic_end) :])
             elif not up and first >> 4 == PUBACK:
-                name = self._in_flight.pop(int.from_bytes(body[:2], "big"), "")
+                name, payload = self._in_flight.pop(int.from_bytes(body[:2], "big"), ("", b""))
                 refused = len(body) > 2 and body[2] >= 0x80
                 if name and not refused:
-                    self._tap.acknowledged.add(name)
+                    self._tap.acknowledged[name] = payload
 
     def reset(self) -> None:
         """End it with RST on both sides."""

@@ -47,7 +47,7 @@ class Evidence:
         witness: what the teller wrote down.
         journal: payloads on disk, by id, in order.
         arrivals: what the consumer got, in order.
-        forgotten: ids that the broker had acknowledged when it was killed with no time to pass them on.
+        forgotten: what the broker had acknowledged when it was killed with no time to pass it on, by id.
         made_room: ids that the broker had acknowledged, if the disk was full: the journal may have given
             them up to make room.
     """
@@ -56,13 +56,14 @@ class Evidence:
     witness: Witness
     journal: dict[str, bytes]
     arrivals: Sequence[Arrival]
-    forgotten: set[str] = field(default_factory=set)
+    forgotten: dict[str, bytes] = field(default_factory=dict)
     made_room: set[str] = field(default_factory=set)
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """Every event of the run by its number, be it still in the journal or only with the consumer."""
-        payloads = {arrival.alarm["id"]: arrival.payload for arrival in self.arrivals} | self.journal
+        """Every event of the run by its number, be it still in the journal or only with others."""
+        arrived = {arrival.alarm["id"]: arrival.payload for arrival in self.arrivals}
+        payloads = self.forgotten | arrived | self.journal
         return sorted(map(json.loads, payloads.values()), key=lambda alarm: alarm["sequence"])
 
 
@@ -110,7 +111,7 @@ class Verdict:
             violations=[violation for check in checks for violation in check(evidence)],
             alarms=len(evidence.events),
             repeats=len(evidence.arrivals) - len(received),
-            forgotten=len(evidence.forgotten - _ids(evidence)),
+            forgotten=len(evidence.forgotten.keys() - _ids(evidence)),
             worst_delay_s=max(delays_ns, default=0) / 1e9,
         )
 
@@ -146,7 +147,7 @@ def _on_disk_stays_on_disk(evidence: Evidence) -> Iterable[str]:
 
 def _nothing_lost(evidence: Evidence) -> Iterable[str]:
     for lost in sorted(
-        (_committed(evidence) | evidence.journal.keys()) - _ids(evidence) - evidence.forgotten
+        (_committed(evidence) | evidence.journal.keys()) - _ids(evidence) - evidence.forgotten.keys()
     ):
         yield f"{lost} was committed and never reached the consumer"
 
@@ -185,8 +186,8 @@ def _in_order(evidence: Evidence) -> Iterable[str]:
 def _the_known_sequence(evidence: Evidence) -> Iterable[str]:
     """What came, and what the broker forgot, is what the script says, event by event."""
     by_id = {alarm["id"]: alarm for _, alarm in _without_repeats(evidence.arrivals)}
-    for name in evidence.forgotten & evidence.journal.keys():
-        by_id.setdefault(name, json.loads(evidence.journal[name]))
+    for name, payload in evidence.forgotten.items():
+        by_id.setdefault(name, json.loads(payload))
     told = [
         Expected(alarm["cause"]["window"]["first_index"], alarm["alarm"], alarm["level"])
         for alarm in sorted(by_id.values(), key=lambda alarm: alarm["sequence"])

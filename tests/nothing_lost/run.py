@@ -18,7 +18,7 @@ from nothing_lost.checker import Evidence, Verdict, journal_of
 from nothing_lost.consumer import Consumer
 from nothing_lost.disk import small_disk
 from nothing_lost.script import Script
-from nothing_lost.teller import Witness
+from nothing_lost.teller import Witness, settled_to
 from tcp_proxy import FaultyProxy
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Stage:
     disk_was_full: bool = False
     disk_excuses: bool = False
     restart_after_s: float = 0.0
-    forgotten: set[str] = field(default_factory=set)
+    forgotten: dict[str, bytes] = field(default_factory=dict)
 
     @property
     def store(self) -> Path:
@@ -270,8 +270,8 @@ class Stage:
         """Let the plan happen; what only slows things down goes on while the next is happening."""
         meanwhile = []
         for step, befalls in self.plan():
-            while Witness.read(self.witness).settled < step:
-                await asyncio.sleep(0.01)
+            while settled_to(self.witness) < step:
+                await asyncio.sleep(0.02)
             await asyncio.sleep(self.some_s(0.0, 0.05))
             self.befell.append(befalls.__name__.replace("_", " "))
             if befalls in (self.latency, self.one_byte_slices, self.suspend):
@@ -304,22 +304,24 @@ async def run(course: Course, directory: Path) -> Report:
         consumer = await cleanup.enter_async_context(Consumer(broker.port))
         rng = random.Random(f"disturbances {course.seed}")
         stage = Stage(course, directory, proxy, broker, consumer, disk, rng, environment)
-        teller = asyncio.create_task(stage.supervise())
         cleanup.push_async_callback(stage.end)
-
+        teller = asyncio.create_task(stage.supervise())
         disturb = asyncio.create_task(stage.disturb())
+        cleanup.push_async_callback(_cancel, teller, disturb)
+
         await asyncio.wait({teller, disturb}, timeout=FINISH_S, return_when=asyncio.FIRST_COMPLETED)
         await asyncio.wait({disturb}, timeout=FINISH_S)
-        disturb.cancel()
+        if disturb.done():
+            disturb.result()
+        else:
+            stage.failures.append(f"what should befall it did not: {stage.befell[-1]} has no end")
+        await _cancel(disturb)
         proxy.heal()
         await asyncio.wait({teller}, timeout=FINISH_S)
-        if not teller.done():
-            teller.cancel()
-            await asyncio.gather(teller, return_exceptions=True)
-        else:
-            await teller
+        if teller.done():
+            teller.result()
         journal = journal_of(store / "box")
-        await consumer.has(set(journal) - stage.forgotten, timeout_s=5.0)
+        await consumer.has(journal.keys() - stage.forgotten.keys(), timeout_s=5.0)
 
         evidence = Evidence(
             Script.of_seed(course.seed),
@@ -334,3 +336,9 @@ async def run(course: Course, directory: Path) -> Report:
         return Report(
             course, verdict, stage.befell, stage.kills, stage.crashes, time.monotonic() - begun_s, directory
         )
+
+
+async def _cancel(*tasks: asyncio.Task[None]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)

@@ -63,17 +63,19 @@ def test_repeats_are_counted_and_change_nothing(evidence):
 
 
 def test_one_that_did_not_arrive_is_lost_unless_the_broker_forgot_it(evidence):
-    missing = evidence.arrivals.pop(20).alarm
+    lost = evidence.arrivals.pop(20)
+    missing = lost.alarm
     assert f"{missing['id']} was committed and never reached the consumer" in violations(evidence)
-    evidence.forgotten = {missing["id"]}
+    evidence.forgotten = {missing["id"]: lost.payload}
     verdict = Verdict.on(evidence)
     assert verdict.violations == []
     assert verdict.forgotten == 1
 
 
 def test_a_last_state_must_arrive_whatever_the_broker_forgot(evidence):
-    missing = evidence.arrivals.pop().alarm
-    evidence.forgotten = {missing["id"]}
+    lost = evidence.arrivals.pop()
+    missing = lost.alarm
+    evidence.forgotten = {missing["id"]: lost.payload}
     assert f"the consumer's last state of {missing['alarm']}" in violations(evidence)
 
 
@@ -127,3 +129,12 @@ def test_a_break_between_two_events_of_an_alarm_is_seen(evidence):
         dataclasses.replace(a, payload=broken) if a.alarm["id"] == name else a for a in evidence.arrivals
     ]
     assert "but it was" in violations(evidence)
+
+
+def test_a_full_disk_may_cost_the_journal_what_the_broker_has(evidence):
+    names = list(evidence.journal)[:40]
+    for name in names:
+        del evidence.journal[name]
+    assert violations(evidence)
+    evidence.made_room = set(names)
+    assert Verdict.on(evidence).violations == []
