@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.outbox.reading import read_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from daqsvc.outbox.reading import JournalEntry, JournalView
@@ -18,6 +18,25 @@ if TYPE_CHECKING:
     """An alarm payload as it was published."""
 
 SCHEMA = "daqsvc.alarm/"
+MOST_EVENTS = 500
+"""Events of one alarm that are looked through for how it began."""
+
+_FINDINGS = {"raised", "escalated", "lowered", "changed", "recurred", "latched", "returned"}
+"""Events that say what was found, rather than what somebody did about it."""
+
+
+class Standing(NamedTuple):
+    """How an alarm stands, and how that came about.
+
+    Attributes:
+        told: its latest event.
+        since_ns: when its occurrence began, wall clock; of an alarm without one, when the event was.
+        message: what was found last, and what somebody has done about it since.
+    """
+
+    told: Told
+    since_ns: int
+    message: str
 
 
 def current(store: Path) -> list[Told]:
@@ -29,6 +48,32 @@ def current(store: Path) -> list[Told]:
     view = read_journal(store, history=0)
     _tell_damage(view, store)
     return list(_told(view.latest))
+
+
+def standing(store: Path, events: Sequence[Told]) -> list[Standing]:
+    """How alarms stand, with what their own past adds to it; blocks.
+
+    Args:
+        store: the store's directory.
+        events: from `current`.
+
+    Raises:
+        OutboxError: the journal cannot be read.
+    """
+    latest = read_journal(store, history=0).latest
+    topics = {json.loads(entry.payload).get("id"): entry.topic for entry in latest}
+    found = []
+    for told in events:
+        past: list[Told] = []
+        if told["occurrence"] and (topic := topics.get(told["id"])):
+            view = read_journal(store, history=MOST_EVENTS, topic=topic)
+            past = [one for one in _told(view.history) if one["occurrence"] == told["occurrence"]]
+        findings = [one["message"] for one in past if one["kind"] in _FINDINGS]
+        message = told["message"]
+        if findings and findings[-1] != message:
+            message = f"{findings[-1]}; {message}"
+        found.append(Standing(told, past[0]["wall_ns"] if past else told["wall_ns"], message))
+    return found
 
 
 def history(store: Path, most: int) -> list[Told]:

@@ -10,6 +10,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from daqsvc.commands.alarm_journal import Standing
+
     Told = Mapping[str, Any]
     """An alarm payload (schema ``daqsvc.alarm/1``), as it was published."""
 
@@ -20,14 +22,15 @@ _AGES = ((86_400, "d"), (3600, "h"), (60, "min"))
 _GAP = "  "
 
 
-def current(events: Sequence[Told], now_ns: int) -> str:
+def current(alarms: Sequence[Standing], now_ns: int) -> str:
     """How alarms stand: one line each, the worst first, then the newest.
 
     Args:
-        events: the latest event of each alarm.
+        alarms: one each.
         now_ns: wall clock, ns since the Unix epoch.
     """
-    worst_first = sorted(events, key=lambda told: (-_LEVELS.index(told["level"]), -told["wall_ns"]))
+    events = [alarm.told for alarm in alarms]
+    worst_first = sorted(alarms, key=lambda alarm: (-_LEVELS.index(alarm.told["level"]), -alarm.since_ns))
     rows = [
         [
             told["level"],
@@ -35,10 +38,10 @@ def current(events: Sequence[Told], now_ns: int) -> str:
             *_machine(told, events),
             told["alarm"],
             (told["occurrence"] or "-")[:ID_LENGTH],
-            f"{_local(told['wall_ns'])} ({ago(now_ns - told['wall_ns'])})",
-            told["message"],
+            f"{_local(since_ns)} ({ago(now_ns - since_ns)})",
+            message,
         ]
-        for told in worst_first
+        for told, since_ns, message in worst_first
     ]
     return _aligned(["LEVEL", "STATE", *_machine_title(events), "ALARM", "ID", "SINCE", "MESSAGE"], rows)
 

@@ -12,6 +12,7 @@ from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add
 
 if TYPE_CHECKING:
     import argparse
+    from pathlib import Path
 
     from daqsvc.commands.store_argument import Load
 
@@ -73,12 +74,13 @@ class AlarmsCommand:
         except (StoreNotFoundError, OutboxError) as error:
             print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED
-        _show(events, arguments)
+        _show(store, events, arguments)
         return EXIT_OK
 
 
-def _show(events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
+def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
     from daqsvc.commands import alarm_table  # noqa: PLC0415
+    from daqsvc.commands.alarm_journal import standing  # noqa: PLC0415
 
     if arguments.json:
         for told in events:
@@ -86,6 +88,6 @@ def _show(events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
     elif arguments.history is not None:
         print(alarm_table.history(events) if events else "nothing has happened yet")  # noqa: T201
     elif events:
-        print(alarm_table.current(events, time.time_ns()))  # noqa: T201
+        print(alarm_table.current(standing(store, events), time.time_ns()))  # noqa: T201
     else:
         print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201

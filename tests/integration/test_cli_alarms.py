@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -256,6 +257,21 @@ async def test_alarms_of_several_machines_stand_in_one_table_the_worst_first(tmp
     }
     assert len(starts) == 1, "columns are aligned"
     assert len((await daqsvc("alarms", "--store", tmp_path, "--all"))[1].splitlines()) == 4
+
+
+async def test_what_was_done_about_an_alarm_does_not_hide_what_it_is_and_since_when(tmp_path: Path) -> None:
+    begun_ns = time.time_ns() - 7200 * 10**9
+    done = {"kind": "acknowledged", "state": "active_acknowledged", "message": "shaking acknowledged by ann"}
+    await write_journal(
+        tmp_path,
+        {"wall_ns": begun_ns - 10**15, "occurrence": "an-earlier-one", "message": "long ago"},
+        {"wall_ns": begun_ns},
+        {"wall_ns": begun_ns, "kind": "escalated", "level": "danger", "message": "shaking danger: 9 g"},
+        done | {"level": "danger", "wall_ns": time.time_ns()},
+    )
+    _, out, _ = await daqsvc("alarms", "--store", tmp_path)
+    assert "(2 h)" in out
+    assert out.endswith("  shaking danger: 9 g; shaking acknowledged by ann\n")
 
 
 async def test_history_is_newest_last_and_as_long_as_is_asked(tmp_path: Path) -> None:
