@@ -155,6 +155,7 @@ class Session:
             self._home_assistant.note(message)
 
     async def _tell_home_assistant(self, link: HomeAssistantLink) -> None:
+        # What the broker has known for long is not told again in time: the summary must not begin without it.
         for message in await self._outbox.retained():
             link.note(message)
         await link.run(self._connection)
