@@ -90,7 +90,7 @@ async def test_a_command_is_carried_out_and_answered(tmp_path, outbox, protocol)
             Consumer(mosquitto.port) as live,
             publishing(outbox, mosquitto.port, protocol, handler=desk, commands=SETTINGS) as publisher,
         ):
-            await eventually(lambda: "commands/+" in mosquitto.log_text, "the box listens")
+            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
             await asyncio.to_thread(say, mosquitto.port, ACKNOWLEDGE, command())
             await eventually(lambda: live.on("/response"), "it is answered")
             answer = live.on("/response")[0]
@@ -105,7 +105,7 @@ async def test_a_command_is_carried_out_and_answered(tmp_path, outbox, protocol)
 async def test_an_mqtt5_sender_is_answered_on_its_own_topic(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         async with publishing(outbox, mosquitto.port, handler=Desk(), commands=SETTINGS):
-            await eventually(lambda: "commands/+" in mosquitto.log_text, "the box listens")
+            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
             operator = await asyncio.to_thread(Operator, mosquitto.port)
             operator.ask(ACKNOWLEDGE, command(), b"first")
             operator.ask(ACKNOWLEDGE, command("c2", schema="daqsvc.command/2"), b"second")
@@ -143,7 +143,9 @@ async def test_a_retained_command_is_not_obeyed_at_every_reconnect(tmp_path, out
             await eventually(lambda: publisher.counters.connected, "connected")
             wire.cut()
             await eventually(lambda: publisher.counters.connections == 2, "connected again")
-            await eventually(lambda: mosquitto.log_text.count("commands/+") >= 2, "listening again")
+            await eventually(
+                lambda: mosquitto.log_text.count("Sending SUBACK to daqsvc-test") == 2, "listening again"
+            )
             await asyncio.to_thread(say, mosquitto.port, ACKNOWLEDGE, command("new", by="Bea"))
             await eventually(
                 lambda: "new" in [m.payload["id"] for m in live.on("/response")], "the fresh one is answered"
@@ -161,7 +163,7 @@ async def test_an_answer_that_the_broker_refuses_costs_neither_connection_nor_al
     desk = Desk()
     with running_mosquitto(tmp_path, acl=acl) as mosquitto:
         async with publishing(outbox, mosquitto.port, handler=desk, commands=SETTINGS) as publisher:
-            await eventually(lambda: "commands/+" in mosquitto.log_text, "the box listens")
+            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
             await asyncio.to_thread(say, mosquitto.port, ACKNOWLEDGE, command())
             await eventually(lambda: publisher.figures()["commands"]["unanswered"] == 1, "it is refused")
             await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
@@ -191,7 +193,7 @@ async def test_a_flood_of_commands_is_bounded_and_counted(tmp_path, outbox):
 
     with running_mosquitto(tmp_path, config="max_inflight_messages 0\nmax_queued_messages 0") as mosquitto:
         async with publishing(outbox, mosquitto.port, handler=slow, commands=SETTINGS) as publisher:
-            await eventually(lambda: "commands/+" in mosquitto.log_text, "the box listens")
+            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
             await asyncio.to_thread(flood, mosquitto.port)
             await eventually(lambda: publisher.figures()["overlooked"] >= 300 - 66, "the rest is dropped")
             gate.set()
