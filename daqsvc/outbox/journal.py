@@ -355,9 +355,10 @@ class Journal:
             deleted = connection.execute(
                 f"""
                 DELETE FROM messages WHERE sequence IN
-                (SELECT sequence FROM messages
-                 WHERE sent AND sequence NOT IN ({_IS_LATEST}) AND (? OR (sequence <= ? AND wall_ns < ?))
-                 ORDER BY sequence LIMIT {TRIM_EVERY})
+                (SELECT sequence FROM
+                 (SELECT sequence, wall_ns FROM messages WHERE sent AND sequence NOT IN ({_IS_LATEST})
+                  ORDER BY sequence LIMIT {TRIM_EVERY})
+                 WHERE ? OR (sequence <= ? AND wall_ns < ?))
                 """,  # noqa: S608  constants only
                 (over, spare_from, oldest_ns),
             ).rowcount
