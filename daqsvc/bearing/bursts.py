@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 STEADY = 2.0
 """Scatter of the energies over that of stationary noise, below which there are no hits. Half a second of it
-has 0.8 to 1.2, of a fault 9 and more where its race is hardly told (S1 at -5 dB)."""
+has 0.8 to 1.3, a fault at -5 dB 5 and more."""
 _LEAST_FRAMES = 32
 
 
