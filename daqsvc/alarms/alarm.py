@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from daqsvc.alarms.chatter import ChatterWatch
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
@@ -16,6 +16,7 @@ from daqsvc.alarms.states import (
     strongest_first,
     transition,
 )
+from daqsvc.alarms.status import AlarmStatus, Request
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,50 +24,8 @@ if TYPE_CHECKING:
     from daqsvc.alarms.chatter import ChatterLimit
     from daqsvc.alarms.events import Identity
     from daqsvc.alarms.rules import Finding
+    from daqsvc.alarms.status import Instant
     from daqsvc.diagnosis.record import Diagnosis
-
-
-class Instant(NamedTuple):
-    """When something happened, by both clocks."""
-
-    t_ns: int
-    wall_ns: int
-
-
-class Request(NamedTuple):
-    """Who asks for something, when, and why."""
-
-    by: str
-    at: Instant
-    reason: str = ""
-
-
-class AlarmStatus(NamedTuple):
-    """How an alarm stands, for a view.
-
-    Attributes:
-        state: what consumers see.
-        level: how bad; of a latching or chattering alarm the worst since it was raised.
-        occurrence: id of the activation; None while the alarm is normal.
-        since: when something last changed; None if nothing ever has.
-        message: the last event's sentence.
-        own_state: the state without its holds.
-        holds: what covers it, strongest first.
-        shelved_until_ns: end of shelving by the monotonic clock; None if not shelved.
-        chattering: whether its returns are held back.
-        first_out: whether it was the first of its group.
-    """
-
-    state: AlarmState
-    level: Level
-    occurrence: str | None
-    since: Instant | None
-    message: str
-    own_state: AlarmState = AlarmState.NORMAL
-    holds: tuple[AlarmState, ...] = ()
-    shelved_until_ns: int | None = None
-    chattering: bool = False
-    first_out: bool = False
 
 
 class Alarm:
@@ -91,6 +50,7 @@ class Alarm:
     ) -> None:
         self.name = name
         self.doubts: tuple[Doubt, ...] = ()
+        self._told_doubts: tuple[Doubt, ...] = ()
         self._identity = identity
         self._latching = latching
         self._new_occurrence = new_occurrence
@@ -144,7 +104,8 @@ class Alarm:
             left_ns = told.shelved_until_wall_ns - max(told.wall_ns, now.wall_ns)
             self._shelved_until_ns = now.t_ns + max(left_ns, 0)
         self._occurrence = None if self._state is AlarmState.NORMAL else told.occurrence
-        self._found, self._cause, self.doubts = found, told.cause, told.doubts
+        self._found, self._cause = found, told.cause
+        self.doubts = self._told_doubts = told.doubts
         self._chatter.resume(chattering=told.chattering)
         self._since, self._message = since, told.message
 
@@ -166,7 +127,7 @@ class Alarm:
                 message = f"{self.name} is quiet again: {finding.sentence}"
                 events.append(self._event(EventKind.QUIET, cause, Request("", at), message))
             elif finding.level < self._level:
-                return []
+                return self._held_back(finding, cause, at)
         event = self._found_normal(finding, cause, at) or self._found_bad(finding, cause, at)
         if event is None:
             return events
@@ -175,6 +136,14 @@ class Alarm:
             message = f"{self.name} chatters: its returns are held back until it is quiet"
             events.append(self._event(EventKind.CHATTERING, cause, Request("", at), message))
         return events
+
+    def _held_back(self, finding: Finding, cause: Diagnosis, at: Instant) -> list[AlarmEvent]:
+        """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
+        if self.doubts == self._told_doubts:
+            return []
+        self._found = finding.identity
+        message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"
+        return [self._event(EventKind.CHANGED, cause, Request("", at), message)]
 
     def hold(self) -> None:
         """Data are missing: everything stays, and no time counts."""
@@ -360,7 +329,7 @@ class Alarm:
     ) -> AlarmEvent:
         """The event of a change that has been made; what is not said before was as it is now."""
         at = request.at
-        self._since, self._message = at, message
+        self._since, self._message, self._told_doubts = at, message, self.doubts
         until_ns = self._shelved_until_ns
         return AlarmEvent(
             identity=self._identity,

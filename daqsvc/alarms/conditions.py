@@ -9,8 +9,8 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.record import Diagnosis
 
 if TYPE_CHECKING:
-    from daqsvc.alarms.alarm import Instant
     from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.alarms.status import Instant
 
 SERVICE = "service"
 """The "detector" of such conditions."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from daqsvc.alarms.alarm import Alarm, Instant, Request
+from daqsvc.alarms.alarm import Alarm
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.conditions import (
     ALARM_FLOOD,
@@ -26,14 +26,15 @@ from daqsvc.alarms.quality import PREFIXES, Doubts, quality_alarm
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, Finding, LevelRule
 from daqsvc.alarms.start_up import StartUpSignal
 from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError
+from daqsvc.alarms.status import Instant, Request
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.alarm import AlarmStatus
     from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.alarms.rules import Rule, Watch
+    from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
 
 __all__ = ["AlarmHandling", "AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
@@ -202,9 +203,7 @@ class AlarmManager:
                 ruled.alarm.is_held(Hold.SUPPRESSED)
                 and self._doubts.silences(ruled.rule, ruled.sensors) is None
             ):
-                # Whoever found a sensor bad is gone; then the alarm's own detectors must find it good.
-                for detector in ruled.rule.detectors:
-                    self._doubts.lose(detector, "a sensor was not OK before the restart")
+                self._doubts.unsettle(ruled.rule)
         return withdrawn
 
     def _tell(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:

@@ -33,7 +33,7 @@ class Doubts:
 
     def __init__(self) -> None:
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
-        self._sensors_lost: dict[str, str] = {}
+        self._unsettled: dict[str, set[str]] = {}
 
     def take(self, diagnosis: Diagnosis) -> list[str]:
         """Take in a statement; the quality alarms that it bears on."""
@@ -41,7 +41,8 @@ class Doubts:
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._by_detector.pop(detector, None)
         if diagnosis.quality == "good":
-            self._sensors_lost.pop(detector, None)
+            for detectors in self._unsettled.values():
+                detectors.discard(detector)
         else:
             not_ok = diagnosis.quality == "not_ok" or (before is not None and before[1].not_ok)
             doubt = Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
@@ -54,9 +55,9 @@ class Doubts:
         for doubt in doubts:
             self._by_detector[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
 
-    def lose(self, detector: str, reason: str) -> None:
-        """Whoever found a sensor of ``detector`` not OK is gone; now ``detector`` must find it good."""
-        self._sensors_lost[detector] = reason
+    def unsettle(self, rule: Rule) -> None:
+        """Whoever found a sensor of ``rule`` not OK is gone; now its own detectors must find them good."""
+        self._unsettled[rule.alarm] = set(rule.detectors)
 
     def of(self, name: str) -> tuple[Doubt, ...]:
         """What is said against the subject of the quality alarm ``name``, by detector."""
@@ -89,9 +90,9 @@ class Doubts:
         Its own detector says that a sensor is not OK, without saying which, or more of its sensors are blamed
         than it can spare.
         """
+        if self._unsettled.get(rule.alarm):
+            return "a sensor was not OK before the restart"
         for detector in rule.detectors:
-            if detector in self._sensors_lost:
-                return self._sensors_lost[detector]
             blamed = self._by_detector.get(detector)
             if rule.spare == 0 and blamed is not None and blamed[1].not_ok:
                 return blamed[1].reason or "a sensor is not OK"

@@ -93,6 +93,7 @@ class Alarms(RuleBasedStateMachine):
         self.settings_of_the_wall = 0
         self.occurrences = set()
         self.start()
+        assert self.manager.resume([], SPEAKERS) == []
 
     def start(self):
         self.called_ns = []

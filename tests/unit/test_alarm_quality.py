@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from alarm_rig import AlarmRig, kinds
+from alarm_rig import SECOND_NS, AlarmRig, kinds
 
+from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 
@@ -68,6 +70,23 @@ def test_an_acknowledged_quality_alarm_still_knows_after_a_restart_that_the_sens
     assert after.rms(50.0, "missing") == []
     assert after.status("vibration-x").state.value == "suppressed"
     assert kinds(after.rms(50.0))[-1] == ("vibration-x", "raised")
+
+
+def test_a_chattering_quality_alarm_tells_who_doubts_although_its_returns_are_held_back():
+    chatter = ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)
+    rig = AlarmRig(LEVEL, handling=AlarmHandling(chatter=chatter))
+    for quality in ["not_ok", "good", "not_ok"]:
+        rig.rms(50.0, quality)
+    assert rig.status("sensor-ok/probe-x").chattering
+    changed = rig.rms(50.0)[0]
+    assert (changed.kind.value, changed.doubts, changed.covered) == ("changed", (), None)
+    assert "until it is quiet: probe-x is good again" in changed.message
+    assert rig.rms(50.0) == []
+    after = rig.restarted(SPEAKERS)
+    assert kinds(bearing(after, "missing", ("accel-de",))) == [("sensor-ok/accel-de", "raised")]
+    assert after.status("vibration-x").state.value == "active_unacknowledged"
+    assert kinds(after.rms(50.0, "not_ok"))[0] == ("sensor-ok/probe-x", "changed")
+    assert after.status("vibration-x").state.value == "suppressed"
 
 
 def test_a_quality_alarm_is_bypassed_like_any_other_and_the_suppression_stays():

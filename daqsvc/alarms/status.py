@@ -1,0 +1,50 @@
+"""How an alarm stands, since when, and who asks something of it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from daqsvc.alarms.states import AlarmState, Level
+
+
+class Instant(NamedTuple):
+    """When something happened, by both clocks."""
+
+    t_ns: int
+    wall_ns: int
+
+
+class Request(NamedTuple):
+    """Who asks for something, when, and why."""
+
+    by: str
+    at: Instant
+    reason: str = ""
+
+
+class AlarmStatus(NamedTuple):
+    """How an alarm stands, for a view.
+
+    Attributes:
+        state: what consumers see.
+        level: how bad; of a latching or chattering alarm the worst since it was raised.
+        occurrence: id of the activation; None while the alarm is normal.
+        since: when something last changed; None if nothing ever has.
+        message: the last event's sentence.
+        own_state: the state without its holds.
+        holds: what covers it, strongest first.
+        shelved_until_ns: end of shelving by the monotonic clock; None if not shelved.
+        chattering: whether its returns are held back.
+        first_out: whether it was the first of its group.
+    """
+
+    state: AlarmState
+    level: Level
+    occurrence: str | None
+    since: Instant | None
+    message: str
+    own_state: AlarmState = AlarmState.NORMAL
+    holds: tuple[AlarmState, ...] = ()
+    shelved_until_ns: int | None = None
+    chattering: bool = False
+    first_out: bool = False
