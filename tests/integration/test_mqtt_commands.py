@@ -140,7 +140,7 @@ async def test_a_retained_command_is_not_obeyed_at_every_reconnect(tmp_path, out
             TcpProxy(mosquitto.port) as wire,
             publishing(outbox, wire.port, protocol, handler=desk, commands=SETTINGS) as publisher,
         ):
-            await eventually(lambda: publisher.counters.connected, "connected")
+            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
             wire.cut()
             await eventually(lambda: publisher.counters.connections == 2, "connected again")
             await eventually(
