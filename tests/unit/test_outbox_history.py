@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -163,6 +164,29 @@ def test_a_journal_that_is_an_older_copy_is_told_and_gives_no_number_again(tmp_p
     journal.close()
     journal = opened(path, wall)
     assert journal.vanished == 0, "it is told once"
+    journal.close()
+
+
+@pytest.mark.parametrize("boot", ["same boot", "after a power cut"])
+def test_a_log_that_is_lost_brings_no_number_back(tmp_path, wall, monkeypatch, boot):
+    """SQLite says nothing about it: a log that is gone, or cut off by a flipped bit, is a log that ended."""
+    store = tmp_path / "store"
+    journal = opened(store / "outbox.sqlite", wall)
+    append(journal, 3)
+    journal.close()
+    journal = opened(store / "outbox.sqlite", wall)
+    last = append(journal, 5)[-1]
+    crashed = tmp_path / "crashed"
+    shutil.copytree(store, crashed)
+    journal.close()
+    for suffix in ("-wal", "-shm"):
+        (crashed / f"outbox.sqlite{suffix}").unlink()
+    if boot != "same boot":
+        monkeypatch.setattr(sequence, "boot_id", lambda: "another-boot")
+    journal = opened(crashed / "outbox.sqlite", wall)
+    [after] = append(journal, 1)
+    assert after == last + 1 if boot == "same boot" else last < after <= last + 1 + sequence.STEP
+    assert journal.vanished == (5 if boot == "same boot" else 0), "how many is only known on the same boot"
     journal.close()
 
 
