@@ -124,7 +124,7 @@ BAD = np.array([1.0, np.nan, np.inf, -np.inf] * 1000)
         ({"a": BAD, "b": noise(2)}, [], r"holds 1000 NaN and 2000 infinite samples \(in a\)"),
         ({"a": np.where(np.isnan(BAD), 0, BAD)}, [], "holds 2000 infinite samples"),
         ({"a": noise(0.4)}, [], r"is too short: 800 samples at 2000 Hz last 0\.4 s; give at least 0\.5 s"),
-        ({"a": noise(2)}, ["--fs", "20"], r"at 20 Hz as a: 0\.5 s at 20 Hz are fewer than 16 samples.*--fs"),
+        ({"a": noise(2), "fs": 20.0}, [], r"at 20 Hz as a: 0\.5 s at 20 Hz are fewer than 16 samples.*--fs"),
         ({"a b": noise(2), "a-b": noise(2)}, [], "'a b' and 'a-b' would both be sensor 'a-b'; .*--map"),
         ({"§": noise(2)}, [], "no sensor can be named '§'"),
         ({"a" * 65: noise(2)}, [], "longer than the 64 characters"),

@@ -1,4 +1,4 @@
-"""The Sparkplug payload: what is written is read again, here and by another reader; nothing breaks reading."""
+"""The Sparkplug payload: what is written is read again, here and elsewhere; nothing breaks reading."""
 
 from __future__ import annotations
 
