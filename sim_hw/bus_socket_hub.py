@@ -1,0 +1,338 @@
+"""The hub of a `sim_hw.bus_socket` bus: hands every frame to all clients but its sender, in one order.
+
+A hub never waits for a client. What a client does not read in time is queued for it, and when its queue is
+full its newest frames are lost; it is told how many, in the place where they are missing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import errno
+import fcntl
+import os
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim_hw.bus_socket_wire import LONGEST, Wish, is_frame, pack_greeting, pack_lost, unpack_greeting
+
+QUEUE_FRAMES = 8192
+"""Frames that wait in the hub for a client, beside those (some 280) that its socket holds."""
+BURST_FRAMES = 64
+"""Frames taken from one client before the others have their turn."""
+LONGEST_PATH_BYTES = 107
+"""Of an address of a Unix socket (``sun_path`` in linux/un.h, less its closing zero)."""
+FLUSH_S = 1.0
+BACKLOG = 64
+
+
+class HubError(OSError):
+    """A hub cannot be started at a path; says why and what to do."""
+
+
+class HubTakenError(HubError):
+    """There is a hub at the path already."""
+
+
+@dataclass(slots=True)
+class HubCounters:
+    """What went through a hub; every figure only grows.
+
+    Attributes:
+        frames: frames that were received from clients.
+        lost: frames that were lost to a client that did not read them in time, once for each such client.
+        malformed: packets that were no frames.
+        clients: clients that have ever joined.
+    """
+
+    frames: int = 0
+    lost: int = 0
+    malformed: int = 0
+    clients: int = 0
+
+
+class _Client:
+    """One end of the bus, as the hub sees it."""
+
+    def __init__(self, connection: socket.socket, limit: int) -> None:
+        self.connection = connection
+        self.joined = False
+        self.echo = False
+        self.backlog: deque[bytes] = deque()
+        self.lost = 0
+        self._limit = limit
+        self._untold = 0
+
+    def offer(self, packet: bytes) -> None:
+        """Send a packet, or queue it, or lose it.
+
+        Raises:
+            OSError: the client is gone.
+        """
+        if not self.backlog and not self._untold and self._sent(packet):
+            return
+        if len(self.backlog) >= self._limit:
+            self.lost += 1
+            self._untold += 1
+            return
+        self._queue_notice()
+        self.backlog.append(packet)
+
+    def flush(self) -> None:
+        """Send what is queued, as far as the client takes it.
+
+        Raises:
+            OSError: the client is gone.
+        """
+        while self.backlog and self._sent(self.backlog[0]):
+            self.backlog.popleft()
+        if not self.backlog:
+            # Whoever has caught up hears of its loss at once, not with the next frame.
+            self._queue_notice()
+            while self.backlog and self._sent(self.backlog[0]):
+                self.backlog.popleft()
+
+    def _queue_notice(self) -> None:
+        if self._untold:
+            self.backlog.append(pack_lost(self._untold))
+            self._untold = 0
+
+    def _sent(self, packet: bytes) -> bool:
+        try:
+            self.connection.send(packet)
+        except BlockingIOError:
+            return False
+        return True
+
+
+class Hub:
+    """A virtual CAN bus at a path; `run` works it, in whatever thread it is called.
+
+    Args:
+        path: of the Unix socket that clients connect to.
+        queue_frames: frames kept for a client that does not read.
+        until_empty: end when the last client has left, rather than only when told to.
+
+    Raises:
+        HubTakenError: there is one already.
+        HubError: the socket cannot be made.
+    """
+
+    def __init__(
+        self, path: str | Path, *, queue_frames: int = QUEUE_FRAMES, until_empty: bool = False
+    ) -> None:
+        self.path = str(path)
+        self.counters = HubCounters()
+        self.thread: threading.Thread | None = None
+        self._queue_frames = queue_frames
+        self._until_empty = until_empty
+        self._stopping = threading.Event()
+        self._clients: dict[socket.socket, _Client] = {}
+        check_path(self.path)
+        self._lock = _lock(self.path)
+        try:
+            self._listener = _listener(self.path)
+        except OSError as error:
+            _unlock(self.path, self._lock)
+            raise HubError(
+                f"no bus can be made at {self.path}: {error.strerror or error}; "
+                "name a path that can be written"
+            ) from error
+        self._selector = selectors.DefaultSelector()
+        self._woken, self._waker = socket.socketpair()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._selector.register(self._woken, selectors.EVENT_READ)
+
+    def run(self) -> None:
+        """Hand frames on until told to stop."""
+        try:
+            while not self._stopping.is_set():
+                for key, events in self._selector.select():
+                    self._serve(key.fileobj, events)
+                if self._until_empty and self.counters.clients and not self._clients:
+                    break
+            self._flush()
+        finally:
+            self._close()
+
+    def start(self) -> None:
+        """Run in a thread of its own; a process that ends hands on what its hub has taken in."""
+        atexit.register(self.stop)
+        self.thread = threading.Thread(
+            target=self._run_as_thread, name=f"unixbus-hub {self.path}", daemon=True
+        )
+        self.thread.start()
+
+    def _run_as_thread(self) -> None:
+        try:
+            self.run()
+        finally:
+            atexit.unregister(self.stop)
+
+    def stop(self) -> None:
+        """Make `run` end, within about a second; from any thread. What is queued is sent before."""
+        self._stopping.set()
+        with contextlib.suppress(OSError):  # it has ended by itself
+            self._waker.send(b"\0")
+        if self.thread is not None and self.thread is not threading.current_thread():
+            self.thread.join(2 * FLUSH_S)
+
+    def _serve(self, ready: object, events: int) -> None:
+        if ready is self._listener:
+            self._accept()
+        elif isinstance(ready, socket.socket) and (client := self._clients.get(ready)):
+            try:
+                if events & selectors.EVENT_WRITE:
+                    client.flush()
+                    self._watch(client)
+            except OSError:
+                self._leave(client)
+                return
+            if events & selectors.EVENT_READ:
+                self._receive(client)
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setblocking(False)
+        self._clients[connection] = _Client(connection, self._queue_frames)
+        self._selector.register(connection, selectors.EVENT_READ)
+        self.counters.clients += 1
+
+    def _receive(self, client: _Client) -> None:
+        for _ in range(BURST_FRAMES):
+            try:
+                packet = client.connection.recv(LONGEST + 1)
+            except BlockingIOError:
+                return
+            except ConnectionResetError:
+                # It left with frames unread; what it sent before that is still to come.
+                continue
+            except OSError:
+                packet = b""
+            if not packet:
+                self._leave(client)
+                return
+            self._take(client, packet)
+
+    def _take(self, client: _Client, packet: bytes) -> None:
+        if not client.joined:
+            wish = unpack_greeting(packet)
+            if wish is None:
+                self.counters.malformed += 1
+                self._leave(client)
+                return
+            client.joined, client.echo = True, bool(wish & Wish.ECHO)
+            self._offer(client, pack_greeting(wish))
+        elif is_frame(packet):
+            self.counters.frames += 1
+            for other in list(self._clients.values()):
+                if other.joined and (other is not client or client.echo):
+                    self._offer(other, packet)
+        else:
+            self.counters.malformed += 1
+
+    def _offer(self, client: _Client, packet: bytes) -> None:
+        waited, lost = bool(client.backlog), client.lost
+        try:
+            client.offer(packet)
+        except OSError:
+            # Its end is seen, and its last frames are taken, when it is read from.
+            return
+        self.counters.lost += client.lost - lost
+        if bool(client.backlog) != waited:
+            self._watch(client)
+
+    def _watch(self, client: _Client) -> None:
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.backlog else 0)
+        self._selector.modify(client.connection, events)
+
+    def _leave(self, client: _Client) -> None:
+        if self._clients.pop(client.connection, None) is not None:
+            self._selector.unregister(client.connection)
+            client.connection.close()
+
+    def _flush(self) -> None:
+        """Send what is queued, for as long as clients read it, and a second at most."""
+        until_s = time.monotonic() + FLUSH_S
+        for client in list(self._clients.values()):
+            # Frames sent before the end was decided are part of what the bus has carried.
+            self._receive(client)
+        while (late := [c for c in self._clients.values() if c.backlog]) and time.monotonic() < until_s:
+            for client in late:
+                try:
+                    client.flush()
+                except OSError:
+                    self._leave(client)
+            time.sleep(0.001)
+
+    def _close(self) -> None:
+        for client in list(self._clients.values()):
+            self._leave(client)
+        self._selector.close()
+        Path(self.path).unlink(missing_ok=True)
+        for each in (self._listener, self._woken, self._waker):
+            each.close()
+        _unlock(self.path, self._lock)
+
+
+def check_path(path: str) -> None:
+    """Refuse a path that no Unix socket can have.
+
+    Raises:
+        HubError: it is empty or too long.
+    """
+    length = len(os.fsencode(path))
+    if not 0 < length <= LONGEST_PATH_BYTES:
+        raise HubError(
+            f"the path {path!r} of a bus has {length} bytes, and a Unix socket's may have 1 to "
+            f"{LONGEST_PATH_BYTES}; name a shorter one, e.g. /tmp/can0"
+        )
+
+
+def _listener(path: str) -> socket.socket:
+    # Whoever holds the lock is the only hub: a socket that is there was left by one that died.
+    if Path(path).exists() and not Path(path).is_socket():
+        raise FileExistsError(errno.EEXIST, "there is a file of that name, and it is not a socket")
+    Path(path).unlink(missing_ok=True)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        listener.bind(path)
+        listener.listen(BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def _lock(path: str) -> int:
+    """Take the lock that only one hub at a path can have; the kernel frees it when the hub dies."""
+    name = Path(f"{path}.lock")
+    while True:
+        try:
+            lock = os.open(name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise HubError(
+                f"no bus can be made at {path}: {error.strerror}; "
+                "name a path in a directory that is there and can be written"
+            ) from error
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Its last holder may have removed it while we waited for it.
+            if os.path.samestat(os.fstat(lock), name.stat()):
+                return lock
+        except BlockingIOError:
+            os.close(lock)
+            raise HubTakenError(f"there is a bus at {path} already; join it, or name another path") from None
+        except FileNotFoundError:
+            pass
+        os.close(lock)
+
+
+def _unlock(path: str, lock: int) -> None:
+    Path(f"{path}.lock").unlink(missing_ok=True)
+    os.close(lock)
