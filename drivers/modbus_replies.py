@@ -1,0 +1,195 @@
+"""What comes back on a Modbus line, byte by byte: which reply answers the request, and what the others are.
+
+Pure functions over bytes, strict: a reply counts only if unit, transaction, function and length are those
+that were asked for. Modbus Application Protocol 1.1b3; Modbus over serial line 1.02; TCP guide 1.0b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Fault: TypeAlias = Literal[
+    "truncated", "oversized", "corrupt", "wrong_unit", "wrong_transaction", "wrong_function", "wrong_protocol"
+]
+
+READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
+WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS = 5, 6, 15, 16
+READ_FIFO = 24
+
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "server device failure",
+    5: "acknowledge",
+    6: "server device busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target device failed to respond",
+}
+
+MBAP_BYTES = 7
+MAX_TCP_BYTES = 260
+MAX_RTU_BYTES = 256
+FIFO_REGISTERS = 31
+"""Registers that a FIFO reply can hold (Modbus Application Protocol, 6.18)."""
+
+_EXCEPTION_BIT = 0x80
+_WRITES = (WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS)
+_READS = (READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT)
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """The reply that is waited for.
+
+    Attributes:
+        unit: address of the unit that was asked.
+        function: what it was asked to do.
+        data_bytes: bytes of register data in the reply; None where the unit decides (FIFO) or there are none.
+        transaction: id of the request; 0 on a serial line, which has none.
+    """
+
+    unit: int
+    function: int
+    data_bytes: int | None
+    transaction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the bytes received so far are.
+
+    Attributes:
+        used: bytes that are done with; the rest may be the beginning of something.
+        pdu: function and data of the reply that was waited for, a refusal of the unit included.
+        fault: what is wrong with the bytes done with; None if there are none or they are the reply.
+        final: whether the request can no more be answered, since this was its reply.
+    """
+
+    used: int = 0
+    pdu: bytes | None = None
+    fault: Fault | None = None
+    final: bool = False
+
+
+def pdu_bytes(start: bytes) -> int | None:
+    """Length of a reply's PDU, from how it begins; None while that is too short to tell.
+
+    Raises:
+        ValueError: no reply that this service asks for begins like that.
+    """
+    if not start:
+        return None
+    function = start[0]
+    if function & _EXCEPTION_BIT:
+        return 2
+    if function in _READS:
+        return None if len(start) < 2 else 2 + start[1]
+    if function in _WRITES:
+        return 5
+    if function == READ_FIFO:
+        return None if len(start) < 3 else 3 + int.from_bytes(start[1:3], "big")
+    raise ValueError(f"function {function} of a reply is not one that was ever asked for")
+
+
+def judge_pdu(pdu: bytes, expected: Expected) -> Fault | None:  # noqa: PLR0911 - one for each fault
+    """What is wrong with the PDU of the unit and transaction that were asked; None if nothing is."""
+    if not pdu:
+        return "truncated"
+    if pdu[0] == expected.function | _EXCEPTION_BIT:
+        return _length_fault(len(pdu), 2)
+    if pdu[0] != expected.function:
+        return "wrong_function"
+    if pdu[0] in _WRITES:
+        return _length_fault(len(pdu), 5)
+    if pdu[0] == READ_FIFO:
+        return _judge_fifo(pdu)
+    assert expected.data_bytes is not None  # noqa: S101 - a read of registers knows how many
+    if len(pdu) < 2:
+        return "truncated"
+    return _length_fault(pdu[1], expected.data_bytes) or _length_fault(len(pdu), 2 + expected.data_bytes)
+
+
+def register_bytes(pdu: bytes) -> bytes:
+    """The registers of a sound reply, high byte of each first; empty for a write."""
+    if pdu[0] == READ_FIFO:
+        return pdu[5:]
+    return pdu[2:] if pdu[0] in _READS else b""
+
+
+def judge_tcp(data: bytes, expected: Expected | None) -> Verdict:  # noqa: PLR0911 - one for each fault
+    """What stands at the head of the bytes received over TCP (MBAP frames)."""
+    if len(data) < MBAP_BYTES:
+        return Verdict()
+    transaction = int.from_bytes(data[:2], "big")
+    protocol = int.from_bytes(data[2:4], "big")
+    length = int.from_bytes(data[4:6], "big")
+    if protocol != 0:
+        # No length can be believed any more: nothing tells where the next frame begins.
+        return Verdict(len(data), fault="wrong_protocol", final=True)
+    if length < 2:
+        return Verdict(len(data), fault="truncated", final=True)
+    end = MBAP_BYTES - 1 + length
+    if end > MAX_TCP_BYTES:
+        return Verdict(len(data), fault="oversized", final=True)
+    if len(data) < end:
+        return Verdict()
+    if expected is None or transaction != expected.transaction:
+        return Verdict(end, fault="wrong_transaction")
+    if data[6] != expected.unit:
+        return Verdict(end, fault="wrong_unit")
+    pdu = data[MBAP_BYTES:end]
+    fault = judge_pdu(pdu, expected)
+    return Verdict(end, None if fault else pdu, fault, final=True)
+
+
+def judge_rtu(  # noqa: PLR0911 - one for each fault
+    data: bytes, expected: Expected, crc_of: Callable[[bytes], int]
+) -> Verdict:
+    """What stands at the head of the bytes received on a serial line.
+
+    Args:
+        data: all that was received since the request and is not done with.
+        expected: the reply that is waited for.
+        crc_of: CRC-16/MODBUS of some bytes, as an int of its two bytes in their order on the line.
+    """
+    if len(data) < 2:
+        return Verdict()
+    try:
+        length = pdu_bytes(data[1:4])
+    except ValueError:
+        return Verdict(len(data), fault="corrupt")
+    if length is None:
+        return Verdict()
+    end = 1 + length + 2
+    if end > MAX_RTU_BYTES:
+        return Verdict(len(data), fault="oversized")
+    if len(data) < end:
+        return Verdict()
+    if crc_of(data[: end - 2]) != int.from_bytes(data[end - 2 : end], "big"):
+        return Verdict(len(data), fault="corrupt")
+    if data[0] != expected.unit:
+        return Verdict(end, fault="wrong_unit")
+    pdu = data[1 : end - 2]
+    fault = judge_pdu(pdu, expected)
+    return Verdict(end, None if fault else pdu, fault, final=True)
+
+
+def _judge_fifo(pdu: bytes) -> Fault | None:
+    if len(pdu) < 5:
+        return "truncated"
+    stated, registers = int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")
+    if registers > FIFO_REGISTERS:
+        return "oversized"
+    return _length_fault(stated, 2 + 2 * registers) or _length_fault(len(pdu), 3 + stated)
+
+
+def _length_fault(found: int, wanted: int) -> Fault | None:
+    if found == wanted:
+        return None
+    return "truncated" if found < wanted else "oversized"
