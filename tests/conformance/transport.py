@@ -165,6 +165,9 @@ class Transport(Protocol):
     latency_ns: int
     """Stated bound of that constant latency, e.g. one poll period; 0 where arrivals are stamped as sent."""
 
+    poll_ns: int
+    """Time that has to pass until the driver looks again; 0 where what is sent wakes it by itself."""
+
     overflow_frames: int
     """More frames than wire and driver can hold together while the event loop does not turn."""
 

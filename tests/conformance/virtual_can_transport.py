@@ -1,0 +1,131 @@
+"""CAN FD over python-can's virtual bus, with a plug that a test can pull."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+import can
+import numpy as np
+from can.interfaces.virtual import VirtualBus
+from conformance.faulty_device import FaultyDevice
+from conformance.transport import CHANNELS, STREAM, SimulatedTime
+
+from drivers.base import BusPort, StreamSpec
+from drivers.can_bus import CanDriver
+from drivers.frames import FrameLayout
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.samples import SampleBlock
+    from drivers.base import StartPolicy
+
+PER_FRAME = 10
+RECEIVE_QUEUE = 1024
+_serial = itertools.count()
+
+
+class PluggedBus(VirtualBus):
+    """python-can's virtual bus, as interface ``"plugged"``: lost while its channel is unplugged."""
+
+    unplugged: set[Any] = set()  # noqa: RUF012 - shared by all buses, like the cables of a rack
+
+    def __init__(self, channel: Any = None, **options: Any) -> None:
+        if channel in self.unplugged:
+            raise can.CanInitializationError(f"{channel} is unplugged")
+        super().__init__(channel, **options)
+        self._lost = False
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        # Once lost it stays lost: a cable that is back does not bring an open interface back.
+        self._lost = self._lost or self.channel_id in self.unplugged
+        if self._lost:
+            raise can.CanOperationError("Network is down", 100)
+        return super()._recv_internal(min(timeout, 0.002) if timeout else timeout)
+
+
+can.interfaces.BACKENDS["plugged"] = ("conformance.virtual_can_transport", "PluggedBus")
+# python-can froze the names when it was imported.
+can.util.VALID_INTERFACES = frozenset(can.interfaces.BACKENDS)
+
+
+def layout() -> FrameLayout:
+    return FrameLayout.plain(
+        frame_id=0x101,
+        length=48,
+        channels=[(name, 16, "signed", 1.0, 0.0) for name in CHANNELS],
+        samples_per_frame=PER_FRAME,
+        counter_byte=0,
+        counter_bits=32,
+        first_byte=4,
+        crc_byte=46,
+    )
+
+
+class _Device(FaultyDevice):
+    def __init__(self, channel: str) -> None:
+        super().__init__(PER_FRAME)
+        self._layout = layout()
+        self._channel = channel
+        self.bus = can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD)
+
+    def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
+        data = bytearray(self._layout.encode(np.array([first_index], np.int64), samples[None])[0].tobytes())
+        if corrupt:
+            data[20] ^= 0x10
+        message = can.Message(arbitration_id=0x101, is_extended_id=False, is_fd=True, data=data)
+        try:
+            self.bus.send(message, timeout=0)
+        except can.CanOperationError:  # the receive queue of the interface is full
+            return False
+        return len(self.bus.channel) > 1
+
+    def go_away(self) -> None:
+        super().go_away()
+        PluggedBus.unplugged.add(self._channel)
+
+    def come_back(self) -> None:
+        super().come_back()
+        PluggedBus.unplugged.discard(self._channel)
+
+
+class VirtualCan:
+    """See `conformance.transport.Transport`."""
+
+    name = "virtual CAN"
+    rate_hz = 1000.0
+    samples_per_frame = PER_FRAME
+    counter_modulus = 2**32
+    jitter_ns = 1000
+    latency_ns = 0
+    poll_ns = 0
+    overflow_frames = 80_000
+    cannot = {}  # noqa: RUF012
+
+    def __init__(self, _folder: Path) -> None:
+        self.channel = f"conformance-{next(_serial)}"
+        self.time = SimulatedTime()
+
+    async def start(self) -> None:
+        self.device = _Device(self.channel)
+
+    async def stop(self) -> None:
+        PluggedBus.unplugged.discard(self.channel)
+        self.device.bus.shutdown()
+
+    def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
+        options = {
+            "interface": "plugged",
+            "channel": self.channel,
+            "fd": True,
+            "options": {"rx_queue_size": RECEIVE_QUEUE, "protocol": can.CanProtocol.CAN_FD},
+        }
+        spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
+        return CanDriver(BusPort("can0", options, [spec], self.time.clock, deliver, start))
+
+
+TRANSPORTS = {VirtualCan.name: VirtualCan}
