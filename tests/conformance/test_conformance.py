@@ -25,8 +25,9 @@ pytestmark = pytest.mark.timeout(240)
 
 LOSSES = 100
 WARM_LOSSES = 10
-LEAK_BYTES_A_LOSS = 512
-"""An object of ours that is kept for every loss weighs more than this."""
+LEAK_BYTES_A_LOSS = 1500
+"""What the time base and the assembler remember of a gap, up to a bound, weighs half of this; a queue, a
+socket's reader or a thread that is kept for every loss weighs more."""
 
 
 async def test_what_is_sent_is_delivered_in_its_place(transport: Transport) -> None:
@@ -349,7 +350,8 @@ async def test_a_driver_ends_wherever_it_is_cancelled(transport: Transport, pres
         await _cancelled_after(rig, turns)
     assert open_files() <= files
     # And it has left the bus free for the next.
-    transport.device.come_back()
+    if not present:
+        transport.device.come_back()
     async with Rig(transport) as fresh:
         await fresh.until_up()
         await fresh.send(5)
