@@ -121,6 +121,9 @@ class AlarmDesk:
         self._self_check = SelfCheck(store, limits.reserve_bytes)
         self._free_bytes: int | None = None
         self._under_way: set[asyncio.Future[Any]] = set()
+        self._newest: dict[tuple[str, str], AlarmEvent] = {}
+        self._untold: dict[tuple[str, str], AlarmEvent] = {}
+        """By alarm, its newest event if the outbox has refused that."""
         self._one_at_a_time = asyncio.Lock()
         self._commands_waiting = 0
         self._stopping = False
@@ -160,6 +163,10 @@ class AlarmDesk:
 
     def tick(self) -> None:
         """What time alone brings, such as the end of shelving, and how the service itself stands."""
+        if self._untold and not self.outbox.counters.waiting:
+            # Once the disk takes events again, it must know how each alarm stands by now.
+            for event in list(self._untold.values()):
+                self._submit(event)
         for event in self.manager.tick():
             self._post(event)
         for condition in self._self_check.look(self._vitals()):
@@ -279,6 +286,7 @@ class AlarmDesk:
             waiting=outbox.waiting,
             write_errors=outbox.write_errors,
             lost=outbox.refused + outbox.lost,
+            damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
         )
@@ -298,6 +306,12 @@ class AlarmDesk:
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
         loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
         logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
+        return self._submit(event)
+
+    def _submit(self, event: AlarmEvent) -> asyncio.Future[int]:
+        alarm = (event.identity.machine, event.alarm)
+        self._newest[alarm] = event
+        self._untold.pop(alarm, None)
         topic = self.topics.alarm(event.identity.machine, event.alarm)
         try:
             committed = self.outbox.submit(
@@ -307,8 +321,17 @@ class AlarmDesk:
             committed = asyncio.get_running_loop().create_future()
             committed.set_exception(error)
         self._watch(committed)
-        committed.add_done_callback(_tell_loss)
+        committed.add_done_callback(lambda done: self._settled(event, done))
         return committed
+
+    def _settled(self, event: AlarmEvent, committed: asyncio.Future[int]) -> None:
+        """Remember what the disk must be told again: how an alarm stands, if its newest event was refused."""
+        if committed.cancelled() or (error := committed.exception()) is None:
+            return
+        logger.error("an event of alarm %s never reached the disk: %s", event.alarm, error)
+        alarm = (event.identity.machine, event.alarm)
+        if self._newest[alarm] is event:
+            self._untold[alarm] = event
 
     def _watch(self, work: asyncio.Future[Any]) -> None:
         self._under_way.add(work)
@@ -327,8 +350,3 @@ def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
     return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
         "; ".join(errors) or "the event waits in memory; make room on the disk"
     )
-
-
-def _tell_loss(committed: asyncio.Future[int]) -> None:
-    if not committed.cancelled() and (error := committed.exception()) is not None:
-        logger.error("an alarm event never reached the disk: %s", error)

@@ -55,6 +55,7 @@ class Vitals:
         waiting: alarm events in memory that the disk has not taken.
         write_errors: failed writes of alarms so far.
         lost: alarm events that could not even wait, so far.
+        damaged: corrupt files set aside, and messages that a file no longer knew, so far.
         telemetry_dropped: telemetry messages dropped so far.
         unwritten: commands so far that were refused because the audit log could not be written.
     """
@@ -68,6 +69,7 @@ class Vitals:
     waiting: int
     write_errors: int
     lost: int
+    damaged: int
     telemetry_dropped: int
     unwritten: int
 
@@ -87,6 +89,7 @@ class SelfCheck:
         self._telemetry = _Happening()
         self._lost = _Happening()
         self._unwritten = _Happening()
+        self._damaged = _Happening()
         self._write_errors = 0
         self._unwritable = False
 
@@ -110,6 +113,7 @@ class SelfCheck:
         if vitals.free_bytes is not None:
             yield self._disk(vitals.free_bytes)
         yield self._journal(vitals)
+        yield self._damage(vitals)
         yield self._dropped(vitals)
         yield self._audit(vitals)
 
@@ -152,6 +156,15 @@ class SelfCheck:
             )
             return Condition("store/journal", Level.ALERT, sentence)
         return Condition("store/journal", Level.NORMAL, f"the journal in {self._store} takes what comes")
+
+    def _damage(self, vitals: Vitals) -> Condition:
+        if not self._damaged.goes_on(vitals.damaged, vitals.now_ns):
+            return Condition("store/damage", Level.NORMAL, f"the files in {self._store} are sound")
+        sentence = (
+            f"files in {self._store} were damaged: what could be read was saved, the rest is set aside as "
+            "*.corrupt-*; look at the disk"
+        )
+        return Condition("store/damage", Level.ALERT, sentence)
 
     def _dropped(self, vitals: Vitals) -> Condition:
         stands = self._telemetry.goes_on(vitals.telemetry_dropped, vitals.now_ns)

@@ -80,6 +80,7 @@ class _Statement(Payload):
     reason: str = Field(description="why the quality is not good")
     sensors: tuple[str, ...]
     model: str
+    where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")
 
 
 class CausePayload(_Statement):
@@ -142,8 +143,8 @@ class DiagnosisPayload(Stamped, _Statement):
     machine: str
 
 
-class Figures(RootModel[dict[str, "WholeOrNumber | Figures"]]):
-    """Numbers by name, or groups of them."""
+class Figures(RootModel[dict[str, "WholeOrNumber | str | Figures"]]):
+    """Numbers by name, words for states, or groups of them."""
 
 
 class StatusPayload(Stamped):
@@ -303,6 +304,7 @@ def _statement(diagnosis: Diagnosis) -> dict[str, Any]:
         "reason": diagnosis.reason,
         "sensors": diagnosis.sensors,
         "model": diagnosis.model,
+        "where": diagnosis.where,
     }
 
 
@@ -328,6 +330,7 @@ def _diagnosis(machine: str, cause: CausePayload) -> Diagnosis:
         reason=cause.reason,
         sensors=cause.sensors,
         model=cause.model,
+        where=cause.where,
     )
 
 

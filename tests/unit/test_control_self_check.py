@@ -24,6 +24,7 @@ FINE: dict[str, Any] = {
     "waiting": 0,
     "write_errors": 0,
     "lost": 0,
+    "damaged": 0,
     "telemetry_dropped": 0,
     "unwritten": 0,
 }
@@ -42,7 +43,8 @@ def test_a_service_that_is_well_says_nothing_but_normal() -> None:
     found = look(self_check(), free_bytes=65 * MIB, certificates_end_ns={"broker": NOW_NS + 90 * NS_PER_DAY})
     assert {level for level, _ in found.values()} == {Level.NORMAL}
     assert set(found) == {
-        *("certificate/broker", "store/disk", "store/journal", "store/telemetry", "store/audit-log"),
+        "certificate/broker",
+        *(f"store/{part}" for part in ("disk", "journal", "damage", "telemetry", "audit-log")),
     }
 
 
@@ -104,7 +106,12 @@ def test_a_journal_that_cannot_be_written_stands_until_nothing_waits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "condition"), [("telemetry_dropped", "store/telemetry"), ("unwritten", "store/audit-log")]
+    ("count", "condition"),
+    [
+        ("telemetry_dropped", "store/telemetry"),
+        ("unwritten", "store/audit-log"),
+        ("damaged", "store/damage"),
+    ],
 )
 def test_what_happens_now_and_then_is_one_alarm(count: str, condition: str) -> None:
     check = self_check()

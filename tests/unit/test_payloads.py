@@ -112,16 +112,20 @@ def test_a_diagnosis_is_stamped_with_the_time_of_its_data():
     assert (said["schema"], said["machine"], said["detector"]) == ("daqsvc.diagnosis/1", "rig", "rotor-bank")
 
 
-def test_status_takes_nested_numbers_and_nothing_else():
-    figures = {"loop_lag_ms": {"p99": 1.5, "max": math.nan}, "streams": {"shaft": {"lost": 3}}, "depth": 0}
+def test_status_takes_nested_numbers_and_words_and_nothing_else():
+    figures = {
+        "loop_lag_ms": {"p99": 1.5, "max": math.nan},
+        "streams": {"shaft": {"lost": 3, "state": "7"}},
+        "depth": 0,
+    }
     said = json.loads(status_payload("lab", "edge-1", figures, CLOCK).to_json())
     assert said["figures"] == {
         "loop_lag_ms": {"p99": 1.5, "max": None},
-        "streams": {"shaft": {"lost": 3}},
+        "streams": {"shaft": {"lost": 3, "state": "7"}},
         "depth": 0,
     }
     with pytest.raises(ValidationError, match="streams"):
-        status_payload("lab", "edge-1", {"streams": "three"}, CLOCK)
+        status_payload("lab", "edge-1", {"streams": ["three"]}, CLOCK)
 
 
 @pytest.mark.parametrize(
