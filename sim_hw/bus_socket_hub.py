@@ -45,12 +45,14 @@ class HubCounters:
 
     Attributes:
         frames: frames that were received from clients.
+        delivered: frames handed to a client, or queued for it, once for each such client.
         lost: frames that were lost to a client that did not read them in time, once for each such client.
         malformed: packets that were no frames.
         clients: clients that have ever joined.
     """
 
     frames: int = 0
+    delivered: int = 0
     lost: int = 0
     malformed: int = 0
     clients: int = 0
@@ -64,24 +66,23 @@ class _Client:
         self.joined = False
         self.echo = False
         self.backlog: deque[bytes] = deque()
-        self.lost = 0
         self._limit = limit
         self._untold = 0
 
-    def offer(self, packet: bytes) -> None:
-        """Send a packet, or queue it, or lose it.
+    def offer(self, packet: bytes) -> bool:
+        """Send a packet, or queue it; False if it was lost because the queue is full.
 
         Raises:
             OSError: the client is gone.
         """
         if not self.backlog and not self._untold and self._sent(packet):
-            return
+            return True
         if len(self.backlog) >= self._limit:
-            self.lost += 1
             self._untold += 1
-            return
+            return False
         self._queue_notice()
         self.backlog.append(packet)
+        return True
 
     def flush(self) -> None:
         """Send what is queued, as far as the client takes it.
@@ -227,23 +228,24 @@ class Hub:
                 self._leave(client)
                 return
             client.joined, client.echo = True, bool(wish & Wish.ECHO)
-            self._offer(client, pack_greeting(wish))
+            client.offer(pack_greeting(wish))
         elif is_frame(packet):
-            self.counters.frames += 1
             for other in list(self._clients.values()):
                 if other.joined and (other is not client or client.echo):
-                    self._offer(other, packet)
+                    self._deliver(other, packet)
+            self.counters.frames += 1
         else:
             self.counters.malformed += 1
 
-    def _offer(self, client: _Client, packet: bytes) -> None:
-        waited, lost = bool(client.backlog), client.lost
+    def _deliver(self, client: _Client, packet: bytes) -> None:
+        waited = bool(client.backlog)
         try:
-            client.offer(packet)
+            taken = client.offer(packet)
         except OSError:
             # Its end is seen, and its last frames are taken, when it is read from.
             return
-        self.counters.lost += client.lost - lost
+        self.counters.delivered += taken
+        self.counters.lost += not taken
         if bool(client.backlog) != waited:
             self._watch(client)
 
