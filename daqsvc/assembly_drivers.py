@@ -2,34 +2,62 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.settings.models import CanBus, DbcLayout, PlainLayout
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
+from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
 from drivers.base import BusPort, StreamSpec
 from drivers.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
+from drivers.modbus_layouts import (
+    Count,
+    Fifo,
+    ModbusLayout,
+    Page,
+    Ring,
+    Trend,
+    Trigger,
+    Waveform,
+    in_units,
+    sample_record,
+)
+from drivers.registers import RegisterField, RegisterRecord, Run, plan_runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.settings.modbus import RegisterChannel, SampleChannel
     from daqsvc.settings.models import MachineFile
     from drivers.base import Driver
 
 DRIVERS = "daqsvc.drivers"
 _NS_PER_MS = 1_000_000
+_POLL_MS = 100.0
+_LOOKS_PER_FILL = 4
+"""How often a store of samples in a device is looked at while it fills once."""
 
 
 class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there."""
 
 
+def stream_layout(machine: MachineFile, stream: str) -> FrameLayout | ModbusLayout:
+    """The layout of a stream, of the kind that its bus's driver knows; see `frame_layout`."""
+    if isinstance(machine.streams[stream].layout, PlainLayout | DbcLayout):
+        return frame_layout(machine, stream)
+    return modbus_layout(machine, stream)
+
+
 def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
-    """The layout of a stream, decoding straight to the physical units of its sensors.
+    """The layout of a stream of CAN frames, decoding straight to the physical units of its sensors.
 
     Raises:
+        AssemblyError: the stream does not come in CAN frames.
         LayoutError: the DBC file does not hold what the machine file says.
     """
     given = machine.streams[stream].layout
@@ -41,10 +69,80 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
             counts=given.counter.counts,
             channels={channel.name: channel.signals for channel in given.channels},
         )
-    else:
+    elif isinstance(given, PlainLayout):
         layout = _plain_layout(given)
-    units = {s.channel: (s.gain, s.shift) for s in machine.sensors if s.stream == stream}
-    return layout.in_units(units)
+    else:
+        raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames")
+    return layout.in_units(_units(machine, stream))
+
+
+def modbus_layout(machine: MachineFile, stream: str) -> ModbusLayout:
+    """The layout of a stream in registers, decoding straight to the physical units of its sensors.
+
+    Raises:
+        AssemblyError: the stream does not come in registers.
+        LayoutError: the registers cannot be read as the machine file says.
+    """
+    given = machine.streams[stream].layout
+    rate_hz = machine.streams[stream].rate_hz
+    layout: ModbusLayout
+    if isinstance(given, RegistersLayout):
+        fields = tuple(_register_field(c, c.address) for c in given.channels)
+        runs = plan_runs(
+            [field.run for field in fields],
+            max_gap=given.max_gap,
+            max_count=given.max_count,
+            forbidden=[Run(first, last - first + 1) for first, last in given.forbidden],
+        )
+        layout = Trend(given.unit, given.table, RegisterRecord(fields, runs))
+    elif isinstance(given, FifoLayout | RingLayout | WaveformLayout):
+        layout = _sampled_layout(given, rate_hz)
+    else:
+        raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in registers")
+    return in_units(layout, _units(machine, stream))
+
+
+def _sampled_layout(given: FifoLayout | RingLayout | WaveformLayout, rate_hz: float) -> ModbusLayout:
+    record = sample_record([_register_field(c, c.place) for c in given.channels])
+    if isinstance(given, FifoLayout):
+        # The place of the count is the head of the queue, not an address.
+        count = Count(0, given.count.bits, low_word_first=given.count.low_word_first)
+        fifo = Fifo(given.unit, given.address, count, record, given.acknowledge)
+        return replace(fifo, poll_ns=_poll_ns(given.poll_ms, fifo.samples_per_read / rate_hz))
+    if isinstance(given, RingLayout):
+        count = Count(given.count.address, given.count.bits, low_word_first=given.count.low_word_first)
+        poll_ns = _poll_ns(given.poll_ms, given.depth / rate_hz)
+        return Ring(given.unit, given.table, count, given.address, given.depth, record, poll_ns)
+    return Waveform(
+        given.unit,
+        given.table,
+        given.block_id,
+        given.address,
+        given.samples,
+        record,
+        None if given.page is None else Page(given.page.select, given.page.registers),
+        None
+        if given.trigger is None
+        else Trigger(given.trigger.address, given.trigger.value, round(given.trigger.every_s * NS_PER_S)),
+        _poll_ns(given.poll_ms, given.samples / rate_hz),
+    )
+
+
+def _poll_ns(given_ms: float | None, fill_s: float) -> int:
+    """How often to look into a store that is full after ``fill_s``, unless the machine file says it."""
+    by_room_ms = min(1000.0 * fill_s / _LOOKS_PER_FILL, _POLL_MS)
+    return max(round((by_room_ms if given_ms is None else given_ms) * _NS_PER_MS), _NS_PER_MS)
+
+
+def _register_field(channel: RegisterChannel | SampleChannel, address: int) -> RegisterField:
+    return RegisterField(
+        channel.name, address, channel.type, channel.order, channel.bits, channel.scale, channel.offset
+    )
+
+
+def _units(machine: MachineFile, stream: str) -> dict[str, tuple[float, float]]:
+    """Gain and shift from the wire to the physical unit, by channel."""
+    return {s.channel: (s.gain, s.shift) for s in machine.sensors if s.stream == stream}
 
 
 def _plain_layout(given: PlainLayout) -> FrameLayout:
@@ -82,11 +180,11 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
                 f"there are {', '.join(sorted(installed)) or 'none'}. "
                 "Install the package that brings it, or correct the name"
             )
-        options: Mapping[str, Any] = bus.model_dump() if isinstance(bus, CanBus) else bus.options
+        options: Mapping[str, Any] = bus.options if isinstance(bus, OtherBus) else bus.model_dump()
         streams = [
             StreamSpec(
                 stream_name,
-                frame_layout(machine, stream_name),
+                stream_layout(machine, stream_name),
                 stream.rate_hz,
                 round(stream.reorder_window_ms * _NS_PER_MS),
             )

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - keeps the signature of `_bus_kind` resolvable
 from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.modbus import (
+    WAYS,
+    FifoLayout,
+    ModbusRtuBus,
+    ModbusTcpBus,
+    RegistersLayout,
+    RingLayout,
+    WaveformLayout,
+)
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -74,7 +84,7 @@ class CanBus(Section):
 class OtherBus(Section):
     """A bus read by a third-party driver, which checks its own options."""
 
-    kind: ClassVar[str] = 'a bus with a driver other than "can"'
+    kind: ClassVar[str] = "a bus with a third-party driver"
 
     driver: Annotated[Name, Field(description="name of the driver's entry point")]
     options: dict[str, Any] = Field(default={}, description="handed to the driver as they are")
@@ -220,18 +230,27 @@ class DbcLayout(Section):
         return tuple(channel.name for channel in self.channels)
 
 
+def _bus_kind(table: Mapping[str, Any]) -> type[Section]:
+    driver = table.get("driver", "can")
+    if driver == "modbus":
+        return ModbusRtuBus if table.get("transport") == "rtu" else ModbusTcpBus
+    return OtherBus if isinstance(driver, str) and driver != "can" else CanBus
+
+
+def _layout_kind(table: Mapping[str, Any]) -> type[Section]:
+    if "way" in table:
+        way = table["way"]
+        return WAYS.get(way, RegistersLayout) if isinstance(way, str) else RegistersLayout
+    return DbcLayout if "dbc" in table else PlainLayout
+
+
 Bus: TypeAlias = Annotated[
-    CanBus | OtherBus,
-    Kinds(
-        lambda table: (
-            CanBus if not isinstance(d := table.get("driver", "can"), str) or d == "can" else OtherBus
-        ),
-        (CanBus, OtherBus),
-    ),
+    CanBus | ModbusTcpBus | ModbusRtuBus | OtherBus,
+    Kinds(_bus_kind, (CanBus, ModbusTcpBus, ModbusRtuBus, OtherBus)),
 ]
 Layout: TypeAlias = Annotated[
-    PlainLayout | DbcLayout,
-    Kinds(lambda table: DbcLayout if "dbc" in table else PlainLayout, (PlainLayout, DbcLayout)),
+    PlainLayout | DbcLayout | RegistersLayout | FifoLayout | RingLayout | WaveformLayout,
+    Kinds(_layout_kind, (PlainLayout, DbcLayout, RegistersLayout, FifoLayout, RingLayout, WaveformLayout)),
 ]
 
 

@@ -30,6 +30,7 @@ from daqsvc.settings.layout_checks import (
     check_voltages,
     unique,
 )
+from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
@@ -68,6 +69,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield check_stream_bus(draft, stream, at)
             yield check_frame_length(draft, stream, messages.get(name), at)
             yield check_counter(stream, messages.get(name), at)
+            yield check_modbus(draft, stream, at)
             with suppress(UnusableValueError):
                 if isinstance(stream.layout, PlainLayout):
                     yield check_plain_layout(stream.layout, (*at, "layout"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
 from daqsvc.settings.bearing import BEARING
-from daqsvc.settings.buses import CanBus
+from daqsvc.settings.buses import CanBus, DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.layout_checks import bus_share, frame_facts
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
@@ -79,9 +79,11 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
 
 def _bus(machine: MachineFile, name: str) -> str:
     bus = machine.buses[name]
-    if not isinstance(bus, CanBus):
+    if isinstance(bus, OtherBus):
         options = f" with options {', '.join(sorted(bus.options))}" if bus.options else ""
         return f"driver {bus.driver}{options}; if absent at start: {bus.start}"
+    if not isinstance(bus, CanBus):
+        return f"{bus.summary}; if absent at start: {bus.start}"
     parts = [f"{'CAN FD' if bus.fd else 'classic CAN'}, {bus.interface} {bus.channel}"]
     if bus.bitrate is not None:
         parts.append(_bit_rate(bus.bitrate))
@@ -105,9 +107,12 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
     facts = frame_facts(stream, machine.dbc_messages.get(name))
     share = bus_share(machine, name, machine.dbc_messages.get(name))
     shown_share = "" if share is None else _percent(*share)
+    layout = stream.layout
+    if not isinstance(layout, PlainLayout | DbcLayout):
+        return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", layout.summary, "", ""
     if facts is None:
         return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", "", "", shown_share
-    samples = f"{facts.samples_per_frame} x {len(stream.layout.channels)} samples"
+    samples = f"{facts.samples_per_frame} x {len(layout.channels)} samples"
     return (
         name,
         stream.bus,
@@ -115,7 +120,7 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
         f"{stream.rate_hz:g} Hz",
         f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
         f"{facts.length} bytes, {samples}",
-        f"{facts.counter_bits} bit {stream.layout.counter.counts}",
+        f"{facts.counter_bits} bit {layout.counter.counts}",
         shown_share,
     )
 

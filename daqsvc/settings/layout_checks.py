@@ -14,6 +14,7 @@ from daqsvc.settings.wire import CLASSIC_MAX_LENGTH, frame_time
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from daqsvc.settings.buses import Layout
     from daqsvc.settings.dbc import DbcMessage
     from daqsvc.settings.models import MachineFile, Sensor
     from daqsvc.settings.problems import KeyPath
@@ -34,8 +35,13 @@ class FrameFacts(NamedTuple):
 
 
 def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None:
-    """Id, length and counter of a stream's frames; None if they are in a DBC message that is not at hand."""
+    """Id, length and counter of a stream's CAN frames.
+
+    None if they are in a DBC message that is not at hand, or if the stream comes over another kind of bus.
+    """
     layout = stream.layout
+    if not isinstance(layout, PlainLayout | DbcLayout):
+        return None
     counts_samples = layout.counter.counts == "samples"
     if isinstance(layout, PlainLayout):
         return FrameFacts(
@@ -118,7 +124,7 @@ def _make_room(layout: PlainLayout, key: str, needed_bytes: int) -> str:
     return "make the frame longer"
 
 
-def check_channels(layout: PlainLayout | DbcLayout, at: KeyPath) -> Iterator[Finding]:
+def check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
     """Channel names are unique; in a DBC layout every channel has as many samples, each its own signal."""
     yield from unique([channel.name for channel in layout.channels], (*at, "channels"), "channel")
     if not isinstance(layout, DbcLayout):

@@ -279,7 +279,7 @@ WARNINGS = [
     ),
     (
         LAVAL,
-        [("[streams.shaft]", '[buses.spare]\ndriver = "modbus"\n[streams.shaft]')],
+        [("[streams.shaft]", '[buses.spare]\ndriver = "profibus"\n[streams.shaft]')],
         "buses.spare",
         "no stream",
     ),

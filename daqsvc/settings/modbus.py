@@ -1,0 +1,335 @@
+"""Modbus lines, and how devices on them hand out samples."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, TypeAlias
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Name, Positive, Section
+
+MAX_REGISTERS = 125
+"""Registers that a request can read (Modbus Application Protocol 1.1b3, 6.3)."""
+
+FIFO_REGISTERS = 31
+"""Registers that a FIFO reply can hold (6.18)."""
+
+RegisterType = Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"]
+Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
+Address = Annotated[int, Field(ge=0, le=65_535)]
+UnitAddress = Annotated[int, Field(ge=0, le=255)]
+Table = Literal["holding", "input"]
+CountBits = Literal[16, 32]
+
+_REGISTERS: dict[RegisterType, int] = {
+    "int16": 1,
+    "uint16": 1,
+    "int32": 2,
+    "uint32": 2,
+    "int64": 4,
+    "uint64": 4,
+    "float32": 2,
+    "float64": 4,
+}
+
+
+def _not_zero(scale: float) -> float:
+    if scale == 0:
+        raise PydanticCustomError(
+            "zero_scale",
+            "would make every sample the same",
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.01"},
+        )
+    return scale
+
+
+def _power_of_two(depth: int) -> int:
+    if depth & (depth - 1):
+        below = 2 ** (depth.bit_length() - 1)
+        raise PydanticCustomError(
+            "ring_depth",
+            "is not a power of two: where a sample lies would not be known once the counter wraps",
+            {"remedy": f"set the device to {below} or {2 * below} places"},
+        )
+    return depth
+
+
+class Writable(Section):
+    """Holding registers of a unit that may be written."""
+
+    unit: Annotated[UnitAddress, Field(description="address of the unit", examples=[1])]
+    address: Annotated[Address, Field(description="first register, from 0", examples=[100])]
+    count: Annotated[int, Field(ge=1, le=123)] = 1
+
+
+class _ModbusBus(Section):
+    """What all Modbus lines have."""
+
+    driver: Annotated[Literal["modbus"], Field(description="which driver reads the bus", examples=["modbus"])]
+    timeout_ms: Annotated[Positive, Field(le=60_000)] = Field(
+        default=500.0, description="how long a unit may take to answer"
+    )
+    demote_after: Annotated[int, Field(ge=1, le=30)] = Field(
+        default=3, description="requests without reply, in a row, after which a unit is set aside"
+    )
+    demotion_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
+        default=10.0, description="how long, before one request probes whether it is back"
+    )
+    writes: Annotated[tuple[Writable, ...], Field(strict=False)] = Field(
+        default=(), description="registers that may be written; nothing else ever is"
+    )
+    start: Literal["error", "retry", "ignore"] = Field(
+        default="retry", description="what to do if the device is absent at start"
+    )
+
+    def may_write(self, unit: int, address: int, count: int = 1) -> bool:
+        """Whether one entry of `writes` holds all these registers."""
+        return any(
+            entry.unit == unit and entry.address <= address and address + count <= entry.address + entry.count
+            for entry in self.writes
+        )
+
+
+class ModbusTcpBus(_ModbusBus):
+    """Units behind a Modbus TCP server or gateway."""
+
+    kind: ClassVar[str] = "a Modbus TCP bus"
+
+    transport: Annotated[
+        Literal["tcp"], Field(description='"tcp", or "rtu" for a serial port', examples=["tcp"])
+    ]
+    host: Annotated[str, Field(min_length=1, description="the server", examples=["192.0.2.10"])]
+    tcp_port: Annotated[int, Field(ge=1, le=65_535)] = 502
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"Modbus TCP, {self.host}:{self.tcp_port}, time-out {self.timeout_ms:g} ms"
+
+
+class ModbusRtuBus(_ModbusBus):
+    """Units on a serial line."""
+
+    kind: ClassVar[str] = "a Modbus RTU bus"
+
+    transport: Annotated[Literal["rtu"], Field(description="a serial port", examples=["rtu"])]
+    serial_port: Annotated[str, Field(min_length=1, description="its device file", examples=["/dev/ttyUSB0"])]
+    baud: Annotated[int, Field(ge=300, le=4_000_000, description="bit/s", examples=[19_200])]
+    parity: Literal["none", "even", "odd"] = "even"
+    stop_bits: Literal[1, 2] = 1
+    quiet_ms: Annotated[Positive, Field(le=60_000)] | None = Field(
+        default=None,
+        description="silence after a request without reply; as long as timeout_ms unless more is given",
+    )
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        framing = f"8{self.parity[0].upper()}{self.stop_bits}"
+        return f"Modbus RTU, {self.serial_port}, {self.baud} bit/s {framing}, time-out {self.timeout_ms:g} ms"
+
+
+class _Quantity(Section):
+    """What all channels in registers have: wire value = raw * scale + offset."""
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["velocity-x"])]
+    type: Annotated[RegisterType, Field(description="what the registers hold", examples=["uint16"])]
+    order: Order = Field(
+        default="ABCD", description="of bytes and words: ABCD is big-endian, CDAB has its words exchanged"
+    )
+    bits: Annotated[tuple[int, int], Field(strict=False)] | None = Field(
+        default=None, description="lowest bit and number of bits, for a part of an unsigned number"
+    )
+    scale: Annotated[float, AfterValidator(_not_zero)] = Field(default=1.0, description="worth of one count")
+    offset: float = Field(default=0.0, description="wire value of the raw value 0")
+
+    @property
+    def registers(self) -> int:
+        """Registers that hold it."""
+        return _REGISTERS[self.type]
+
+
+class RegisterChannel(_Quantity):
+    """One quantity at an address."""
+
+    address: Annotated[Address, Field(description="its first register, from 0", examples=[0])]
+
+
+class SampleChannel(_Quantity):
+    """One quantity in a sample of several registers."""
+
+    place: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
+        description="its first register within a sample, from 0", examples=[0]
+    )
+
+
+class _ModbusLayout(Section):
+    """What all layouts in registers have."""
+
+    unit: Annotated[UnitAddress, Field(description="address of the unit", examples=[1])]
+
+
+class _Sampled(_ModbusLayout):
+    """What layouts have in which samples lie one after another."""
+
+    channels: Annotated[
+        tuple[SampleChannel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x", place = 0, type = "int16", scale = 0.0005 }]'],
+        ),
+    ]
+    poll_ms: Annotated[Positive, Field(le=60_000)] | None = Field(
+        default=None, description="how often to look for more; by rate and room in the device unless given"
+    )
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def sample_registers(self) -> int:
+        """Registers of one sample of every channel."""
+        return max(channel.place + channel.registers for channel in self.channels)
+
+
+class RegistersLayout(_ModbusLayout):
+    """Registers that always show the present values, polled on a schedule."""
+
+    kind: ClassVar[str] = 'a layout with way = "registers"'
+
+    way: Annotated[Literal["registers"], Field(description="how samples are got", examples=["registers"])]
+    table: Table = "holding"
+    channels: Annotated[
+        tuple[RegisterChannel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels",
+            examples=['[{ name = "velocity", address = 0, type = "uint16", scale = 0.01 }]'],
+        ),
+    ]
+    max_gap: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
+        default=8, description="registers nobody wants that may be read along to save a request"
+    )
+    max_count: Annotated[int, Field(ge=4, le=MAX_REGISTERS)] = Field(
+        default=MAX_REGISTERS, description="registers in a request, at most"
+    )
+    forbidden: Annotated[tuple[tuple[Address, Address], ...], Field(strict=False)] = Field(
+        default=(), description="first and last register of ranges that must never be read"
+    )
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{len(self.channels)} values polled in {self.table} registers"
+
+
+class FifoCount(Section):
+    """The running count of samples at the head of a queue."""
+
+    bits: CountBits = 16
+    low_word_first: bool = False
+
+
+class RegisterCount(FifoCount):
+    """A running count of samples in registers."""
+
+    address: Annotated[Address, Field(description="its first register, from 0", examples=[0])]
+
+
+class FifoLayout(_Sampled):
+    """A queue of samples read by function 24, with the count of its first sample at its head."""
+
+    kind: ClassVar[str] = 'a layout with way = "fifo"'
+
+    way: Annotated[Literal["fifo"], Field(description="how samples are got", examples=["fifo"])]
+    address: Annotated[Address, Field(description="pointer of the queue", examples=[0])]
+    count: FifoCount = FifoCount()
+    acknowledge: Address | None = Field(
+        default=None, description="holding register that is told how far the queue has been taken"
+    )
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{len(self.channels)} channels from a FIFO, {self.count.bits} bit count"
+
+
+class RingLayout(_Sampled):
+    """A ring of samples in registers, with a count of all samples written so far."""
+
+    kind: ClassVar[str] = 'a layout with way = "ring"'
+
+    way: Annotated[Literal["ring"], Field(description="how samples are got", examples=["ring"])]
+    table: Table = "holding"
+    count: Annotated[RegisterCount, Field(description="the write counter", examples=["{ address = 0 }"])]
+    address: Annotated[Address, Field(description="first register of the ring", examples=[16])]
+    depth: Annotated[
+        int,
+        AfterValidator(_power_of_two),
+        Field(ge=2, le=32_768, description="samples in it", examples=[256]),
+    ]
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{len(self.channels)} channels from a ring of {self.depth}, {self.count.bits} bit count"
+
+
+class BlockPage(Section):
+    """A window on a block that is too long for the address space."""
+
+    select: Annotated[Address, Field(description="register that is told which page, from 0", examples=[99])]
+    registers: Annotated[int, Field(ge=1, le=65_535, description="registers in the window", examples=[100])]
+
+
+class BlockTrigger(Section):
+    """How to make the device take a block."""
+
+    address: Annotated[Address, Field(description="holding register to write", examples=[98])]
+    value: Annotated[int, Field(ge=0, le=65_535)] = 1
+    every_s: Annotated[Positive, Field(le=86_400)] = Field(
+        default=60.0, description="how long to wait for a block before it is written again"
+    )
+
+
+class WaveformLayout(_Sampled):
+    """A block of samples, taken at once and kept until the next one replaces it."""
+
+    kind: ClassVar[str] = 'a layout with way = "waveform"'
+
+    way: Annotated[Literal["waveform"], Field(description="how samples are got", examples=["waveform"])]
+    table: Table = "holding"
+    block_id: Annotated[
+        Address, Field(description="register that changes with every block, from 1 on", examples=[0])
+    ]
+    address: Annotated[Address, Field(description="first register of the block", examples=[100])]
+    samples: Annotated[int, Field(ge=1, le=1_000_000, description="samples in a block", examples=[1024])]
+    page: BlockPage | None = None
+    trigger: BlockTrigger | None = None
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{len(self.channels)} channels in blocks of {self.samples} samples"
+
+
+ModbusBus: TypeAlias = ModbusTcpBus | ModbusRtuBus
+ModbusLayout: TypeAlias = RegistersLayout | FifoLayout | RingLayout | WaveformLayout
+
+WAYS: dict[object, type[Section]] = {
+    "registers": RegistersLayout,
+    "fifo": FifoLayout,
+    "ring": RingLayout,
+    "waveform": WaveformLayout,
+}
