@@ -80,3 +80,8 @@ class Link:
         if not self._said_down:
             logger.warning("%s is lost: %s; it is being tried again", self.name, reason)
         self.state, self.reason, self._said_down = "down", reason, True
+
+    def end(self, reason: str) -> None:
+        """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
+        logger.info("%s has ended: %s", self.name, reason)
+        self.state, self.reason, self._said_down = "down", reason, False

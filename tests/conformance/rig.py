@@ -109,7 +109,8 @@ class Rig:
             async with asyncio.timeout(PATIENCE_S):
                 while not true():
                     assert self._task is None or not self._task.done(), f"the driver ended: {self._task}"
-                    if step_ns:
+                    # While a thread works no time passes: the outcome must not depend on its speed.
+                    if step_ns and self.transport.time.somebody_waits:
                         await self.transport.time.pass_ns(step_ns)
                     await asyncio.sleep(LOOK_S)
         except TimeoutError:
@@ -154,12 +155,13 @@ class Rig:
         self.sent += frames * self.transport.samples_per_frame
         return self._first_index + first, samples_of(np.arange(first, self.sent))
 
-    async def send(self, frames: int, *, at_once: int = 1) -> None:
+    async def send(self, frames: int, *, at_once: int = 1, to_be_continued: bool = False) -> None:
         """Let the device sample and send; the driver takes in what was sent before the next is.
 
         Args:
             frames: how many.
             at_once: how many of them leave the device together.
+            to_be_continued: leave it to the next `send` to wait for a driver that polls.
         """
         for done in range(0, frames, at_once):
             n = min(at_once, frames - done)
@@ -169,7 +171,19 @@ class Rig:
             if wait_ns > 0:
                 await self.transport.time.pass_ns(wait_ns)
             await self.device.send(*self.next_samples(n))
+            if not self.transport.poll_ns:
+                await self.settle()
+            else:
+                # A driver that polls sees it when it is time to; the device does not wait for that.
+                await self.rest()
+        if not to_be_continued:
             await self.settle()
+
+    async def rest(self) -> None:
+        """Wait until the driver has nothing to do before more time has passed."""
+        async with asyncio.timeout(PATIENCE_S):
+            while not self.transport.time.somebody_waits:
+                await asyncio.sleep(LOOK_S)
 
     async def settle(self) -> None:
         """Wait until the driver has taken in all that is on the wire."""

@@ -49,6 +49,11 @@ class Time(Protocol):
     exact: bool
     """Whether arrivals are stamped when the device sends, to the nanosecond."""
 
+    @property
+    def somebody_waits(self) -> bool:
+        """Whether anybody waits for this time to pass, rather than works."""
+        ...
+
     async def pass_ns(self, duration_ns: int) -> None:
         """Let ``duration_ns`` pass for the device and for the driver."""
         ...
@@ -61,6 +66,11 @@ class SimulatedTime:
 
     def __init__(self) -> None:
         self.clock = DrivenClock()
+
+    @property
+    def somebody_waits(self) -> bool:
+        """See `Time.somebody_waits`."""
+        return any(not wake.done() for _, _, wake in self.clock._sleepers)
 
     async def pass_ns(self, duration_ns: int) -> None:
         """See `Time.pass_ns`; whoever wakes has run once when this returns."""
@@ -75,6 +85,11 @@ class RealTime:
 
     def __init__(self) -> None:
         self.clock = SystemClock()
+
+    @property
+    def somebody_waits(self) -> bool:
+        """See `Time.somebody_waits`."""
+        return True
 
     async def pass_ns(self, duration_ns: int) -> None:
         """See `Time.pass_ns`."""
@@ -166,7 +181,8 @@ class Transport(Protocol):
     """Stated bound of that constant latency, e.g. one poll period; 0 where arrivals are stamped as sent."""
 
     poll_ns: int
-    """Time that has to pass until the driver looks again; 0 where what is sent wakes it by itself."""
+    """Steps in which time passes while the driver is waited for, for a driver that polls; 0 for one that is
+    woken by what is sent."""
 
     overflow_frames: int
     """More frames than wire and driver can hold together while the event loop does not turn."""

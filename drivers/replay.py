@@ -1,0 +1,255 @@
+"""The replay driver: a recording in place of a device.
+
+It plays CAN logs and tables of samples through the same decoders and assemblers as a live bus, so that
+a machine file can be tried on what was recorded. Time stamps are those of the recording, moved so that
+its first one is now: the jitter of the day is played too, the jitter of this machine is not added.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.supervisor import Backoff, Link
+from drivers.base import BusCounters, BusPort, DeviceAbsentError
+from drivers.can_adapter import batch_of
+from drivers.can_batches import FrameSorter
+from drivers.frames import FrameLayout
+from drivers.replay_files import (
+    TABLE_COUNTER_BITS,
+    CanLog,
+    ColumnLayout,
+    GrowingCandump,
+    Place,
+    RecordingError,
+    SampleTable,
+    kind_of,
+    words,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    import can
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import StreamSpec
+    from drivers.can_batches import Sorted
+    from drivers.replay_files import Recording
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+POLL_NS = NS_PER_S // 20
+SPAN_NS = NS_PER_S // 20
+UNPACED_SPAN_NS = NS_PER_S
+REMAP_NS = 2 * NS_PER_S
+"""A growing log whose times are off by more than this is from another clock than before."""
+
+REMEMBERED_IDS = 64
+END_OF_FILE = "end of file"
+
+
+@dataclass(slots=True)
+class ReplayCounters(BusCounters):
+    """What happened on a replayed bus; every figure only grows.
+
+    Attributes:
+        frames_malformed: lines of a log that are no frames.
+        passes: how often the recording has been played to its end.
+    """
+
+    frames_malformed: int = 0
+    passes: int = 0
+
+
+class ReplayDriver:
+    """Plays one recording.
+
+    Options of the bus: ``file``; ``at_end``, what to do at its end: ``"stop"`` (the link is down from then
+    on, with the reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is
+    writing the file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver
+    takes it, where the samples' times run ahead of the clock.
+
+    A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
+    `ColumnLayout`. When a CAN log is played again its counters are those of a device that has restarted;
+    the samples of a table are counted on.
+
+    Args:
+        port: settings, streams, clock and where to deliver.
+    """
+
+    def __init__(self, port: BusPort) -> None:
+        self.name = port.name
+        self._path = Path(port.options["file"])
+        self._at_end = port.options.get("at_end", "stop")
+        self._paced = port.options.get("pace", "recorded") == "recorded"
+        self.link = Link(f"replayed bus {port.name!r} ({self._path})")
+        self.counters = ReplayCounters()
+        self._port = port
+        self._assemblers = {spec.name: _assembler(spec, port) for spec in port.streams}
+        frames = [spec for spec in port.streams if isinstance(spec.layout, FrameLayout)]
+        self._sorter = FrameSorter(frames)
+        self._place = Place()
+        self._first_index: dict[str, int] = {}
+        self._shift_ns: int | None = None
+        self._newest_ns = 0
+        self._backoff = Backoff()
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `drivers.base.Driver.streams`."""
+        return {name: (a.counters, a.time_base) for name, a in self._assemblers.items()}
+
+    async def run(self) -> None:
+        """See `drivers.base.Driver.run`; also ends at the end of a recording that is played once."""
+        first_try = True
+        try:
+            while True:
+                recording = await self._open()
+                if recording is not None:
+                    self.link.up()
+                    before = self._frames
+                    reason = await self._play(recording)
+                    if self._frames > before:
+                        self._backoff.reset()
+                    if reason == END_OF_FILE and self._at_end == "stop":
+                        self.link.end(reason)
+                        return
+                    if reason == END_OF_FILE and self._frames > before:
+                        continue
+                    self.link.down(reason)
+                elif first_try and self._port.start == "error":
+                    raise DeviceAbsentError(f"{self.link.name} cannot be opened: {self.link.reason}")
+                elif first_try and self._port.start == "ignore":
+                    return
+                first_try = False
+                await self._port.clock.sleep_ns(self._backoff.next_ns())
+        finally:
+            for assembler in self._assemblers.values():
+                assembler.flush()
+
+    @property
+    def _frames(self) -> int:
+        return sum(a.counters.frames_received for a in self._assemblers.values())
+
+    async def _open(self) -> Recording | None:
+        try:
+            return await _in_thread(self._open_file, undo=lambda recording: recording.close())
+        except RecordingError as error:
+            reason = f"{error}"
+        except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
+            reason = f"it cannot be opened: {words(error)}"
+        self.counters.open_failures += 1
+        self.link.down(reason)
+        return None
+
+    def _open_file(self) -> Recording:
+        if not self._path.exists():
+            raise RecordingError(f"there is no file {self._path}; correct the bus's file, or record it first")
+        if self._at_end == "wait":
+            return GrowingCandump(self._path, self._sort, self._place)
+        if kind_of(self._path) == "table":
+            return SampleTable(self._path, self._port.streams, self._first_index)
+        return CanLog(self._path, self._sort)
+
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+        return self._sorter.sort(batch_of(messages, t_ns), 0)
+
+    async def _play(self, recording: Recording) -> str:
+        """Play until there is no more; returns why."""
+        if self._at_end != "wait":
+            self._shift_ns = None
+        try:
+            while True:
+                piece = await _in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
+                if piece is None:
+                    self.counters.passes += 1
+                    return END_OF_FILE
+                await self._take(piece)
+        except RecordingError as error:
+            return f"{error}"
+        except Exception as error:
+            logger.exception("the reader of %s failed", self.link.name)
+            self.counters.reader_failures += 1
+            return f"its reader failed: {words(error)}"
+        finally:
+            await _in_thread(recording.close)
+
+    async def _take(self, piece: Sorted) -> None:
+        clock = self._port.clock
+        for name, count in piece.notes.items():
+            setattr(self.counters, name, getattr(self.counters, name) + count)
+        for name, count in piece.unknown.items():
+            if name in self.counters.unknown_ids or len(self.counters.unknown_ids) < REMEMBERED_IDS:
+                self.counters.unknown_ids[name] = self.counters.unknown_ids.get(name, 0) + count
+        for stream, (count, _) in piece.wrong_length.items():
+            self._assemblers[stream].counters.frames_wrong_length += count
+        if piece.frames:
+            await self._place_frames(piece)
+        elif self._at_end == "wait":
+            await clock.sleep_ns(POLL_NS)
+        if self._paced:
+            for assembler in self._assemblers.values():
+                assembler.tick(clock.monotonic_ns())
+
+    async def _place_frames(self, piece: Sorted) -> None:
+        """Deliver a piece, when its last frame is due."""
+        clock = self._port.clock
+        now_ns = clock.monotonic_ns()
+        first_ns = min(int(frames.arrival_ns[0]) for frames in piece.frames)
+        last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames)
+        if self._shift_ns is None or (
+            self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS
+        ):
+            # Never back in time: what was played before has its place.
+            self._shift_ns = max(now_ns, self._newest_ns) - first_ns
+        due_ns = last_ns + self._shift_ns
+        floor_ns, self._newest_ns = self._newest_ns, max(self._newest_ns, due_ns)
+        if self._paced and due_ns > now_ns:
+            await clock.sleep_ns(due_ns - now_ns)
+        else:
+            await asyncio.sleep(0)
+        for frames in piece.frames:
+            decoded = frames.decoded
+            # Logs of several interfaces may step back a little; an arrival never does.
+            arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns + self._shift_ns, floor_ns))
+            self._assemblers[frames.stream].accept(
+                decoded.counter, decoded.samples, decoded.intact, arrival_ns
+            )
+
+
+async def _in_thread(call: Callable[..., T], *arguments: Any, undo: Callable[[T], None] | None = None) -> T:
+    """Call something that reads a file; if cancelled meanwhile, wait for its end and undo it."""
+    work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait({work})
+        if work.exception() is None and undo is not None:
+            undo(work.result())
+        raise
+
+
+def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:
+    layout = spec.layout
+    table = isinstance(layout, ColumnLayout)
+    return StreamAssembler(
+        spec.name,
+        spec.rate_hz,
+        counter_bits=TABLE_COUNTER_BITS if table else layout.counter_bits,
+        samples_per_frame=1 if table else layout.samples_per_frame,
+        counts_per_frame=1 if table else layout.counts_per_frame,
+        deliver=port.deliver,
+        reorder_window_ns=spec.reorder_window_ns,
+    )
