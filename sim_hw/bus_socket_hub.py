@@ -204,12 +204,13 @@ class Hub:
         self._selector.register(connection, selectors.EVENT_READ)
         self.counters.clients += 1
 
-    def _receive(self, client: _Client) -> None:
+    def _receive(self, client: _Client) -> bool:
+        """Take what a client has sent, up to a burst; whether more may be there."""
         for _ in range(BURST_FRAMES):
             try:
                 packet = client.connection.recv(LONGEST + 1)
             except BlockingIOError:
-                return
+                return False
             except ConnectionResetError:
                 # It left with frames unread; what it sent before that is still to come.
                 continue
@@ -217,8 +218,9 @@ class Hub:
                 packet = b""
             if not packet:
                 self._leave(client)
-                return
+                return False
             self._take(client, packet)
+        return True
 
     def _take(self, client: _Client, packet: bytes) -> None:
         if not client.joined:
@@ -261,9 +263,10 @@ class Hub:
     def _flush(self) -> None:
         """Send what is queued, for as long as clients read it, and a second at most."""
         until_s = time.monotonic() + FLUSH_S
-        for client in list(self._clients.values()):
-            # Frames sent before the end was decided are part of what the bus has carried.
-            self._receive(client)
+        # Frames sent before the end was decided are part of what the bus has carried.
+        sending = list(self._clients.values())
+        while sending and time.monotonic() < until_s:
+            sending = [client for client in sending if self._receive(client)]
         while (late := [c for c in self._clients.values() if c.backlog]) and time.monotonic() < until_s:
             for client in late:
                 try:
