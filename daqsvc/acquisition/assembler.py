@@ -270,5 +270,6 @@ class StreamAssembler:
                 self._time.period_ns,
                 lost,
                 quality,
+                self._time.error_at(first),
             )
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import TYPE_CHECKING, TypeAlias
@@ -41,6 +42,8 @@ class SampleBlock:
         period_ns: estimated time between samples.
         lost_before: samples known to be missing between the previous block and this one.
         quality: what is known against this block.
+        t_error_ns: how far ``t_first_ns`` may be off (95th percentile), beside the constant part of the delay
+            from the device to the host; infinite if nobody knows.
     """
 
     stream: str
@@ -50,6 +53,7 @@ class SampleBlock:
     period_ns: float
     lost_before: int = 0
     quality: Quality = Quality.GOOD
+    t_error_ns: float = math.inf
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2 or self.samples.dtype != np.float32:

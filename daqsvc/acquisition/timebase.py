@@ -3,20 +3,21 @@
 Frames arrive late, never early: the bus, the kernel and the scheduler add delay and take none away.
 So the truth lies along the lower edge of the cloud of arrivals. The estimator keeps the earliest
 arrival of every tenth of a second and supports a line under them where it fits the whole window best
-(the linear programme of Moon, Skelly and Towsley 1999, solved on the lower convex hull). Jitter of
-10 ms then moves the estimate by far less than a millisecond. The constant part of the delay cannot be
-seen from one side and stays in.
+(`daqsvc.acquisition.clock_line`). Jitter of 10 ms then moves the estimate by far less than a millisecond,
+and the estimate says how far off it may be. The constant part of the delay cannot be seen from one side and
+stays in.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.clock_line import Bucket, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class TimeBaseState(NamedTuple):
         jitter_ns: 95th percentile of the delay of arrivals behind the earliest possible ones.
         settled: whether rate and offset come from at least two seconds of arrivals.
         restarts: how often the device has restarted its counter.
+        error_ns: 95th percentile of the error of `TimeBase.time_of` for what arrives now, beside the constant
+            part of the delay; infinite until it has settled.
     """
 
     period_ns: float
@@ -45,6 +48,7 @@ class TimeBaseState(NamedTuple):
     jitter_ns: float
     settled: bool
     restarts: int
+    error_ns: float = math.inf
 
 
 class Placed(NamedTuple):
@@ -94,12 +98,14 @@ class TimeBase:
         self._last_in_frame = samples_per_frame - 1
         self._restarts = 0
         self._delays: deque[float] = deque(maxlen=RECENT_DELAYS)
-        self._buckets: deque[tuple[int, int]] = deque(maxlen=WINDOW_BUCKETS)
+        self._buckets: deque[Bucket] = deque(maxlen=WINDOW_BUCKETS)
         self._period_ns = self._nominal_ns
         self._origin: tuple[int, int] | None = None
         self._bucket_best: tuple[int, int] | None = None
         self._bucket_start = 0
+        self._bucket_sums = (0, 0.0, 0.0)
         self._offset_ns = 0.0
+        self._error_ns = math.inf
         self._settled = False
 
     @property
@@ -112,6 +118,7 @@ class TimeBase:
             jitter_ns=jitter,
             settled=self._settled,
             restarts=self._restarts,
+            error_ns=self._error_ns,
         )
 
     @property
@@ -154,11 +161,24 @@ class TimeBase:
         index0, arrival0 = self._origin
         return arrival0 + round((index - index0) * self._period_ns + self._offset_ns)
 
+    def error_at(self, index: int) -> float:
+        """95th percentile of the error of `time_of`, in ns, beside the constant part of the delay.
+
+        It grows with the distance to the last arrivals; infinite until the time base has settled.
+        """
+        if self._origin is None or not self._settled:
+            return math.inf
+        first, last = self._buckets[0].x, self._buckets[-1].x
+        ahead = max(0, index - self._origin[0] - last)
+        return self._error_ns * (1.0 + 2.0 * ahead / (last - first))
+
     def _forget(self) -> None:
         self._origin = self._bucket_best = None
+        self._bucket_sums = (0, 0.0, 0.0)
         self._buckets.clear()
         self._delays.clear()
         self._period_ns, self._offset_ns = self._nominal_ns, 0.0
+        self._error_ns = math.inf
         self._settled = False
 
     def _learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> None:
@@ -175,13 +195,20 @@ class TimeBase:
         point = (int(x[earliest]), int(y[earliest]))
         if self._bucket_best is None or self._residual(point) < self._residual(self._bucket_best):
             self._bucket_best = point
+        count, sum_x, sum_late = self._bucket_sums
+        self._bucket_sums = (
+            count + len(x),
+            sum_x + float(x.sum()),
+            sum_late + float((y - x * self._nominal_ns).sum()),
+        )
         if not self._settled:
             # Until there is a slope to speak of, hang the nominal line under the earliest arrival.
             self._offset_ns = min(self._offset_ns, self._residual(self._bucket_best))
         newest = int(y.max())
         if newest - self._bucket_start >= BUCKET_NS:
-            self._buckets.append(self._bucket_best)
-            self._bucket_best = None
+            count, sum_x, sum_late = self._bucket_sums
+            self._buckets.append(Bucket(*self._bucket_best, count, sum_x / count, sum_late / count))
+            self._bucket_best, self._bucket_sums = None, (0, 0.0, 0.0)
             self._bucket_start = newest
             self._support()
 
@@ -189,27 +216,10 @@ class TimeBase:
         return point[1] - point[0] * self._period_ns
 
     def _support(self) -> None:
-        """Lay the line under the window's earliest arrivals, touching where the window is centred."""
-        points = sorted(self._buckets)
-        if points[-1][1] - points[0][1] < SETTLING_NS:
+        """Lay the line under the window's arrivals."""
+        if self._buckets[-1].y_ns - self._buckets[0].y_ns < SETTLING_NS:
             return
-        # In coordinates that take the nominal slope off, ints of any size stay exact enough as floats.
-        flat = [(x, y - x * self._nominal_ns) for x, y in points]
-        hull: list[tuple[int, float]] = []
-        for p in flat:
-            while len(hull) > 1 and _turns_right(hull[-2], hull[-1], p):
-                hull.pop()
-            hull.append(p)
-        middle = sum(x for x, _ in flat) / len(flat)
-        (x0, y0), (x1, y1) = next((a, b) for a, b in pairwise(hull) if a[0] <= middle <= b[0])
-        slope = (y1 - y0) / (x1 - x0)
-        limit = MAX_DRIFT * self._nominal_ns
-        slope = min(max(slope, -limit), limit)
-        self._period_ns = self._nominal_ns + slope
-        self._offset_ns = min(y - slope * x for x, y in flat)
+        line = clock_line(self._buckets, self._nominal_ns, MAX_DRIFT * self._nominal_ns)
+        self._period_ns = self._nominal_ns + line.slope_ns
+        self._offset_ns, self._error_ns = line.offset_ns, line.error_ns
         self._settled = True
-
-
-def _turns_right(a: tuple[int, float], b: tuple[int, float], c: tuple[int, float]) -> bool:
-    """Whether b lies on or above the line from a to c, so that it is no corner of the lower hull."""
-    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

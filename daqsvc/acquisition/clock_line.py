@@ -1,0 +1,150 @@
+"""The line from a device's sample count to host time, under arrivals that come late and never early.
+
+Two lines compete. The **support** lies under the earliest arrivals where it fits the window best (the linear
+programme of Moon, Skelly and Towsley, INFOCOM 1999, solved on the lower convex hull): with N arrivals whose
+delay is often close to the least one it errs by some delay / N, and no load of the host moves it. Where a
+small delay is rare the support hangs on two lucky arrivals; there the **mean** line, of least squares through
+all arrivals and lowered until it touches, errs less.
+
+How far the line may be off is told by the earliest arrivals of parts of the window. The constants below make
+that a 95th percentile for delays whose least value is not rare (uniform, exponential, in bursts), and about
+the 85th for others: tests/statistical/test_alignment_clocks.py draws them.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+PARTS = 6
+"""Parts of the window that a line is held against: the earliest arrival of each should lie on it."""
+SOFT = 0.5
+"""The mean line is taken if its slope is sure, at the window's end, to so much of the support's gap."""
+_LEAST_GROWTH = 1.3
+"""Of the gap from parts to parts of these; 6 where small delays are frequent, nearing 1 as they get rare."""
+_SUPPORT_ERROR = (2.5, 3.0)
+"""The support's error in units of the gap, and of how far it lies above the least delay."""
+_MEAN_ERROR = (1.0, 2.5)
+_SIGMAS = 2.0
+
+
+class Bucket(NamedTuple):
+    """Arrivals of a short while, in samples and ns since the first one.
+
+    Attributes:
+        x: sample count of the earliest arrival, by the line of its time.
+        y_ns: when it arrived.
+        arrivals: how many arrivals there were.
+        mean_x: mean of their sample counts.
+        mean_late_ns: mean of their arrival times behind the nominal line.
+    """
+
+    x: int
+    y_ns: int
+    arrivals: int
+    mean_x: float
+    mean_late_ns: float
+
+
+class ClockLine(NamedTuple):
+    """An estimated line: arrival at ``x * (nominal period + slope) + offset``, and how far it may be off.
+
+    Attributes:
+        slope_ns: ns per sample beyond the nominal period.
+        offset_ns: at sample 0.
+        error_ns: 95th percentile of the line's error at the end of the window.
+    """
+
+    slope_ns: float
+    offset_ns: float
+    error_ns: float
+
+
+def clock_line(buckets: Sequence[Bucket], nominal_ns: float, max_slope_ns: float) -> ClockLine:
+    """The better of the two lines.
+
+    Args:
+        buckets: at least two, with different sample counts.
+        nominal_ns: nominal time between samples.
+        max_slope_ns: bound of the slope's magnitude.
+    """
+    table = np.array(buckets, np.float64)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    x = table[:, 0]
+    late = table[:, 1] - x * nominal_ns
+    slope = float(np.clip(_support_slope(x, late), -max_slope_ns, max_slope_ns))
+    offset, gap, missed = _touching(x, late, slope)
+    mean_slope, spread_ns = _mean_slope(*table[:, 2:].T)
+    if spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
+        return ClockLine(slope, offset, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
+    offset, gap, missed = _touching(x, late, mean_slope)
+    return ClockLine(mean_slope, offset, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed)
+
+
+def _touching(x: Floats, late: Floats, slope: float) -> tuple[float, float, float]:
+    """The line of a given slope under all arrivals.
+
+    The earliest arrivals of the window's parts lie above it: the fewer arrivals, the later their earliest.
+    How that grows from the window to its parts, and to parts of these, tells how late the earliest of all is.
+
+    Returns:
+        Offset of the line; mean gap between it and the earliest arrivals of the parts; how far it is
+        estimated to lie above the least delay there is.
+    """
+    above = late - slope * x
+    offset = float(above.min())
+    along = (x - x[0]) / (x[-1] - x[0])
+    gaps = []
+    for parts in (PARTS, PARTS**2):
+        least = np.full(parts, np.inf)
+        np.minimum.at(least, np.minimum(along * parts, parts - 1).astype(np.int64), above - offset)
+        gaps.append(float(least[np.isfinite(least)].mean()))
+    gap, fine_gap = gaps
+    if gap <= 0.0:
+        return offset, 0.0, 0.0
+    growth = min(max(fine_gap / gap - 1.0, _LEAST_GROWTH), float(PARTS))
+    return offset, gap, gap / (growth - 1.0)
+
+
+def _support_slope(x: Floats, late: Floats) -> float:
+    """Slope of the edge of the lower convex hull that spans the mean of ``x``."""
+    hull: list[tuple[float, float]] = []
+    for point in zip(x.tolist(), late.tolist(), strict=True):
+        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
+            hull.pop()
+        hull.append(point)
+    middle = float(x.mean())
+    (x0, y0), (x1, y1) = next((a, b) for a, b in pairwise(hull) if a[0] <= middle <= b[0])
+    return (y1 - y0) / (x1 - x0)
+
+
+def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float]:
+    """Slope of least squares, and by how much it may be off at the end of the window, in ns.
+
+    How far it may be off comes from the means of the window's parts, since neighbouring delays are alike.
+    """
+    weight = arrivals / arrivals.sum()
+    centred = x - (weight * x).sum()
+    moment = (weight * centred**2).sum()
+    slope = float((weight * centred * late).sum() / moment)
+    left = late - (weight * late).sum() - slope * centred
+    reach = float(centred[-1] - centred[0])
+    parts = np.minimum((centred - centred[0]) * (2 * PARTS / reach), 2 * PARTS - 1).astype(np.int64)
+    share = np.bincount(parts, weight, 2 * PARTS)
+    means = np.bincount(parts, weight * left, 2 * PARTS)[share > 0] / share[share > 0]
+    deviation = float(np.sqrt((share[share > 0] * means**2).sum() / max(len(means) - 2, 1)))
+    return slope, _SIGMAS * deviation * float(np.abs(centred).max() / np.sqrt(moment))
+
+
+def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    """Whether b lies on or above the line from a to c, so that it is no corner of the lower hull."""
+    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])
