@@ -1,82 +1,62 @@
-"""The CAN and CAN FD driver, on any interface that python-can knows.
+"""The CAN and CAN FD driver: SocketCAN by a reader of ours, anything else through python-can.
 
 python-can's own asyncio reader hangs when the interface goes down and takes one frame per turn of the
-event loop (python-can#1865, #1912), so the bus is read by a thread of ours. It drains the bus in
-batches, decodes each batch as arrays, and hands it to the event loop. When the event loop cannot keep
-up the thread waits: frames then pile up in the interface, and what overflows there shows as a gap in
-the devices' counters.
+event loop (python-can#1865, #1912), so the bus is read by a thread of ours (`drivers.can_reader`). This
+module is the event loop's side: it opens the bus and opens it again, places what the thread has decoded,
+and counts.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import threading
-import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
-
-import can
-import numpy as np
+from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusCounters, BusPort, DeviceAbsentError
+from drivers.base import BusPort, DeviceAbsentError
+from drivers.can_adapter import open_adapter
+from drivers.can_batches import FrameSorter
+from drivers.can_errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
+from drivers.can_reader import SHUTDOWN_S, CanReader, close_quietly, words
+from drivers.socketcan import open_socketcan
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
+    from collections.abc import Callable, Mapping
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
-    from drivers.frames import Decoded, FrameLayout
+    from drivers.can_batches import CanSource, Sorted
+    from drivers.frames import FrameLayout
 
 logger = logging.getLogger(__name__)
 
-POLL_S = 0.05
-BATCH_S = 0.002
-BATCH_FRAMES = 2048
-BATCHES_UNDER_WAY = 32
 REMEMBERED_IDS = 64
-SHUTDOWN_S = 0.5
-ERROR_CLASS_BUS_OFF = 0x40
-"""Bit of an error frame's id (linux/can/error.h, CAN_ERR_BUSOFF)."""
-
-
-class _BusOffError(Exception):
-    """The controller has taken itself off the bus; only opening it again helps."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Batch:
-    """Decoded frames of one stream, in their order of arrival."""
-
-    stream: str
-    decoded: Decoded
-    arrival_ns: NDArray[np.int64]
 
 
 class CanDriver:
     """Reads one CAN bus.
 
     Options of the bus: ``interface`` and ``channel`` as python-can names them, ``fd``, and optionally
-    ``bitrate``, ``data_bitrate`` and ``options`` (a table handed to python-can as it is).
+    ``bitrate``, ``data_bitrate`` and ``options`` (a table handed to python-can as it is). With interface
+    ``socketcan`` python-can is left out; see `drivers.socketcan` for what can be set there.
 
     Args:
         port: settings, streams, clock and where to deliver.
+        open_source: opens the bus; called on a thread.
     """
 
-    def __init__(self, port: BusPort) -> None:
+    def __init__(
+        self, port: BusPort, open_source: Callable[[BusPort, FrameSorter], CanSource] | None = None
+    ) -> None:
         self.name = port.name
         self.link = Link(f"CAN bus {port.name!r} ({port.options['interface']} {port.options.get('channel')})")
-        self.counters = BusCounters()
+        self.counters = CanCounters()
         self._port = port
-        self._specs: dict[tuple[int, bool], StreamSpec[FrameLayout]] = {
-            (s.layout.frame_id, s.layout.extended): s for s in port.streams
-        }
+        self._sorter = FrameSorter(port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
+        self._open_source = open_source or _open_source
         self._backoff = Backoff()
         self._said: set[str] = set()
 
@@ -90,11 +70,12 @@ class CanDriver:
         first_try = True
         try:
             while True:
-                bus = await self._open()
-                if bus is not None:
+                source = await self._open()
+                if source is not None:
                     self.link.up()
+                    self.counters.controller_state = "error-active"
                     before = self._frames
-                    reason = await self._receive(bus)
+                    reason = await self._receive(source)
                     self.link.down(reason)
                     if self._frames > before:  # a bus that opens and fails at once is not back
                         self._backoff.reset()
@@ -112,24 +93,24 @@ class CanDriver:
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
-    async def _open(self) -> can.BusABC | None:
-        opening = asyncio.ensure_future(asyncio.to_thread(_open_bus, self._port.options))
+    async def _open(self) -> CanSource | None:
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open_source, self._port, self._sorter))
         try:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
             # A bus that opens all the same must be closed again, or its next owner finds it taken.
             await asyncio.wait({opening}, timeout=SHUTDOWN_S)
             if opening.done() and opening.exception() is None:
-                await asyncio.to_thread(_shut_down, opening.result())
+                await asyncio.to_thread(close_quietly, opening.result())
             raise
         except Exception as error:  # noqa: BLE001 - adapters raise what they like; the driver must live on
             self.counters.open_failures += 1
-            self.link.down(f"it cannot be opened: {_words(error)}")
+            self.link.down(f"it cannot be opened: {words(error)}")
             return None
 
-    async def _receive(self, bus: can.BusABC) -> str:
+    async def _receive(self, source: CanSource) -> str:
         """Read until the link fails; returns why."""
-        reader = _Reader(self, bus, asyncio.get_running_loop())
+        reader = CanReader(self.link.name, source, self._sorter, self.take, asyncio.get_running_loop())
         reader.start()
         try:
             return await reader.ended
@@ -142,21 +123,61 @@ class CanDriver:
                 await asyncio.wait({closing}, timeout=2 * SHUTDOWN_S)
                 raise
 
-    def take(self, found: _Sorted) -> None:
+    def take(self, found: Sorted) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""
         for name, count in found.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
+        if "frames_overrun" in found.notes:
+            self._say_once(
+                "overrun",
+                "%s: the kernel dropped frames because its receive buffer was full; they are counted from "
+                "now on. Raise receive_buffer_bytes of the bus, or relieve the machine",
+                self.link.name,
+            )
+        if found.errors is not None:
+            self._take_errors(found.errors)
+        elif found.data_frames and self.counters.controller_state == "bus-off":
+            # Whoever receives is on the bus again, even if the frame that said so was missed.
+            self._take_errors(ErrorCounts(state="error-active"))
         for name, count in found.unknown.items():
             self._take_unknown(name, count)
         for stream, (count, length) in found.wrong_length.items():
             self._take_wrong_length(stream, count, length)
-        for batch in found.batches:
-            decoded = batch.decoded
-            assembler = self._assemblers[batch.stream]
-            assembler.accept(decoded.counter, decoded.samples, decoded.intact, batch.arrival_ns)
+        for frames in found.frames:
+            decoded = frames.decoded
+            assembler = self._assemblers[frames.stream]
+            assembler.accept(decoded.counter, decoded.samples, decoded.intact, frames.arrival_ns)
         if found.drained_ns is not None:
             for assembler in self._assemblers.values():
                 assembler.tick(found.drained_ns)
+
+    def _take_errors(self, errors: ErrorCounts) -> None:
+        """Count what error frames said; the link goes down with the controller and comes back with it."""
+        before = self.counters.controller_state
+        self.counters.take(errors)
+        state = self.counters.controller_state
+        if errors.counts.get("rx_overflows"):
+            self._say_once(
+                "rx overflow",
+                "%s: the controller's receive buffer overflowed: frames are lost, and counted from now on",
+                self.link.name,
+            )
+        if errors.bus_off:
+            self.link.down(self._bus_off_reason)
+        if state != "bus-off" and (errors.bus_off or before == "bus-off"):
+            self.link.up()
+        elif state not in {before, "bus-off"}:
+            self._say_once(state, "%s is %s: %s", self.link.name, state, EXPLAINED[state])
+
+    @property
+    def _bus_off_reason(self) -> str:
+        if self._port.options["interface"] != "socketcan":
+            return BUS_OFF_REASON
+        channel = self._port.options["channel"]
+        return (
+            f"{BUS_OFF_REASON}; unless {channel} has restart-ms set, it comes back by "
+            f"`ip link set {channel} type can restart`"
+        )
 
     def _take_unknown(self, name: str, count: int) -> None:
         ids = self.counters.unknown_ids
@@ -189,157 +210,6 @@ class CanDriver:
             self._said.add(key)
             logger.warning(message, *arguments)
 
-    def sort(self, messages: list[can.Message], arrival_ns: list[int]) -> _Sorted:
-        """Sort and decode a batch of messages; runs on the reader thread."""
-        found = _Sorted()
-        chosen: dict[str, list[int]] = {}
-        for k, message in enumerate(messages):
-            if message.is_error_frame:
-                found.note("frames_error")
-                if message.arbitration_id & ERROR_CLASS_BUS_OFF:
-                    found.bus_off = True
-                continue
-            if message.is_remote_frame:
-                found.note("frames_remote")
-                continue
-            spec = self._specs.get((message.arbitration_id, message.is_extended_id))
-            if spec is None:
-                found.note("frames_unknown")
-                name = f"{message.arbitration_id:#x} ({29 if message.is_extended_id else 11} bit)"
-                found.unknown[name] = found.unknown.get(name, 0) + 1
-            elif len(message.data) != spec.layout.length:
-                count, _ = found.wrong_length.get(spec.name, (0, 0))
-                found.wrong_length[spec.name] = (count + 1, len(message.data))
-            else:
-                chosen.setdefault(spec.name, []).append(k)
-        for spec in self._specs.values():
-            rows = chosen.get(spec.name)
-            if rows:
-                raw = b"".join(messages[k].data for k in rows)
-                payloads = np.frombuffer(raw, np.uint8).reshape(len(rows), spec.layout.length)
-                arrival = np.array([arrival_ns[k] for k in rows], np.int64)
-                found.batches.append(_Batch(spec.name, spec.layout.decode(payloads), arrival))
-        return found
-
-
-@dataclass(slots=True)
-class _Sorted:
-    """What a batch of messages held.
-
-    Attributes:
-        batches: decoded frames by stream.
-        notes: what to add to which of the bus's counters.
-        unknown: frames by unknown id, in words.
-        wrong_length: frames by stream, and the length of the last of them.
-        bus_off: whether an error frame says that the controller went bus-off.
-        drained_ns: when the bus was last known to hold no frame that was sent before; None if the
-            batch ended for another reason.
-    """
-
-    batches: list[_Batch] = field(default_factory=list)
-    notes: dict[str, int] = field(default_factory=dict)
-    unknown: dict[str, int] = field(default_factory=dict)
-    wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
-    bus_off: bool = False
-    drained_ns: int | None = None
-
-    def note(self, counter: str) -> None:
-        self.notes[counter] = self.notes.get(counter, 0) + 1
-
-
-class _Reader(threading.Thread):
-    """Drains one open bus until told to stop or the bus fails; `ended` then holds the reason."""
-
-    def __init__(self, driver: CanDriver, bus: can.BusABC, loop: asyncio.AbstractEventLoop) -> None:
-        super().__init__(name=f"can-reader-{driver.name}", daemon=True)
-        self.ended: asyncio.Future[str] = loop.create_future()
-        self._driver = driver
-        self._clock = driver._port.clock  # noqa: SLF001 - the reader is a part of the driver
-        self._bus = bus
-        self._loop = loop
-        self._stopping = threading.Event()
-        self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
-
-    def run(self) -> None:
-        try:
-            while not self._stopping.is_set():
-                self._drain()
-            reason = "it was closed"
-        except _BusOffError:
-            reason = "the controller went bus-off (wiring, termination or bit rate)"
-        except (can.CanError, OSError, ValueError) as error:
-            reason = _words(error)
-        except Exception as error:
-            logger.exception("the reader of %s failed", self._driver.link.name)
-            self._post(self._driver.take, _Sorted(notes={"reader_failures": 1}))
-            reason = f"its reader failed: {_words(error)}"
-        self._post(self._end, reason)
-
-    def close(self) -> None:
-        """Stop reading and close the bus; takes at most about half a second."""
-        self._stopping.set()
-        self.join(SHUTDOWN_S)
-        if self.is_alive():
-            logger.warning("%s: its reader hangs in the adapter and is left behind", self._driver.link.name)
-        _shut_down(self._bus)
-
-    def _drain(self) -> None:
-        """Take what is there, up to a batch, and hand it over; then raise what the bus has raised.
-
-        Raises:
-            _BusOffError: the controller went bus-off.
-            Exception: whatever the adapter raises when it is lost.
-        """
-        messages: list[can.Message] = []
-        arrival_ns: list[int] = []
-        failure: Exception | None = None
-        drained_ns: int | None = None
-        asked_ns = self._clock.monotonic_ns()
-        while len(messages) < BATCH_FRAMES:
-            try:
-                message = self._bus.recv(0 if messages else POLL_S)
-            except Exception as error:  # noqa: BLE001 - raised again below, after what came before it
-                failure = error
-                break
-            if message is None:
-                # Asked before the bus was: whatever was sent until then has been seen by now.
-                drained_ns = asked_ns
-                break
-            asked_ns = self._clock.monotonic_ns()
-            messages.append(message)
-            arrival_ns.append(asked_ns)
-        found = self._driver.sort(messages, arrival_ns)
-        found.drained_ns = drained_ns
-        if failure is None and (found.bus_off or self._bus.state == can.BusState.ERROR):
-            found.note("bus_off")
-            failure = _BusOffError()
-        self._hand_over(found)
-        if failure is not None:
-            raise failure
-        if messages:
-            # Let a few frames gather: one turn of the event loop then serves them all.
-            time.sleep(BATCH_S)
-
-    def _hand_over(self, found: _Sorted) -> None:
-        while not self._under_way.acquire(timeout=POLL_S):
-            if self._stopping.is_set():
-                return
-        self._post(self._take, found)
-
-    def _take(self, found: _Sorted) -> None:
-        self._under_way.release()
-        self._driver.take(found)
-
-    def _end(self, reason: str) -> None:
-        if not self.ended.done():
-            self.ended.set_result(reason)
-
-    def _post(self, call: Any, *arguments: object) -> None:
-        try:
-            self._loop.call_soon_threadsafe(call, *arguments)
-        except RuntimeError:  # the event loop is closed: there is nobody left to tell
-            self._stopping.set()
-
 
 def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
     return StreamAssembler(
@@ -353,24 +223,7 @@ def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
     )
 
 
-def _open_bus(options: Mapping[str, Any]) -> can.BusABC:
-    chosen: dict[str, Any] = dict(options.get("options") or {})
-    for key in ("bitrate", "data_bitrate"):
-        if options.get(key) is not None:
-            chosen[key] = options[key]
-    if options["interface"] == "virtual":
-        chosen["protocol"] = can.CanProtocol.CAN_FD if options.get("fd") else can.CanProtocol.CAN_20
-    else:
-        chosen["fd"] = bool(options.get("fd"))
-    return can.Bus(channel=options.get("channel"), interface=options["interface"], **chosen)
-
-
-def _shut_down(bus: can.BusABC) -> None:
-    try:
-        bus.shutdown()
-    except Exception as error:  # noqa: BLE001 - a lost adapter may fail to close in its own way
-        logger.info("closing a CAN bus that is gone: %s", _words(error))
-
-
-def _words(error: BaseException) -> str:
-    return f"{error}" or type(error).__name__
+def _open_source(port: BusPort, sorter: FrameSorter) -> CanSource:
+    if port.options["interface"] == "socketcan":
+        return open_socketcan(port.options, sorter.matches, port.clock)
+    return open_adapter(port.options, port.clock)

@@ -1,0 +1,56 @@
+"""What the two SocketCAN transports share: the device, but for how a frame is put on the wire."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from can_standin import frame_bytes
+from conformance.faulty_device import FaultyDevice
+from conformance.transport import STREAM
+from conformance.virtual_can_transport import PER_FRAME, layout
+
+from drivers.base import BusPort, StreamSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from conformance.transport import Time
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.samples import SampleBlock
+    from drivers.base import StartPolicy
+
+RATE_HZ = 1000.0
+
+
+class SocketDevice(FaultyDevice):
+    """Makes ``struct canfd_frame`` of samples."""
+
+    def __init__(self) -> None:
+        super().__init__(PER_FRAME)
+        self._layout = layout()
+
+    def put_frame(self, frame: bytes) -> bool:
+        """Put a frame on the wire; tells whether the wire has taken it. Made by the transport."""
+        raise NotImplementedError
+
+    def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
+        data = bytearray(self._layout.encode(np.array([first_index], np.int64), samples[None])[0].tobytes())
+        if corrupt:
+            data[20] ^= 0x10
+        return self.put_frame(frame_bytes(self._layout.frame_id, bytes(data)))
+
+
+def port_on(
+    channel: str, time: Time, deliver: Callable[[SampleBlock], None], start: StartPolicy, buffer_bytes: int
+) -> BusPort:
+    """The settings of the driver under test."""
+    options = {
+        "interface": "socketcan",
+        "channel": channel,
+        "fd": True,
+        "receive_buffer_bytes": buffer_bytes,
+    }
+    spec = StreamSpec(STREAM, layout(), RATE_HZ, 30_000_000)
+    return BusPort("can0", options, [spec], time.clock, deliver, start)

@@ -1,0 +1,67 @@
+"""The SocketCAN reader where the kernel has no CAN: the same bytes and system calls over Unix sockets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from can_standin import StandInBus
+from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on
+from conformance.transport import RealTime
+from conformance.virtual_can_transport import PER_FRAME
+
+from drivers.can_bus import CanDriver
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from daqsvc.acquisition.samples import SampleBlock
+    from drivers.base import StartPolicy
+
+
+class _Device(SocketDevice):
+    def __init__(self, bus: StandInBus) -> None:
+        super().__init__()
+        self._bus = bus
+
+    def put_frame(self, frame: bytes) -> bool:
+        return self._bus.send([frame]) == 1
+
+    def go_away(self) -> None:
+        super().go_away()
+        self._bus.unplug()
+
+    def come_back(self) -> None:
+        super().come_back()
+        self._bus.plug_in()
+
+
+class StandInSocketCan:
+    """See `conformance.transport.Transport`."""
+
+    name = "SocketCAN stand-in"
+    rate_hz = RATE_HZ
+    samples_per_frame = PER_FRAME
+    counter_modulus = 2**32
+    jitter_ns = 5_000_000
+    latency_ns = 5_000_000
+    poll_ns = 0
+    overflow_frames = 50_000
+    cannot = {}  # noqa: RUF012
+
+    def __init__(self, _folder: Path) -> None:
+        self.time = RealTime()
+        self._bus = StandInBus()
+
+    async def start(self) -> None:
+        self.device = _Device(self._bus)
+
+    async def stop(self) -> None:
+        self._bus.unplug()
+
+    def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
+        port = port_on("stand-in", self.time, deliver, start, 1 << 20)
+        return CanDriver(port, open_source=self._bus.open)
+
+
+TRANSPORTS = {StandInSocketCan.name: StandInSocketCan}
