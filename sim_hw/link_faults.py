@@ -7,7 +7,7 @@ plan knows whether a later frame can really overtake a held one, and what it cou
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -29,42 +29,72 @@ class Fault(IntEnum):
     """The second copy of a frame that was sent just before."""
     REORDERED = 3
     CORRUPTED = 4
+    SILENCED = 5
+    """Not sent, because its node is silent."""
+    BABBLED = 6
+    """Sent by a babbling node that nobody asked."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultCounts:
-    """How many frames a link was given, and what it did to them."""
+    """How many frames a node made, and what was done to them.
+
+    Attributes:
+        frames_in: frames that the node made, sent or not.
+        dropped: of those, lost on the link.
+        duplicated: of those, sent twice.
+        reordered: of those, overtaken by a later one.
+        corrupted: of those, sent with bits flipped.
+        silenced: of those, not sent because the node was silent.
+        delayed: frames, second copies too, that were sent later than they were due.
+        babbled: frames of a babbling node, beside those.
+        brown_outs: how often the node came back from a brown-out.
+        counter_resets: how often its counter was reset.
+    """
 
     frames_in: int = 0
     dropped: int = 0
     duplicated: int = 0
     reordered: int = 0
     corrupted: int = 0
+    silenced: int = 0
+    delayed: int = 0
+    babbled: int = 0
+    brown_outs: int = 0
+    counter_resets: int = 0
 
     @property
     def lost(self) -> int:
         """Frames that a receiver who checks their CRC never sees."""
-        return self.dropped + self.corrupted
+        return self.dropped + self.corrupted + self.silenced
+
+    @property
+    def sent(self) -> int:
+        """Frames of the node that went onto the bus, second copies and corrupted ones too."""
+        return self.frames_in - self.dropped - self.silenced + self.duplicated
 
     def __add__(self, other: FaultCounts) -> FaultCounts:
         return FaultCounts(
-            self.frames_in + other.frames_in,
-            self.dropped + other.dropped,
-            self.duplicated + other.duplicated,
-            self.reordered + other.reordered,
-            self.corrupted + other.corrupted,
+            **{each.name: getattr(self, each.name) + getattr(other, each.name) for each in fields(self)}
         )
 
     @classmethod
-    def of(cls, faults: NDArray[np.uint8]) -> FaultCounts:
-        """Counts of a run of events, by their `Fault`."""
+    def of(
+        cls, faults: NDArray[np.uint8], *, delayed: int = 0, brown_outs: int = 0, counter_resets: int = 0
+    ) -> FaultCounts:
+        """Counts of a run of events, by their `Fault`, and what else happened meanwhile."""
         seen = Counter(faults.tolist())
         return cls(
-            frames_in=len(faults) - seen[Fault.DUPLICATED],
+            frames_in=len(faults) - seen[Fault.DUPLICATED] - seen[Fault.BABBLED],
             dropped=seen[Fault.DROPPED],
             duplicated=seen[Fault.DUPLICATED],
             reordered=seen[Fault.REORDERED],
             corrupted=seen[Fault.CORRUPTED],
+            silenced=seen[Fault.SILENCED],
+            babbled=seen[Fault.BABBLED],
+            delayed=delayed,
+            brown_outs=brown_outs,
+            counter_resets=counter_resets,
         )
 
 
@@ -129,19 +159,20 @@ class LinkFaults:
         if self.reorder_within_ns < 0:
             raise ValueError(f"reorder_within_ns is {self.reorder_within_ns}; it cannot be negative")
 
-    def plan(self, t_ns: NDArray[np.int64], length: int) -> FaultPlan:
+    def plan(self, t_ns: NDArray[np.int64], length: int, *, salt: int = 0) -> FaultPlan:
         """Decide what happens to every frame of a schedule.
 
         Args:
             t_ns: int64 ``[n]``, when each frame of one id is due, not falling.
             length: payload bytes of a frame.
+            salt: makes other draws of the same seed, for another part of the same run.
 
         Raises:
             ValueError: ``t_ns`` falls somewhere.
         """
         if np.any(np.diff(t_ns) < 0):
             raise ValueError("the schedule of frames goes back in time; sort it before planning its faults")
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng([self.seed, salt] if salt else self.seed)
         fault = self._draw(len(t_ns), rng)
         overtaken_by = self._hold_back(fault, t_ns)
 

@@ -28,6 +28,28 @@ class TimedFrames:
     payloads: NDArray[np.uint8]
 
 
+def check_samples(
+    samples: NDArray[np.float64] | NDArray[np.float32], layout: FrameLayout, rate_hz: float
+) -> None:
+    """Refuse samples that cannot be put into frames.
+
+    Raises:
+        ValueError: as `to_frames`, but for values that do not fit.
+    """
+    if samples.ndim != 2 or samples.shape[1] != len(layout.channels):
+        raise ValueError(
+            f"samples are {list(samples.shape)}; frame {layout.frame_id:#x} takes [n, "
+            f"{len(layout.channels)}], one column for each of {', '.join(layout.channels)}"
+        )
+    if rate_hz <= 0:
+        raise ValueError(f"rate_hz is {rate_hz}; it must be positive")
+    if len(samples) < layout.samples_per_frame:
+        raise ValueError(
+            f"{len(samples)} samples do not fill one frame {layout.frame_id:#x} of "
+            f"{layout.samples_per_frame}; give more"
+        )
+
+
 def to_frames(
     samples: NDArray[np.float64] | NDArray[np.float32],
     layout: FrameLayout,
@@ -49,19 +71,9 @@ def to_frames(
         ValueError: the channels do not match, there is not one whole frame of samples, or a value
             does not fit the layout.
     """
-    if samples.ndim != 2 or samples.shape[1] != len(layout.channels):
-        raise ValueError(
-            f"samples are {list(samples.shape)}; frame {layout.frame_id:#x} takes [n, "
-            f"{len(layout.channels)}], one column for each of {', '.join(layout.channels)}"
-        )
-    if rate_hz <= 0:
-        raise ValueError(f"rate_hz is {rate_hz}; it must be positive")
+    check_samples(samples, layout, rate_hz)
     per_frame = layout.samples_per_frame
     n = len(samples) // per_frame
-    if n == 0:
-        raise ValueError(
-            f"{len(samples)} samples do not fill one frame {layout.frame_id:#x} of {per_frame}; give more"
-        )
     start = np.arange(n, dtype=np.int64) * per_frame
     whole = samples[: n * per_frame].reshape(n, per_frame, -1)
     return TimedFrames(
