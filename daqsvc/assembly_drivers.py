@@ -6,9 +6,12 @@ from dataclasses import replace
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
+from daqsvc.settings.replay import ReplayBus, TableLayout
 from drivers.base import BusPort, StreamSpec
 from drivers.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
@@ -25,6 +28,7 @@ from drivers.modbus_layouts import (
     sample_record,
 )
 from drivers.registers import RegisterField, RegisterRecord, Run, plan_runs
+from drivers.replay_files import ColumnLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -46,10 +50,18 @@ class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there."""
 
 
-def stream_layout(machine: MachineFile, stream: str) -> FrameLayout | ModbusLayout:
+def stream_layout(machine: MachineFile, stream: str) -> FrameLayout | ModbusLayout | ColumnLayout:
     """The layout of a stream, of the kind that its bus's driver knows; see `frame_layout`."""
-    if isinstance(machine.streams[stream].layout, PlainLayout | DbcLayout):
+    given = machine.streams[stream].layout
+    if isinstance(given, PlainLayout | DbcLayout):
         return frame_layout(machine, stream)
+    if isinstance(given, TableLayout):
+        return ColumnLayout(
+            channels=given.channel_names,
+            columns=tuple(column.column for column in given.columns),
+            scale=np.array([column.scale for column in given.columns]),
+            offset=np.array([column.offset for column in given.columns]),
+        ).in_units(_units(machine, stream))
     return modbus_layout(machine, stream)
 
 
@@ -181,6 +193,8 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
                 "Install the package that brings it, or correct the name"
             )
         options: Mapping[str, Any] = bus.options if isinstance(bus, OtherBus) else bus.model_dump()
+        if isinstance(bus, ReplayBus):
+            options = {**options, "file": machine.resolve(bus.file)}
         streams = [
             StreamSpec(
                 stream_name,

@@ -164,7 +164,7 @@ class ReplayDriver:
         return CanLog(self._path, self._sort)
 
     def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
-        return self._sorter.sort(batch_of(messages, t_ns), 0)
+        return self._sorter.sort(batch_of(messages, t_ns.tolist()), 0)
 
     async def _play(self, recording: Recording) -> str:
         """Play until there is no more; returns why."""
@@ -243,13 +243,16 @@ async def _in_thread(call: Callable[..., T], *arguments: Any, undo: Callable[[T]
 
 def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:
     layout = spec.layout
-    table = isinstance(layout, ColumnLayout)
+    if isinstance(layout, ColumnLayout):
+        bits, per_frame, counts = TABLE_COUNTER_BITS, 1, 1
+    else:
+        bits, per_frame, counts = layout.counter_bits, layout.samples_per_frame, layout.counts_per_frame
     return StreamAssembler(
         spec.name,
         spec.rate_hz,
-        counter_bits=TABLE_COUNTER_BITS if table else layout.counter_bits,
-        samples_per_frame=1 if table else layout.samples_per_frame,
-        counts_per_frame=1 if table else layout.counts_per_frame,
+        counter_bits=bits,
+        samples_per_frame=per_frame,
+        counts_per_frame=counts,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
     )

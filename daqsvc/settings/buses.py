@@ -18,6 +18,7 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
+from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -234,6 +235,8 @@ def _bus_kind(table: Mapping[str, Any]) -> type[Section]:
     driver = table.get("driver", "can")
     if driver == "modbus":
         return ModbusRtuBus if table.get("transport") == "rtu" else ModbusTcpBus
+    if driver == "replay":
+        return ReplayBus
     return OtherBus if isinstance(driver, str) and driver != "can" else CanBus
 
 
@@ -241,16 +244,21 @@ def _layout_kind(table: Mapping[str, Any]) -> type[Section]:
     if "way" in table:
         way = table["way"]
         return WAYS.get(way, RegistersLayout) if isinstance(way, str) else RegistersLayout
+    if "columns" in table:
+        return TableLayout
     return DbcLayout if "dbc" in table else PlainLayout
 
 
 Bus: TypeAlias = Annotated[
-    CanBus | ModbusTcpBus | ModbusRtuBus | OtherBus,
-    Kinds(_bus_kind, (CanBus, ModbusTcpBus, ModbusRtuBus, OtherBus)),
+    CanBus | ModbusTcpBus | ModbusRtuBus | ReplayBus | OtherBus,
+    Kinds(_bus_kind, (CanBus, ModbusTcpBus, ModbusRtuBus, ReplayBus, OtherBus)),
 ]
 Layout: TypeAlias = Annotated[
-    PlainLayout | DbcLayout | RegistersLayout | FifoLayout | RingLayout | WaveformLayout,
-    Kinds(_layout_kind, (PlainLayout, DbcLayout, RegistersLayout, FifoLayout, RingLayout, WaveformLayout)),
+    PlainLayout | DbcLayout | RegistersLayout | FifoLayout | RingLayout | WaveformLayout | TableLayout,
+    Kinds(
+        _layout_kind,
+        (PlainLayout, DbcLayout, RegistersLayout, FifoLayout, RingLayout, WaveformLayout, TableLayout),
+    ),
 ]
 
 

@@ -32,6 +32,8 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.problems import Finding
+from daqsvc.settings.replay import ReplayBus
+from daqsvc.settings.replay_checks import check_replay_bus, check_replayed
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
 
@@ -70,6 +72,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield check_frame_length(draft, stream, messages.get(name), at)
             yield check_counter(stream, messages.get(name), at)
             yield check_modbus(draft, stream, at)
+            yield check_replayed(draft, stream, at)
             with suppress(UnusableValueError):
                 if isinstance(stream.layout, PlainLayout):
                     yield check_plain_layout(stream.layout, (*at, "layout"))
@@ -78,6 +81,9 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_bus_load(draft, messages)
     yield _unused_buses(draft)
     yield check_interfaces(draft)
+    for name, bus in draft.buses.items():
+        if isinstance(bus, ReplayBus):
+            yield check_replay_bus(bus, ("buses", name))
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
             at = ("sensors", index)

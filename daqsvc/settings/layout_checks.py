@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.settings.buses import CRC_BYTES, CanBus, DbcLayout, PlainLayout, Stream
 from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.replay import TableLayout
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.wire import CLASSIC_MAX_LENGTH, frame_time
 
@@ -126,6 +127,9 @@ def _make_room(layout: PlainLayout, key: str, needed_bytes: int) -> str:
 
 def check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
     """Channel names are unique; in a DBC layout every channel has as many samples, each its own signal."""
+    if isinstance(layout, TableLayout):
+        yield from unique(list(layout.channel_names), (*at, "columns"), "channel")
+        return
     yield from unique([channel.name for channel in layout.channels], (*at, "channels"), "channel")
     if not isinstance(layout, DbcLayout):
         return

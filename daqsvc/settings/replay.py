@@ -1,0 +1,93 @@
+"""Recordings in place of a bus."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from daqsvc.settings.section import Name, Section
+
+TABLES = frozenset({".npz", ".csv"})
+"""Endings of the files that hold a table of samples; any other is a CAN log."""
+
+
+class ReplayBus(Section):
+    """A recording that is played as if it came over a bus."""
+
+    kind: ClassVar[str] = "a replayed bus"
+
+    driver: Annotated[Literal["replay"], Field(description="which driver plays it", examples=["replay"])]
+    file: Annotated[
+        Path,
+        Field(
+            strict=False,
+            description="a CAN log (.log, .asc, .blf, .trc; .gz behind it if zipped) or a table of samples "
+            "(.npz, .csv), relative to the machine file",
+            examples=["run-up.blf"],
+        ),
+    ]
+    at_end: Literal["stop", "loop", "wait"] = Field(
+        default="stop",
+        description="what to do at its end: stop, play it again, or wait for more",
+    )
+    pace: Literal["recorded", "unpaced"] = Field(
+        default="recorded", description="as it was recorded, or as fast as it can be taken in"
+    )
+    start: Literal["error", "retry", "ignore"] = Field(
+        default="retry", description="what to do if the file is absent at start"
+    )
+
+    @property
+    def is_table(self) -> bool:
+        """Whether the file holds a table of samples rather than CAN frames."""
+        return self.file.suffix.lower() in TABLES
+
+    @property
+    def summary(self) -> str:
+        """What a person is told of it."""
+        end = {"stop": "once", "loop": "again and again", "wait": "as it is written"}[self.at_end]
+        return f"replay of {self.file}, {end}{', unpaced' if self.pace == 'unpaced' else ''}"
+
+
+class TableColumn(Section):
+    """One quantity of a table: wire value = value * scale + offset, as for a channel of a frame."""
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
+    column: Annotated[
+        str,
+        Field(
+            min_length=1,
+            description="its column: a name in the first line of a CSV file, or an array of an NPZ file",
+            examples=["probe_x_v"],
+        ),
+    ]
+    scale: float = Field(default=1.0, description="wire value of the value 1")
+    offset: float = Field(default=0.0, description="wire value of the value 0")
+
+
+class TableLayout(Section):
+    """Samples as columns of a table."""
+
+    kind: ClassVar[str] = "a layout of columns in a table"
+
+    columns: Annotated[
+        tuple[TableColumn, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x", column = "probe_x_v" }]'],
+        ),
+    ]
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(column.name for column in self.columns)
+
+    @property
+    def summary(self) -> str:
+        """What a person is told of it."""
+        return f"columns {', '.join(column.column for column in self.columns)}"

@@ -1,0 +1,53 @@
+"""Whether recordings and what is to be read from them fit each other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.buses import DbcLayout, PlainLayout
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.replay import ReplayBus, TableLayout
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.settings.buses import Stream
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import KeyPath
+
+
+def check_replay_bus(bus: ReplayBus, at: KeyPath) -> Iterator[Finding]:
+    """Only a candump log can be read while it is being written."""
+    if bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
+        yield Finding(
+            (*at, "at_end"),
+            f"{bus.file.name} cannot be read while it is being written: only a candump log (.log) can",
+            'write at_end = "stop" or "loop", or have a candump log written',
+        )
+
+
+def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
+    """A table takes columns, a CAN log takes frames."""
+    bus, layout = draft.buses.get(stream.bus), stream.layout
+    table = isinstance(bus, ReplayBus) and bus.is_table
+    if isinstance(layout, TableLayout):
+        if bus is not None and not table:
+            yield Finding(
+                (*at, "layout", "columns"),
+                f'bus "{stream.bus}" has no columns: only the replay of an .npz or .csv file has',
+                "describe the frames of the bus, or correct the bus of the stream",
+            )
+        for index, column in enumerate(layout.columns):
+            if column.scale == 0:
+                yield Finding(
+                    (*at, "layout", "columns", index, "scale"),
+                    "would make every sample the same",
+                    "write what the value 1 is worth, e.g. 0.001",
+                )
+    elif table or (isinstance(bus, ReplayBus) and not isinstance(layout, PlainLayout | DbcLayout)):
+        wanted = "columns of a table" if table else "CAN frames"
+        yield Finding(
+            (*at, "layout"),
+            f'bus "{stream.bus}" replays {wanted}, and this describes something else',
+            "write columns = [{ name = ..., column = ... }]" if table else "describe the frames of the log",
+        )
