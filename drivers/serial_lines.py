@@ -1,0 +1,359 @@
+"""Samples as lines of text: ``seq,x,y,z`` with a counter, or a time stamp of the device's own clock.
+
+One line carries one sample of every channel. The loss of lines shows in the counter; a device that sends
+none may send the time at which it sampled instead. Two optional parts, as NMEA 0183 has them: a first
+field that names the stream, and a checksum behind a ``*``.
+"""
+
+from __future__ import annotations
+
+import binascii
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import repeat
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from drivers.frames import Decoded, LayoutError
+from drivers.serial_framing import Found, Frames, Pieces
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+Checksum = Literal["none", "xor", "crc16"]
+TimeUnit = Literal["s", "ms", "us"]
+
+END = b"\r\n"
+LONGEST_LINE = 1024
+"""Bytes; a line that is longer is garbage."""
+
+UNITS_PER_S: Mapping[TimeUnit, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
+TIME_COUNTER_BITS = 32
+LATEST_S = 1e12
+"""A device's time in s that is later than this is no time."""
+
+DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
+_NUMERIC = b"0123456789+-.eE "
+_TRACKING = 0.05
+"""Share of a stamp's deviation by which the device's sampling instants are corrected."""
+
+
+@dataclass(frozen=True)
+class LineLayout:
+    """Which column of a line is what.
+
+    Attributes:
+        columns: names in their order, without the prefix; those named nowhere else are left out.
+        channels: names, in the order of the sample columns; each is a column.
+        scale: physical value of a written 1, float64 ``[channels]``.
+        offset: physical value of a written 0, same shape.
+        counter: the column that counts lines (and so samples); None if there is a time.
+        counter_bits: its width: 8, 16 or 32.
+        time: the column with the device's time; None if there is a counter.
+        time_unit: its unit.
+        prefix: the first field of every line of this stream; None if there is no such field.
+        separator: between fields, one character.
+        decimals: digits behind the point when lines are written.
+    """
+
+    columns: tuple[str, ...]
+    channels: tuple[str, ...]
+    scale: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    counter: str | None = None
+    counter_bits: int = 32
+    time: str | None = None
+    time_unit: TimeUnit = "ms"
+    prefix: str | None = None
+    separator: str = ","
+    decimals: int = 6
+
+    def __post_init__(self) -> None:
+        if (self.counter is None) == (self.time is None):
+            raise LayoutError(
+                "a line needs a counter or a time, and not both: without it loss cannot be told"
+            )
+        for name in (self._place, *self.channels):
+            if self.columns.count(name) != 1:
+                raise LayoutError(
+                    f"column {name!r} is there {self.columns.count(name)} times among "
+                    f"{', '.join(self.columns)}; name it once"
+                )
+
+    @property
+    def _place(self) -> str:
+        """The column that tells where a sample belongs."""
+        name = self.counter if self.time is None else self.time
+        assert name is not None  # noqa: S101 - `__post_init__` has seen to it
+        return name
+
+    @property
+    def samples_per_frame(self) -> int:
+        """One line, one sample."""
+        return 1
+
+    @property
+    def counts_per_frame(self) -> int:
+        """One line, one count."""
+        return 1
+
+    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> LineLayout:
+        """The same layout with each channel's value ``v`` turned into ``gain * v + shift``.
+
+        Args:
+            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
+        """
+        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
+        gain = np.array([g for g, _ in pairs])
+        shift = np.array([s for _, s in pairs])
+        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
+
+    @cached_property
+    def _picks(self) -> tuple[int, ...]:
+        return tuple(self.columns.index(name) for name in (self._place, *self.channels))
+
+    def read(self, rows: Iterable[Sequence[bytes]]) -> tuple[list[int] | list[float], NDArray[np.float32]]:
+        """Places and samples of rows of fields.
+
+        Returns:
+            Counters, or times in s; float32 ``[n, 1, channels]`` in physical units.
+
+        Raises:
+            ValueError: a row has the wrong number of fields, or a field is no number or does not fit.
+        """
+        picked: list[bytes] = []
+        for row in rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"{len(row)} fields instead of {len(self.columns)}")
+            picked += [row[k] for k in self._picks]
+        # What float() takes besides, "nan", "inf" and "1_0", no device means.
+        if b"".join(picked).translate(None, _NUMERIC):
+            raise ValueError("a field is no number")
+        width = len(self._picks)
+        values = np.array(list(map(float, picked)), np.float64).reshape(-1, width)[:, 1:]
+        with np.errstate(over="ignore"):
+            samples = (values * self.scale + self.offset).astype(np.float32)[:, None, :]
+        if self.time is not None:
+            per_s = UNITS_PER_S[self.time_unit]
+            times = [float(field) / per_s for field in picked[::width]]
+            if max(map(abs, times)) > LATEST_S:
+                raise ValueError(f"a time is beyond {LATEST_S:g} s")
+            return times, samples
+        counters = list(map(int, picked[::width]))
+        if min(counters) < 0 or max(counters) >= 2**self.counter_bits:
+            raise ValueError(f"a counter does not fit {self.counter_bits} bits")
+        return counters, samples
+
+    def write(self, place: float, sample: NDArray[np.float64]) -> bytes:
+        """One line without its checksum and end.
+
+        Args:
+            place: the counter, or the device's time in s.
+            sample: float64 ``[channels]`` in physical units.
+        """
+        values = dict(zip(self.channels, ((sample - self.offset) / self.scale).tolist(), strict=True))
+        fields = [] if self.prefix is None else [self.prefix]
+        for name in self.columns:
+            if name == self.time:
+                fields.append(f"{place * UNITS_PER_S[self.time_unit]:.4f}")
+            elif name == self.counter:
+                fields.append(str(int(place) % 2**self.counter_bits))
+            else:
+                fields.append(f"{values.get(name, 0.0):.{self.decimals}f}")
+        return self.separator.join(fields).encode("ascii")
+
+
+class DeviceTime:
+    """Sample counts from a device's time stamps.
+
+    Each stamp is compared with the one expected after the stamp before it, so that a device whose rate is
+    not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to half a
+    sampling period. Time that goes back means that the device was restarted: the count begins at 0 again.
+
+    Args:
+        rate_hz: nominal samples per second.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_s = 1.0 / rate_hz
+        self._count = 0
+        self._last_s: float | None = None
+        self._phase_s = 0.0
+
+    def count(self, times_s: Iterable[float]) -> list[int]:
+        """The count of each sample, modulo ``2**TIME_COUNTER_BITS``."""
+        counts: list[int] = []
+        for time_s in times_s:
+            if self._last_s is None or time_s < self._last_s:
+                self._count, self._phase_s = 0, time_s
+            else:
+                steps = round((time_s - self._phase_s) / self._period_s)
+                self._count += max(steps, 0)
+                self._phase_s += steps * self._period_s
+                self._phase_s += _TRACKING * (time_s - self._phase_s)
+            self._last_s = time_s
+            counts.append(self._count % 2**TIME_COUNTER_BITS)
+        return counts
+
+
+class LineFraming:
+    """Lines of text, each one sample; a line that cannot be read costs itself only.
+
+    Args:
+        layouts: by stream; if there are several, each has a prefix.
+        rates_hz: nominal samples per second, by stream.
+        checksum: behind a ``*`` at the end of each line, in hexadecimal, over what stands between an opening
+            ``$`` or ``!`` (if there is one) and the ``*``: all characters combined by XOR, as in NMEA 0183,
+            or their CRC-16/IBM-3740.
+
+    Raises:
+        LayoutError: the streams cannot be told apart.
+    """
+
+    def __init__(
+        self, layouts: Mapping[str, LineLayout], rates_hz: Mapping[str, float], checksum: Checksum = "none"
+    ) -> None:
+        self._layouts = dict(layouts)
+        self._rates_hz = dict(rates_hz)
+        self._checksum: Checksum = checksum
+        self._by_prefix: dict[bytes | None, str] = {}
+        for name, layout in layouts.items():
+            key = None if layout.prefix is None else layout.prefix.encode("ascii")
+            other = self._by_prefix.setdefault(key, name)
+            if other != name or (None in self._by_prefix and len(layouts) > 1):
+                raise LayoutError(f"streams {other!r} and {name!r} cannot be told apart; give each a prefix")
+        self._separators = {layout.separator.encode("ascii") for layout in layouts.values()}
+        if len(self._separators) != 1:
+            raise LayoutError(
+                "the streams of one port have different separators; they must have the same one"
+            )
+        self._separator = next(iter(self._separators))
+        self._times = {
+            name: DeviceTime(rates_hz[name]) for name, layout in layouts.items() if layout.time is not None
+        }
+        self._pieces = Pieces(b"\n", LONGEST_LINE)
+        self._astray = False
+
+    def restart(self) -> None:
+        """See `drivers.serial_framing.Framing.restart`."""
+        self._pieces.restart()
+        self._astray = False
+
+    def encode(
+        self,
+        stream: str,
+        first_index: NDArray[np.int64],
+        samples: NDArray[np.float64] | NDArray[np.float32],
+        *,
+        clip: bool = False,  # noqa: ARG002 - any finite number can be written
+    ) -> list[bytes]:
+        """See `drivers.serial_framing.Framing.encode`; a device that sends its time began at index 0."""
+        layout = self._layouts[stream]
+        places = first_index / self._rates_hz[stream] if stream in self._times else first_index
+        rows = np.asarray(samples, np.float64)[:, 0, :]
+        if not np.isfinite(rows).all():
+            raise LayoutError("a sample to be written is not finite; a line carries finite numbers only")
+        lines = [layout.write(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
+        if self._checksum == "none":
+            return [line + END for line in lines]
+        sums = self._sums([line[line[:1] in {b"$", b"!"} :] for line in lines])
+        digits = DIGITS[self._checksum]
+        return [b"%b*%0*X" % (line, digits, value) + END for line, value in zip(lines, sums, strict=True)]
+
+    def cut(self, data: bytes) -> Found:
+        """See `drivers.serial_framing.Framing.cut`."""
+        found = Found()
+        pieces, ends, cut_off = self._pieces.split(data, found)
+        overlong = found.malformed > 0
+        if cut_off and pieces and self._checksum == "none":
+            # Nothing shows whether the beginning of this line is missing, e.g. a digit.
+            found.garbage_bytes += len(pieces[0]) + 1
+            pieces, ends, cut_off = pieces[1:], ends[1:], False
+        lines = [piece.rstrip(b"\r") for piece in pieces]
+        if not all(lines):
+            full = [k for k, line in enumerate(lines) if line]
+            cut_off &= bool(lines[0])
+            lines, ends = [lines[k] for k in full], ends[full]
+        if lines:
+            in_step = self._sort(lines, ends, found)
+            found.garbage_bytes += sum(len(lines[k]) + 1 for k in np.flatnonzero(~in_step).tolist())
+            self._astray = found.keep_step(
+                in_step[1:] if cut_off and not in_step[0] else in_step, self._astray
+            )
+        self._astray |= overlong
+        return found
+
+    def _sort(self, lines: list[bytes], ends: NDArray[np.int64], found: Found) -> NDArray[np.bool_]:
+        """Read lines into ``found``, by stream; returns which of them were lines at all."""
+        texts, intact = self._check(lines)
+        in_step = np.zeros(len(lines), np.bool_)
+        chosen: dict[str, list[int]] = defaultdict(list)
+        rows = [text.split(self._separator) for text in texts]
+        alone = self._by_prefix.get(None)
+        for k, row in enumerate(rows):
+            name = alone or self._by_prefix.get(row[0])
+            if name is not None:
+                chosen[name].append(k)
+            elif intact[k] and row[0].isascii() and row[0].decode("ascii").isprintable():
+                found.note_unknown(row[0].decode("ascii"))
+                in_step[k] = True
+        for name, picked in chosen.items():
+            start = 0 if alone else 1
+            good, read = self._read(self._layouts[name], picked, [rows[k][start:] for k in picked])
+            if read is None:
+                continue
+            in_step[good] = True
+            places, samples = read
+            sound = intact[good]
+            counter = np.zeros(len(good), np.int64)
+            if name in self._times:
+                # A stamp that is not to be trusted must not move the time of those behind it.
+                trusted = np.flatnonzero(sound)
+                counter[trusted] = self._times[name].count(places[k] for k in trusted.tolist())
+            else:
+                counter[:] = places
+            found.frames[name] = Frames(Decoded(counter, samples, sound), ends[good])
+        return in_step
+
+    @staticmethod
+    def _read(
+        layout: LineLayout, picked: list[int], rows: list[list[bytes]]
+    ) -> tuple[list[int], tuple[list[int] | list[float], NDArray[np.float32]] | None]:
+        """Read the rows that can be read, all at once if that is all of them."""
+        try:
+            return picked, layout.read(rows)
+        except ValueError:
+            good: list[int] = []
+            kept: list[list[bytes]] = []
+            for k, row in zip(picked, rows, strict=True):
+                try:
+                    layout.read([row])
+                except ValueError:
+                    continue
+                good.append(k)
+                kept.append(row)
+            return good, layout.read(kept) if kept else None
+
+    def _check(self, lines: list[bytes]) -> tuple[list[bytes], NDArray[np.bool_]]:
+        """Take the checksums off; returns the texts, and whether each matches."""
+        if self._checksum == "none":
+            return lines, np.ones(len(lines), np.bool_)
+        digits = DIGITS[self._checksum]
+        parts = [line.rpartition(b"*") for line in lines]
+        summed = [text[text[:1] in {b"$", b"!"} :] for text, _, _ in parts]
+        right = [b"%0*X" % (digits, value) for value in self._sums(summed)]
+        sent = [value.upper() for _, _, value in parts]
+        intact = np.fromiter((a == b for a, b in zip(sent, right, strict=True)), np.bool_, len(lines))
+        return [text for text, _, _ in parts], intact
+
+    def _sums(self, texts: list[bytes]) -> list[int]:
+        if self._checksum == "crc16":
+            return list(map(binascii.crc_hqx, texts, repeat(0xFFFF)))
+        # A zero in front keeps every stretch that is combined from being empty, and changes no sum.
+        flat = np.frombuffer(b"\0" + b"\0".join(texts), np.uint8)
+        starts = np.cumsum([0, *(len(text) + 1 for text in texts[:-1])])
+        return [int(value) for value in np.bitwise_xor.reduceat(flat, starts)]
