@@ -73,6 +73,11 @@ class PseudoTerminal:
         self._fd = None
 
     @property
+    def pending(self) -> bool:
+        """Whether a part of a frame still waits for room; `flush` sends it."""
+        return bool(self._unsent)
+
+    @property
     def listening(self) -> bool:
         """Whether somebody has the other end open."""
         if self._fd is None:
