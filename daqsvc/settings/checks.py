@@ -32,8 +32,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.replay import ReplayBus
-from daqsvc.settings.replay_checks import check_replay_bus, check_replayed
+from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
 
@@ -81,9 +80,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_bus_load(draft, messages)
     yield _unused_buses(draft)
     yield check_interfaces(draft)
-    for name, bus in draft.buses.items():
-        if isinstance(bus, ReplayBus):
-            yield check_replay_bus(bus, ("buses", name))
+    yield check_replay_buses(draft)
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
             at = ("sensors", index)

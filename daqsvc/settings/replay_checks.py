@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.replay import ReplayBus, TableLayout
+from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,14 +18,16 @@ if TYPE_CHECKING:
     from daqsvc.settings.problems import KeyPath
 
 
-def check_replay_bus(bus: ReplayBus, at: KeyPath) -> Iterator[Finding]:
+def check_replay_buses(draft: MachineFile) -> Iterator[Finding]:
     """Only a candump log can be read while it is being written."""
-    if bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
-        yield Finding(
-            (*at, "at_end"),
-            f"{bus.file.name} cannot be read while it is being written: only a candump log (.log) can",
-            'write at_end = "stop" or "loop", or have a candump log written',
-        )
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if isinstance(bus, ReplayBus) and bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
+                yield Finding(
+                    ("buses", name, "at_end"),
+                    f"{bus.file.name} cannot be read while it is written: only a candump log (.log) can",
+                    'write at_end = "stop" or "loop", or have a candump log written',
+                )
 
 
 def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
