@@ -126,93 +126,9 @@ class CanLog:
         if reader is None or not issubclass(reader, TextIOMessageReader | BinaryIOMessageReader):
             return can.LogReader(self._path)  # of a plugin, a data base, or nothing at all
         mode: Literal["rt", "rb"] = "rt" if issubclass(reader, TextIOMessageReader) else "rb"
-        file: Any = (
-            self._files.enter_context(gzip.open(self._path, mode))
-            if zipped
-            else self._files.enter_context(self._path.open(mode))
-        )
+        opened = gzip.open(self._path, mode) if zipped else self._path.open(mode)  # noqa: SIM115 - by `_files`
+        file: Any = self._files.enter_context(opened)
         return reader(file)
-
-    def read(self, span_ns: int) -> Sorted | None:
-        """The next piece: what was recorded within ``span_ns``, its arrivals in time of the recording.
-
-        Returns:
-            None at the end; an empty piece if there may be more later.
-
-        Raises:
-            RecordingError: the rest cannot be read.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
-
-
-@dataclass(frozen=True)
-class ColumnLayout:
-    """Samples as columns of a table.
-
-    Attributes:
-        channels: names of the channels, in the order of a sample.
-        columns: name of each channel's column: of the CSV file's header, or of an array of the NPZ file.
-        scale: physical value of one unit of the column, float64 ``[channels]``.
-        offset: physical value of the column's zero, same shape.
-    """
-
-    channels: tuple[str, ...]
-    columns: tuple[str, ...]
-    scale: NDArray[np.float64]
-    offset: NDArray[np.float64]
-
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> ColumnLayout:
-        """The same columns with each channel's value ``v`` turned into ``gain * v + shift``.
-
-        Args:
-            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
-        """
-        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
-        gain = np.array([g for g, _ in pairs])
-        shift = np.array([s for _, s in pairs])
-        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
-
-
-class CanLog:
-    """A finished CAN log: ASC, BLF, candump, TRC, CSV or SQLite by its ending, gzipped or not.
-
-    Args:
-        path: the file.
-        sort: sorts messages with their times to streams.
-
-    Raises:
-        RecordingError: the file cannot be opened, or is of no format that python-can reads.
-    """
-
-    def __init__(self, path: Path, sort: Sort) -> None:
-        self._path = path
-        self._sort = sort
-        self._frames = 0
-        self._files = ExitStack()
-        try:
-            self._reader = self._open()
-        except Exception as error:
-            self._files.close()
-            raise RecordingError(
-                f"{path} cannot be read as a CAN log: {words(error)}; give a file of a format that "
-                "python-can reads, with its usual ending (.asc, .blf, .log, .trc; .gz behind it if zipped)"
-            ) from error
-        self._messages: Iterator[can.Message] = iter(self._reader)
-        self._ahead: can.Message | None = None
-
-    def _open(self) -> MessageReader:
-        # Given only a path, python-can leaves a file open that it cannot make sense of.
-        zipped = self._path.suffix.lower() == ".gz"
-        reader = MESSAGE_READERS.get((self._path.with_suffix("") if zipped else self._path).suffix.lower())
-        if reader is None or not issubclass(reader, TextIOMessageReader | BinaryIOMessageReader):
-            return can.LogReader(self._path)  # of a plugin, a data base, or nothing at all
-        mode = "rt" if issubclass(reader, TextIOMessageReader) else "rb"
-        file = gzip.open(self._path, mode) if zipped else self._path.open(mode)
-        return reader(self._files.enter_context(file))
 
     def read(self, span_ns: int) -> Sorted | None:
         """See `Recording.read`."""
