@@ -18,29 +18,17 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
+from daqsvc.settings.packing import (  # noqa: TC001 - pydantic needs them at run time
+    Channel,
+    Counter,
+    Counts,
+    StartPolicy,
+)
 from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
-
-CRC_BYTES = 2
-
-RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
-Counts = Literal["samples", "frames"]
-StartPolicy = Literal["error", "retry", "ignore"]
-
-_RAW_BYTES: dict[RawType, int] = {
-    "int8": 1,
-    "int16": 2,
-    "int24": 3,
-    "int32": 4,
-    "uint8": 1,
-    "uint16": 2,
-    "uint24": 3,
-    "uint32": 4,
-    "float32": 4,
-}
 
 
 def _payload_length(length: int) -> int:
@@ -51,16 +39,6 @@ def _payload_length(length: int) -> int:
             {"remedy": "take 0 to 8 (classic CAN), or 12, 16, 20, 24, 32, 48 or 64 (CAN FD)"},
         )
     return length
-
-
-def _not_zero(scale: float) -> float:
-    if scale == 0:
-        raise PydanticCustomError(
-            "zero_scale",
-            "would make every sample the same",
-            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
-        )
-    return scale
 
 
 class CanBus(Section):
@@ -90,41 +68,6 @@ class OtherBus(Section):
     driver: Annotated[Name, Field(description="name of the driver's entry point")]
     options: dict[str, Any] = Field(default={}, description="handed to the driver as they are")
     start: StartPolicy = Field(default="retry", description="what to do if the device is absent at start")
-
-
-class Counter(Section):
-    """The running count in each frame that tells loss and gives a sample its place in time."""
-
-    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
-    bits: Annotated[Literal[8, 16, 32], Field(description="its width", examples=[16])]
-    counts: Annotated[
-        Counts,
-        Field(description="what it counts; of samples, the first one in the frame", examples=["samples"]),
-    ]
-
-    @property
-    def end_byte(self) -> int:
-        """One past its last byte."""
-        return self.byte + self.bits // 8
-
-
-class Channel(Section):
-    """One quantity in the frame: wire value = raw * scale + offset.
-
-    The wire value is in V if the channel's sensor has a sensitivity, else in the sensor's unit.
-    """
-
-    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
-    type: Annotated[RawType, Field(description="the raw type of a sample", examples=["int16"])]
-    scale: Annotated[
-        float, AfterValidator(_not_zero), Field(description="worth of one count", examples=[0.0005])
-    ]
-    offset: float = Field(default=0.0, description="wire value of the raw value 0")
-
-    @property
-    def raw_bytes(self) -> int:
-        """Bytes of one raw sample."""
-        return _RAW_BYTES[self.type]
 
 
 class PlainLayout(Section):

@@ -6,7 +6,8 @@ from contextlib import suppress
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.settings.buses import CRC_BYTES, CanBus, DbcLayout, PlainLayout, Stream
+from daqsvc.settings.buses import CanBus, DbcLayout, PlainLayout, Stream
+from daqsvc.settings.packing import CRC_BYTES
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.replay import TableLayout
 from daqsvc.settings.section import UnusableValueError

@@ -22,8 +22,6 @@ from daqsvc.settings.bearing import BEARING, Bearing, WatchedBearing
 from daqsvc.settings.buses import (
     Bus,
     CanBus,
-    Channel,
-    Counter,
     DbcChannel,
     DbcCounter,
     DbcLayout,
@@ -33,6 +31,7 @@ from daqsvc.settings.buses import (
     Stream,
 )
 from daqsvc.settings.mqtt import Mqtt
+from daqsvc.settings.packing import Channel, Counter
 from daqsvc.settings.pipeline import ROTOR_BANK, Levels, Mode, Pipeline, RotorBank
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS, RotorSynchronous
 from daqsvc.settings.section import AngleDeg, DampingRatio, Name, Positive, Section

@@ -1,0 +1,78 @@
+"""What the frames of every kind of bus are made of: raw numbers, a counter, channels."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Name, Section
+
+CRC_BYTES = 2
+
+RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
+Counts = Literal["samples", "frames"]
+StartPolicy = Literal["error", "retry", "ignore"]
+
+_RAW_BYTES: dict[RawType, int] = {
+    "int8": 1,
+    "int16": 2,
+    "int24": 3,
+    "int32": 4,
+    "uint8": 1,
+    "uint16": 2,
+    "uint24": 3,
+    "uint32": 4,
+    "float32": 4,
+}
+
+
+def not_zero(scale: float) -> float:
+    """A scale that tells samples apart.
+
+    Raises:
+        PydanticCustomError: it does not.
+    """
+    if scale == 0:
+        raise PydanticCustomError(
+            "zero_scale",
+            "would make every sample the same",
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
+        )
+    return scale
+
+
+class Counter(Section):
+    """The running count in each frame that tells loss and gives a sample its place in time."""
+
+    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
+    bits: Annotated[Literal[8, 16, 32], Field(description="its width", examples=[16])]
+    counts: Annotated[
+        Counts,
+        Field(description="what it counts; of samples, the first one in the frame", examples=["samples"]),
+    ]
+
+    @property
+    def end_byte(self) -> int:
+        """One past its last byte."""
+        return self.byte + self.bits // 8
+
+
+class Channel(Section):
+    """One quantity in the frame: wire value = raw * scale + offset.
+
+    The wire value is in V if the channel's sensor has a sensitivity, else in the sensor's unit.
+    """
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
+    type: Annotated[RawType, Field(description="the raw type of a sample", examples=["int16"])]
+    scale: Annotated[
+        float, AfterValidator(not_zero), Field(description="worth of one count", examples=[0.0005])
+    ]
+    offset: float = Field(default=0.0, description="wire value of the raw value 0")
+
+    @property
+    def raw_bytes(self) -> int:
+        """Bytes of one raw sample."""
+        return _RAW_BYTES[self.type]
