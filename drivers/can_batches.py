@@ -123,7 +123,10 @@ class Sorted:
 
 @dataclass(frozen=True, slots=True)
 class IdMatch:
-    """Which ids a stream's frames have: those that equal ``id`` wherever ``mask`` has a one."""
+    """Which ids a stream's frames have: those that equal ``id`` wherever ``mask`` has a one.
+
+    The ids are those of frames that are no error frames.
+    """
 
     id: int
     mask: int
@@ -131,9 +134,10 @@ class IdMatch:
     @classmethod
     def of(cls, layout: FrameLayout) -> IdMatch:
         """The ids of a layout: one id of 11 or 29 bits, in frames that carry data."""
+        # Not `ERROR`: in a filter of the kernel this bit asks for error frames.
         if layout.extended:
-            return cls(layout.frame_id | EXTENDED, EXTENDED_ID | EXTENDED | REMOTE | ERROR)
-        return cls(layout.frame_id, STANDARD_ID | EXTENDED | REMOTE | ERROR)
+            return cls(layout.frame_id | EXTENDED, EXTENDED_ID | EXTENDED | REMOTE)
+        return cls(layout.frame_id, STANDARD_ID | EXTENDED | REMOTE)
 
     def __contains__(self, frame_id: int) -> bool:
         return frame_id & self.mask == self.id & self.mask

@@ -138,8 +138,8 @@ class DatagramBuffer:
     def stamps(self) -> Stamps:
         """What the kernel said about the datagrams of the last `receive`.
 
-        The socket must ask for ``SO_TIMESTAMPNS``; ``SO_TIMESTAMPING`` for hardware stamps only, and
-        ``SO_RXQ_OVFL``, may come after it, in this order (``__sock_recv_timestamp``, ``sock_recv_drops``).
+        The socket may ask for ``SO_TIMESTAMPNS``, with that ``SO_TIMESTAMPING`` for hardware stamps only, and
+        ``SO_RXQ_OVFL``; they come in this order (``__sock_recv_timestamp``, ``sock_recv_drops``).
         """
         n = self._used
         lengths = self._control_lengths[:n]
@@ -149,7 +149,7 @@ class DatagramBuffer:
         # Three times: by software, a retired one, and as the hardware gave it.
         hardware = np.where(hardware_stamped, self._time(_AFTER_STAMP + 16 + 32), 0)
         dropped: int | None = None
-        for offset in (_AFTER_STAMP, _AFTER_HARDWARE_STAMP):
+        for offset in (0, _AFTER_STAMP, _AFTER_HARDWARE_STAMP):
             # The figure grows from datagram to datagram: the last one that carries it says it all.
             telling = np.flatnonzero(self._is(offset, SO_RXQ_OVFL, lengths))
             if len(telling):

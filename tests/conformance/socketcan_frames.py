@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from drivers.base import BusPort, StreamSpec
+from drivers.recvmmsg import SO_TIMESTAMPNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
+    from drivers.socketcan import SocketCan
 
 RATE_HZ = 1000.0
 
@@ -40,6 +43,11 @@ class SocketDevice(FaultyDevice):
         if corrupt:
             data[20] ^= 0x10
         return self.put_frame(frame_bytes(self._layout.frame_id, bytes(data)))
+
+
+def stamp_when_read(reader: SocketCan) -> None:
+    """Arrivals by the test's clock: the kernel's own stamps know nothing of simulated time."""
+    reader._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
 
 
 def port_on(

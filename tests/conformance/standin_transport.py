@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from can_standin import StandInBus
-from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on
-from conformance.transport import RealTime
+from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
+from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
 
 from drivers.can_bus import CanDriver
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
-    from drivers.base import StartPolicy
+    from drivers.base import BusPort, StartPolicy
+    from drivers.can_batches import FrameSorter
+    from drivers.socketcan import SocketCan
 
 
 class _Device(SocketDevice):
@@ -43,14 +45,14 @@ class StandInSocketCan:
     rate_hz = RATE_HZ
     samples_per_frame = PER_FRAME
     counter_modulus = 2**32
-    jitter_ns = 5_000_000
-    latency_ns = 5_000_000
+    jitter_ns = 1000
+    latency_ns = 0
     poll_ns = 0
     overflow_frames = 50_000
     cannot = {}  # noqa: RUF012
 
     def __init__(self, _folder: Path) -> None:
-        self.time = RealTime()
+        self.time = SimulatedTime()
         self._bus = StandInBus()
 
     async def start(self) -> None:
@@ -60,8 +62,13 @@ class StandInSocketCan:
         self._bus.unplug()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
+        def open_end(port: BusPort, sorter: FrameSorter) -> SocketCan:
+            reader = self._bus.open(port, sorter)
+            stamp_when_read(reader)
+            return reader
+
         port = port_on("stand-in", self.time, deliver, start, 1 << 20)
-        return CanDriver(port, open_source=self._bus.open)
+        return CanDriver(port, open_source=open_end)
 
 
 TRANSPORTS = {StandInSocketCan.name: StandInSocketCan}

@@ -13,7 +13,7 @@ limit_s=${HIL_LIMIT_S:-300}
 out=${HIL_OUT:-$(mktemp -d "${TMPDIR:-/tmp}/hil.XXXXXX")}
 mkdir -p "$out"
 case "$here$out$PWD" in *' '*) echo "guest.sh: paths travel on a kernel's command line: no spaces, please" >&2; exit 2;; esac
-rm -f "$out/exit-code"
+rm -f "$out/exit-code" "$out/console"
 
 {   # What crosses into the guest: the folder, the variables that the tests read, the command.
     printf 'cd %q\n' "$PWD"

@@ -1,0 +1,162 @@
+"""CAN FD over vcan interfaces of the kernel: once the interface goes down, once it is removed altogether."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
+from conformance.transport import SimulatedTime
+from conformance.virtual_can_transport import PER_FRAME
+from vcan_links import VcanLink
+
+from drivers.can_bus import CanDriver
+from drivers.socketcan import dropped_frames, open_socketcan
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.samples import SampleBlock
+    from drivers.base import BusPort, StartPolicy
+    from drivers.can_batches import FrameSorter
+    from drivers.socketcan import SocketCan
+
+NEEDS = "DAQSVC_HIL"
+RECEIVE_BUFFER_BYTES = 256 << 10
+
+
+class _Device(SocketDevice):
+    """A peer on the interface; it asks the kernel what the driver's socket missed, and pulls the plug."""
+
+    def __init__(self, link: VcanLink, *, removes: bool) -> None:
+        self._frames_put = self._samples_put = 0
+        self._dropped_before = 0
+        self._readers: list[SocketCan] = []
+        super().__init__()
+        self._link = link
+        self._removes = removes
+        self._sender: socket.socket | None = link.sender()
+
+    def watch(self, reader: SocketCan) -> None:
+        """Follow a reader until it is closed."""
+        self._readers.append(reader)
+        close = reader.close
+
+        def closing() -> None:
+            self._dropped_before += dropped_frames(reader._socket)
+            self._readers.remove(reader)
+            close()
+
+        reader.close = closing  # type: ignore[method-assign]
+
+    @property
+    def _dropped(self) -> int:
+        return self._dropped_before + sum(dropped_frames(r._socket) for r in self._readers)
+
+    @property
+    def frames_on_wire(self) -> int:
+        return self._frames_put - self._dropped
+
+    @frames_on_wire.setter
+    def frames_on_wire(self, frames: int) -> None:
+        assert not frames, "counted as they are put in"
+
+    @property
+    def samples_on_wire(self) -> int:
+        return self._samples_put - PER_FRAME * self._dropped
+
+    @samples_on_wire.setter
+    def samples_on_wire(self, samples: int) -> None:
+        assert not samples, "counted as they are put in"
+
+    def _put(self, index: int, samples: NDArray[np.float32]) -> None:
+        first = self.put(index, samples, corrupt=self._corrupting)
+        second = self._duplicating and self.put(index, samples, corrupt=False)
+        self._frames_put += first + second
+        self._samples_put += len(samples) * (first and not self._corrupting)
+        self._corrupting = self._duplicating = False
+
+    def put_frame(self, frame: bytes) -> bool:
+        if self._sender is None:
+            return False
+        try:
+            self._sender.send(frame)
+        except OSError:
+            return False
+        return bool(self._readers)
+
+    def go_away(self) -> None:
+        super().go_away()
+        if self._removes:
+            self._close_sender()
+            self._link.remove()
+        else:
+            self._link.down()
+
+    def come_back(self) -> None:
+        super().come_back()
+        if self._removes:
+            self._link.close()
+            self._link.add()
+        else:
+            self._link.up()
+        self._close_sender()  # its first error is that the interface was down
+        self._sender = self._link.sender()
+
+    def stop(self) -> None:
+        self._close_sender()
+        self._link.close()
+
+    def _close_sender(self) -> None:
+        if self._sender is not None:
+            self._sender.close()
+            self._sender = None
+
+
+class VcanDown:
+    """See `conformance.transport.Transport`; the wire goes away as ``ip link set down``."""
+
+    name = "SocketCAN vcan"
+    removes = False
+    rate_hz = RATE_HZ
+    samples_per_frame = PER_FRAME
+    counter_modulus = 2**32
+    jitter_ns = 1000
+    latency_ns = 0
+    poll_ns = 0
+    overflow_frames = 50_000
+    cannot = {}  # noqa: RUF012
+
+    def __init__(self, _folder: Path) -> None:
+        self.time = SimulatedTime()
+
+    async def start(self) -> None:
+        self._link = VcanLink()
+        self.device = _Device(self._link, removes=self.removes)
+
+    async def stop(self) -> None:
+        self.device.stop()
+
+    def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
+        def open_watched(port: BusPort, sorter: FrameSorter) -> SocketCan:
+            reader = open_socketcan(port.options, sorter.matches, port.clock)
+            stamp_when_read(reader)
+            self.device.watch(reader)
+            return reader
+
+        port = port_on(self._link.name, self.time, deliver, start, RECEIVE_BUFFER_BYTES)
+        return CanDriver(port, open_source=open_watched)
+
+
+class VcanRemoved(VcanDown):
+    """The wire goes away as an adapter that is unplugged: there is no such interface any more."""
+
+    name = "SocketCAN vcan, unplugged"
+    removes = True
+
+
+TRANSPORTS = {each.name: each for each in (VcanDown, VcanRemoved)}
