@@ -1,8 +1,9 @@
-"""The contract between a driver and the service.
+"""The contract between a driver and the service; ``docs/drivers.md`` has it in words and by example.
 
 A driver owns one link. It takes frames off the bus, decodes them in bulk, and delivers blocks; it
 keeps the link up by itself, counts what goes wrong, and lets no exception out. Drivers register by
-entry point in the group ``daqsvc.drivers`` as a callable that takes a `BusPort`.
+entry point in the group ``daqsvc.drivers`` as a callable that takes a `BusPort`. What this asks of
+them, ``tests/conformance/test_conformance.py`` tests over every transport.
 """
 
 from __future__ import annotations
@@ -26,6 +27,20 @@ StartPolicy = Literal["error", "retry", "ignore"]
 
 class DeviceAbsentError(Exception):
     """The device is not there at start, and the machine file says that this is an error."""
+
+
+class BusOptionError(ValueError):
+    """An option of a bus cannot be used; raised by a driver that is made.
+
+    Args:
+        key: the option.
+        problem: what is wrong with it, e.g. ``"is 0"``.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, key: str, problem: str, remedy: str) -> None:
+        super().__init__(f"{key} {problem}; {remedy}")
+        self.key = key
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +106,10 @@ class BusCounters:
 
 
 class Driver(Protocol):
-    """One link, kept up."""
+    """One link, kept up.
+
+    Making one opens nothing and starts nothing.
+    """
 
     name: str
     link: Link
@@ -104,6 +122,10 @@ class Driver(Protocol):
 
     async def run(self) -> None:
         """Open the link and deliver blocks until cancelled; then hand over what is held back and close.
+
+        Whatever is lost on the way is counted. Cancelled at any point, it leaves no task, thread or file
+        behind, and the link down; it can then be called again. It returns by itself only if the device is
+        absent at start and the policy is ``"ignore"``, or if there is nothing more to come.
 
         Raises:
             DeviceAbsentError: the device is absent at start and the policy is ``"error"``. Nothing else.

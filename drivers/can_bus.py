@@ -86,6 +86,7 @@ class CanDriver:
                 first_try = False
                 await self._port.clock.sleep_ns(self._backoff.next_ns())
         finally:
+            self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
 

@@ -97,6 +97,7 @@ class ModbusDriver:
                 first_try = False
                 await self._port.clock.sleep_ns(self._backoff.next_ns())
         finally:
+            self.link.stop()
             for reader in self._readers.values():
                 reader.flush()
 

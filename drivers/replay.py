@@ -136,6 +136,7 @@ class ReplayDriver:
                 first_try = False
                 await self._port.clock.sleep_ns(self._backoff.next_ns())
         finally:
+            self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
 

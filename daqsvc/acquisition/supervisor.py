@@ -85,3 +85,8 @@ class Link:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
         logger.info("%s has ended: %s", self.name, reason)
         self.state, self.reason, self._said_down = "down", reason, False
+
+    def stop(self) -> None:
+        """Nobody keeps the link up any more: its driver was stopped. That is no loss."""
+        if self.state == "up":
+            self.state, self.reason = "down", "it was stopped"

@@ -51,6 +51,7 @@ async def test_a_driver_that_was_stopped_can_run_again(transport: Transport) -> 
         await rig.until_up()
         await rig.send(5)
         await rig.end()
+        assert rig.driver.link.state == "down"
         delivered = rig.counters.samples_received
         # Nobody listens now: these are lost, and the driver must know.
         await transport.time.pass_ns(5 * transport.samples_per_frame * rig.period_ns)
@@ -60,6 +61,7 @@ async def test_a_driver_that_was_stopped_can_run_again(transport: Transport) -> 
     rig.check_books()
     rig.check_indices()
     assert rig.counters.samples_lost > 0
+    assert rig.driver.link.losses == 0, "to be stopped is no loss"
 
 
 async def test_absent_at_start_is_an_error_if_the_machine_file_says_so(transport: Transport) -> None:
