@@ -10,14 +10,15 @@ import tomllib
 from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from sim_hw.link_faults import LinkFaults
 from sim_hw.plants.rotor import Change, RotorParameters, simulate
 from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
+from sim_hw.scenario_bearing import BearingScenario
+from sim_hw.scenario_faults import FaultTable, LinkFaultRates, planned_faults
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -26,9 +27,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pydantic_core import ErrorDetails
 
+    from sim_hw.link_faults import LinkFaults
+    from sim_hw.node_faults import NodeFaults
+
     Floats: TypeAlias = NDArray[np.float64]
 
 _BUILTIN = "scenarios"
+_Kind = TypeVar("_Kind", bound=BaseModel)
 
 
 class ScenarioError(ValueError):
@@ -120,32 +125,6 @@ class Mode(_Table):
         return self
 
 
-class LinkFaultRates(_Table):
-    """Probabilities per frame of what the link does wrong, see `LinkFaults`."""
-
-    drop: float = 0.0
-    duplicate: float = 0.0
-    reorder: float = 0.0
-    corrupt: float = 0.0
-    reorder_within_ms: float = Field(default=5.0, ge=0, allow_inf_nan=False)
-
-    @model_validator(mode="after")
-    def _check_rates(self) -> Self:
-        self.for_seed(0)
-        return self
-
-    def for_seed(self, seed: int) -> LinkFaults:
-        """The link with its random draws fixed."""
-        return LinkFaults(
-            drop=self.drop,
-            duplicate=self.duplicate,
-            reorder=self.reorder,
-            corrupt=self.corrupt,
-            reorder_within_ns=round(self.reorder_within_ms * 1e6),
-            seed=seed,
-        )
-
-
 class Scenario(_Table):
     """One scenario file.
 
@@ -159,7 +138,8 @@ class Scenario(_Table):
         plant: the machine.
         noise: of its sensors.
         onset: what goes wrong with it, in order.
-        link_faults: what the link does wrong; None if it does nothing wrong.
+        link_faults: what the link does wrong all the time; None if it does nothing wrong.
+        fault: what goes wrong with nodes and link, and when.
     """
 
     title: str
@@ -171,6 +151,7 @@ class Scenario(_Table):
     noise: Noise = Noise()
     onset: tuple[Mode, ...] = ()
     link_faults: LinkFaultRates | None = None
+    fault: tuple[FaultTable, ...] = ()
 
     @model_validator(mode="after")
     def _check_schedule(self) -> Self:
@@ -197,6 +178,7 @@ class Scenario(_Table):
             raise ValueError(
                 "plant.rotor.eccentricity is 0: without 1X vibration there is no signal-to-noise"
             )
+        self.node_faults()
         return self
 
     def _parameters(self, onset: Mode) -> RotorParameters:
@@ -260,6 +242,10 @@ class Scenario(_Table):
             else self.link_faults.for_seed(self.seed if seed is None else seed)
         )
 
+    def node_faults(self, seed: int | None = None) -> NodeFaults | None:
+        """What goes wrong with nodes and link, `link` included; None if nothing does."""
+        return planned_faults(self.fault, self.link_faults, self.seed if seed is None else seed)
+
 
 def builtin_scenarios() -> list[str]:
     """Names of the scenarios that come with the package."""
@@ -267,7 +253,7 @@ def builtin_scenarios() -> list[str]:
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Read a scenario by its name, or from a file.
+    """Read a scenario of a rotor by its name, or from a file.
 
     Args:
         name_or_path: one of `builtin_scenarios`, or the path of a TOML file.
@@ -275,10 +261,23 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     Raises:
         ScenarioError: there is no such scenario, or the file is not one; says all that is wrong.
     """
+    return _understood(Scenario, _table(name_or_path), name_or_path)
+
+
+def load_any_scenario(name_or_path: str | Path) -> Scenario | BearingScenario:
+    """As `load_scenario`, whatever the plant is."""
+    table = _table(name_or_path)
+    plant = table.get("plant")
+    if isinstance(plant, dict) and plant.get("kind") == "bearing":
+        return _understood(BearingScenario, table, name_or_path)
+    return _understood(Scenario, table, name_or_path)
+
+
+def _table(name_or_path: str | Path) -> dict[str, Any]:
     builtin = _builtin_files().get(str(name_or_path))
     source: Traversable = Path(name_or_path) if builtin is None else builtin
     try:
-        table = tomllib.loads(source.read_text(encoding="utf-8"))
+        return tomllib.loads(source.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ScenarioError(
             f"there is no scenario {str(name_or_path)!r}: neither a file nor one of "
@@ -286,8 +285,11 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
         ) from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ScenarioError(f"scenario {name_or_path} cannot be read: {error}") from error
+
+
+def _understood(kind: type[_Kind], table: dict[str, Any], name_or_path: str | Path) -> _Kind:
     try:
-        return Scenario.model_validate(table)
+        return kind.model_validate(table)
     except ValidationError as error:
         problems = "\n".join(_in_words(problem) for problem in error.errors())
         raise ScenarioError(f"scenario {name_or_path} cannot be understood:\n{problems}") from error

@@ -226,7 +226,7 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
         rate_hz=machine.rate_hz,
         onsets=machine.onsets,
         samples_per_rev=machine.samples_per_rev,
-        faults=scenario.link(arguments.seed),
+        faults=scenario.node_faults(arguments.seed),
         seed=scenario.seed if arguments.seed is None else arguments.seed,
     )
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.settings import MachineFile
     from sim_hw.demo.listener import Received
-    from sim_hw.link_faults import LinkFaults
+    from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.scenario import Onset
 
@@ -54,7 +54,7 @@ class Script:
         rate_hz: samples per second.
         onsets: what changes when; empty for a recording.
         samples_per_rev: to count delays in revolutions; None if the shaft is not known.
-        faults: of the link.
+        faults: of the node and its link.
         seed: of everything random, to be told in the summary.
     """
 
@@ -65,7 +65,7 @@ class Script:
     rate_hz: float
     onsets: Sequence[Onset] = ()
     samples_per_rev: float | None = None
-    faults: LinkFaults | None = None
+    faults: NodeFaults | None = None
     seed: int = 0
 
     @property
@@ -82,6 +82,7 @@ class Outcome:
         diagnoses: payloads of the diagnoses that changed a decision, in order of arrival.
         figures: the service's last figures.
         injected: what the link did to the frames, by fault.
+        frames_in: frames that the device made, whatever the link did to them.
         frames_sent: frames that went onto the bus.
         samples_sent: samples that were played.
         messages: messages that the consumer got from the broker.
@@ -93,6 +94,7 @@ class Outcome:
     diagnoses: list[dict[str, Any]] = field(default_factory=list)
     figures: dict[str, Any] = field(default_factory=dict)
     injected: dict[str, int] = field(default_factory=dict)
+    frames_in: int = 0
     frames_sent: int = 0
     samples_sent: int = 0
     messages: int = 0
@@ -189,6 +191,7 @@ class Session:
         self.outcome.real_s = asyncio.get_running_loop().time() - begun_s
         self.outcome.frames_sent, self.outcome.samples_sent = node.frames_sent, node.samples_sent
         done = node.injected
+        self.outcome.frames_in = done.frames_in
         self.outcome.injected = {
             "dropped": done.dropped,
             "duplicated": done.duplicated,

@@ -27,7 +27,7 @@ def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, An
     ]
     figures = outcome.figures
     stream = figures["streams"][script.stream]
-    frames_lost = stream["samples_lost"] // max(outcome.samples_sent // max(_frames(outcome), 1), 1)
+    frames_lost = stream["samples_lost"] // max(outcome.samples_sent // max(outcome.frames_in, 1), 1)
     return {
         "type": "summary",
         "title": script.title,
@@ -66,12 +66,6 @@ def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, An
         "messages": outcome.messages,
         "complete": outcome.complete,
     }
-
-
-def _frames(outcome: Outcome) -> int:
-    """Frames that the device has made, whatever the link did to them."""
-    injected = outcome.injected
-    return outcome.frames_sent + injected.get("dropped", 0) - injected.get("duplicated", 0)
 
 
 def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:

@@ -1,0 +1,133 @@
+"""Scenarios of a machine with one rolling element bearing: which of its parts are damaged, and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sim_hw.plants.bearing import BearingMachine, FaultSignal, Levels, levels, simulate
+from sim_hw.scenario_faults import FaultTable, LinkFaultRates, planned_faults
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from numpy.typing import NDArray
+
+    from sim_hw.node_faults import NodeFaults
+    from sim_hw.plants.bearing import Fault
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+_SILENT = Levels((0.0, 0.0), 0.0)
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class BearingPlant(_Table):
+    """A machine by its masses, stiffnesses and dampings, in SI units.
+
+    Those not given have the mode of its rolling elements at 4.2 kHz (the set ``S3`` of the bearing's model).
+    """
+
+    kind: Literal["bearing"]
+    speed_rpm: float = Field(default=1797.0, gt=0, allow_inf_nan=False)
+    masses_kg: tuple[float, float, float] = (2.0, 1.0, 2.0)
+    stiffnesses_n_per_m: tuple[float, float, float] = (1.7765e8, 3.5531e8, 1.7765e8)
+    dampings_n_s_per_m: tuple[float, float, float] = (753.98, 2513.27, 1256.64)
+    snr_db: float = Field(default=10.0, allow_inf_nan=False)
+
+    @property
+    def machine(self) -> BearingMachine:
+        """Its arithmetic."""
+        return BearingMachine(
+            masses=self.masses_kg, stiffnesses=self.stiffnesses_n_per_m, dampings=self.dampings_n_s_per_m
+        )
+
+
+class Damage(_Table):
+    """From ``at_s`` on these parts are damaged, and no others."""
+
+    part: Literal["healthy", "inner", "outer", "ball", "inner_and_outer"]
+    at_s: float = Field(ge=0, allow_inf_nan=False)
+
+
+class BearingScenario(_Table):
+    """One scenario file whose plant is a bearing.
+
+    Attributes:
+        title: what it shows, in a line.
+        seed: of every random draw, unless another is given.
+        duration_s: length of the run.
+        plant: the machine.
+        damage: of its bearing, in order; healthy before the first.
+        link_faults: what the link does wrong all the time.
+        fault: what goes wrong with nodes and link, and when.
+    """
+
+    title: str
+    seed: int = Field(default=1, ge=0)
+    duration_s: float = Field(gt=0, le=3600)
+    plant: BearingPlant
+    damage: tuple[Damage, ...] = ()
+    link_faults: LinkFaultRates | None = None
+    fault: tuple[FaultTable, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_schedule(self) -> Self:
+        times = [damage.at_s for damage in self.damage]
+        if sorted(set(times)) != times or (times and times[-1] >= self.duration_s):
+            raise ValueError(
+                f"damage at {', '.join(f'{at:g}' for at in times)} s must rise and lie before the end, "
+                f"duration_s = {self.duration_s:g}"
+            )
+        self.node_faults()
+        return self
+
+    def node_faults(self, seed: int | None = None) -> NodeFaults | None:
+        """What goes wrong with nodes and link; None if nothing does."""
+        return planned_faults(self.fault, self.link_faults, self.seed if seed is None else seed)
+
+    def accelerations(self, rate_hz: float, seed: int | None = None, snr_db: float | None = None) -> Run:
+        """Run the scenario; the same seed gives the same samples.
+
+        Args:
+            rate_hz: sampling rate.
+            seed: instead of the scenario's.
+            snr_db: instead of the plant's.
+        """
+        seed = self.seed if seed is None else seed
+        signal = FaultSignal(shaft_hz=self.plant.speed_rpm / 60.0)
+        level = levels(
+            self.plant.machine,
+            signal,
+            snr_db=self.plant.snr_db if snr_db is None else snr_db,
+            rate_hz=rate_hz,
+        )
+        calm, *of_damage = (
+            np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(1 + len(self.damage))
+        )
+
+        def run(part: Fault, level: Levels, rng: np.random.Generator) -> Floats:
+            machine = self.plant.machine
+            return simulate(machine, signal, part, level, rng, seconds=self.duration_s, rate_hz=rate_hz).y
+
+        # The machine is linear: its vibration is what it does when healthy, and what the damage adds.
+        y = run("healthy", level, calm)
+        ends = [*(d.at_s for d in self.damage[1:]), self.duration_s]
+        for damage, end_s, rng in zip(self.damage, ends, of_damage, strict=True):
+            part = slice(round(damage.at_s * rate_hz), round(end_s * rate_hz))
+            y[part] += run(damage.part, _SILENT, rng)[part]
+        return Run(rotor_m_s2=y[:, 0], housing_m_s2=y[:, 1])
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What accelerometers on the rotor and on the housing said: float64 ``[n]`` each, in m/s^2."""
+
+    rotor_m_s2: Floats
+    housing_m_s2: Floats
