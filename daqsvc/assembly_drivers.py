@@ -12,6 +12,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.replay import ReplayBus, TableLayout
+from daqsvc.settings.serial import LineLayout as LineSettings
+from daqsvc.settings.serial import SerialLayout
 from drivers.base import BusPort, StreamSpec
 from drivers.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
@@ -29,14 +31,15 @@ from drivers.modbus_layouts import (
 )
 from drivers.registers import RegisterField, RegisterRecord, Run, plan_runs
 from drivers.replay_files import ColumnLayout
+from drivers.serial_lines import LineLayout
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.modbus import RegisterChannel, SampleChannel
-    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.models import Channel, MachineFile
     from drivers.base import Driver
 
 DRIVERS = "daqsvc.drivers"
@@ -50,11 +53,17 @@ class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there."""
 
 
-def stream_layout(machine: MachineFile, stream: str) -> FrameLayout | ModbusLayout | ColumnLayout:
+def stream_layout(
+    machine: MachineFile, stream: str
+) -> FrameLayout | ModbusLayout | ColumnLayout | LineLayout:
     """The layout of a stream, of the kind that its bus's driver knows; see `frame_layout`."""
     given = machine.streams[stream].layout
     if isinstance(given, PlainLayout | DbcLayout):
         return frame_layout(machine, stream)
+    if isinstance(given, SerialLayout):
+        return _serial_layout(given).in_units(_units(machine, stream))
+    if isinstance(given, LineSettings):
+        return _line_layout(given).in_units(_units(machine, stream))
     if isinstance(given, TableLayout):
         return ColumnLayout(
             channels=given.channel_names,
@@ -158,14 +167,11 @@ def _units(machine: MachineFile, stream: str) -> dict[str, tuple[float, float]]:
 
 
 def _plain_layout(given: PlainLayout) -> FrameLayout:
-    def kind(raw_type: str) -> Kind:
-        return "float" if raw_type == "float32" else "unsigned" if raw_type.startswith("u") else "signed"
-
     return FrameLayout.plain(
         frame_id=given.id,
         extended=given.extended,
         length=given.length,
-        channels=[(c.name, 8 * c.raw_bytes, kind(c.type), c.scale, c.offset) for c in given.channels],
+        channels=_packed(given.channels),
         samples_per_frame=given.samples_per_frame,
         counter_byte=given.counter.byte,
         counter_bits=given.counter.bits,
@@ -174,6 +180,42 @@ def _plain_layout(given: PlainLayout) -> FrameLayout:
         crc_byte=given.crc_byte,
         byte_order=given.byte_order,
     )
+
+
+def _serial_layout(given: SerialLayout) -> FrameLayout:
+    return FrameLayout.plain(
+        frame_id=given.stream_id or 0,
+        length=given.payload_length,
+        channels=_packed(given.channels),
+        samples_per_frame=given.samples_per_frame,
+        counter_byte=given.counter.byte,
+        counter_bits=given.counter.bits,
+        counts=given.counter.counts,
+        first_byte=given.first_byte,
+        byte_order=given.byte_order,
+    )
+
+
+def _line_layout(given: LineSettings) -> LineLayout:
+    return LineLayout(
+        columns=given.line,
+        channels=given.channel_names,
+        scale=np.array([channel.scale for channel in given.channels]),
+        offset=np.array([channel.offset for channel in given.channels]),
+        counter=None if given.counter is None else given.counter.column,
+        counter_bits=32 if given.counter is None else given.counter.bits,
+        time=None if given.time is None else given.time.column,
+        time_unit="ms" if given.time is None else given.time.unit,
+        prefix=given.prefix,
+        separator=given.separator,
+    )
+
+
+def _packed(channels: Sequence[Channel]) -> list[tuple[str, int, Kind, float, float]]:
+    def kind(raw_type: str) -> Kind:
+        return "float" if raw_type == "float32" else "unsigned" if raw_type.startswith("u") else "signed"
+
+    return [(c.name, 8 * c.raw_bytes, kind(c.type), c.scale, c.offset) for c in channels]
 
 
 def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> list[Driver]:

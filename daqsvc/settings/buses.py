@@ -26,6 +26,7 @@ from daqsvc.settings.packing import (  # noqa: TC001 - pydantic needs them at ru
 )
 from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
+from daqsvc.settings.serial import FRAMINGS, CobsBus, LineLayout, LinesBus, SerialLayout, SyncBus
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
@@ -180,6 +181,9 @@ def _bus_kind(table: Mapping[str, Any]) -> type[Section]:
         return ModbusRtuBus if table.get("transport") == "rtu" else ModbusTcpBus
     if driver == "replay":
         return ReplayBus
+    if driver == "serial":
+        framing = table.get("framing")
+        return FRAMINGS.get(framing, CobsBus) if isinstance(framing, str) else CobsBus
     return OtherBus if isinstance(driver, str) and driver != "can" else CanBus
 
 
@@ -189,18 +193,40 @@ def _layout_kind(table: Mapping[str, Any]) -> type[Section]:
         return WAYS.get(way, RegistersLayout) if isinstance(way, str) else RegistersLayout
     if "columns" in table:
         return TableLayout
+    if "line" in table:
+        return LineLayout
+    if "payload_length" in table:
+        return SerialLayout
     return DbcLayout if "dbc" in table else PlainLayout
 
 
 Bus: TypeAlias = Annotated[
-    CanBus | ModbusTcpBus | ModbusRtuBus | ReplayBus | OtherBus,
-    Kinds(_bus_kind, (CanBus, ModbusTcpBus, ModbusRtuBus, ReplayBus, OtherBus)),
+    CanBus | ModbusTcpBus | ModbusRtuBus | CobsBus | SyncBus | LinesBus | ReplayBus | OtherBus,
+    Kinds(_bus_kind, (CanBus, ModbusTcpBus, ModbusRtuBus, CobsBus, SyncBus, LinesBus, ReplayBus, OtherBus)),
 ]
 Layout: TypeAlias = Annotated[
-    PlainLayout | DbcLayout | RegistersLayout | FifoLayout | RingLayout | WaveformLayout | TableLayout,
+    PlainLayout
+    | DbcLayout
+    | RegistersLayout
+    | FifoLayout
+    | RingLayout
+    | WaveformLayout
+    | SerialLayout
+    | LineLayout
+    | TableLayout,
     Kinds(
         _layout_kind,
-        (PlainLayout, DbcLayout, RegistersLayout, FifoLayout, RingLayout, WaveformLayout, TableLayout),
+        (
+            PlainLayout,
+            DbcLayout,
+            RegistersLayout,
+            FifoLayout,
+            RingLayout,
+            WaveformLayout,
+            SerialLayout,
+            LineLayout,
+            TableLayout,
+        ),
     ),
 ]
 
@@ -214,5 +240,10 @@ class Stream(Section):
     ]
     reorder_window_ms: Annotated[NotNegative, Field(le=1000)] = Field(
         default=10.0, description="how long a gap may wait for a late frame"
+    )
+    latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(
+        default=0.0,
+        description="constant delay from the taking of a sample to its arrival, which no clock shows; counts "
+        "where streams are aligned",
     )
     layout: Annotated[Layout, Field(description="where counter and samples lie in a frame")]

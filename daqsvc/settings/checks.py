@@ -35,6 +35,7 @@ from daqsvc.settings.problems import Finding
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.serial_checks import check_serial, check_serial_ports
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -71,6 +72,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield check_frame_length(draft, stream, messages.get(name), at)
             yield check_counter(stream, messages.get(name), at)
             yield check_modbus(draft, stream, at)
+            yield check_serial(draft, stream, at)
             yield check_replayed(draft, stream, at)
             with suppress(UnusableValueError):
                 if isinstance(stream.layout, PlainLayout):
@@ -80,6 +82,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_bus_load(draft, messages)
     yield _unused_buses(draft)
     yield check_interfaces(draft)
+    yield check_serial_ports(draft)
     yield check_replay_buses(draft)
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):

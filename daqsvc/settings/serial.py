@@ -1,0 +1,286 @@
+"""Serial ports, and how samples lie in the frames or lines that come over them."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.packing import (
+    CRC_BYTES,
+    Channel,
+    Counter,
+    StartPolicy,
+    not_zero,
+)
+from daqsvc.settings.section import Name, Section
+
+LONGEST_PAYLOAD = 4096
+LONGEST_SYNC_WORD = 8
+
+
+def _device_path(path: str) -> str:
+    if not path.startswith("/"):
+        raise PydanticCustomError(
+            "device_path",
+            "is not the whole path of a port",
+            {"remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}"},
+        )
+    return path
+
+
+def _sync_word(text: str) -> str:
+    try:
+        length = len(bytes.fromhex(text))
+    except ValueError:
+        length = 0
+    if not 1 <= length <= LONGEST_SYNC_WORD:
+        raise PydanticCustomError(
+            "sync_word",
+            f"is not 1 to {LONGEST_SYNC_WORD} bytes in hexadecimal",
+            {"remedy": 'write the bytes that each frame begins with, e.g. "a55a"'},
+        )
+    return text
+
+
+def _separator(text: str) -> str:
+    if not text.isascii() or text.isalnum() or text in "+-.*\r\n":
+        raise PydanticCustomError(
+            "separator",
+            "cannot stand between numbers",
+            {"remedy": 'write the character that the device puts there, e.g. "," or ";"'},
+        )
+    return text
+
+
+class SerialBus(Section):
+    """What all serial ports have."""
+
+    driver: Annotated[Literal["serial"], Field(description="which driver reads the bus", examples=["serial"])]
+    port: Annotated[
+        str,
+        AfterValidator(_device_path),
+        Field(
+            description="path of the port; those below /dev/serial/by-id stay the same when it is re-plugged",
+            examples=["/dev/serial/by-id/usb-FTDI_FT232R_A1B2C3D4-if00-port0"],
+        ),
+    ]
+    baud: Annotated[int, Field(ge=50, le=12_000_000, description="bit/s", examples=[921_600])]
+    data_bits: Literal[7, 8] = Field(default=8, description="bits of a character")
+    parity: Literal["none", "even", "odd"] = Field(default="none", description="of a character")
+    stop_bits: Literal[1, 2] = Field(default=1, description="of a character")
+    flow_control: Literal["none", "rts-cts", "xon-xoff"] = Field(
+        default="none", description="whether and how the device is told to wait"
+    )
+    low_latency: bool = Field(default=False, description="have the port's driver pass bytes on at once")
+    start: StartPolicy = Field(default="retry", description="what to do if the port is absent at start")
+
+    @property
+    def bits_per_character(self) -> int:
+        """Bits that a character takes on the wire, start bit included."""
+        return 1 + self.data_bits + (self.parity != "none") + self.stop_bits
+
+    def _line(self) -> str:
+        character = f"{self.data_bits}{self.parity[0].upper()}{self.stop_bits}"
+        return f"serial {self.port}, {self.baud} bit/s {character}"
+
+
+class _BinaryBus(SerialBus):
+    """What serial ports with binary frames have."""
+
+    crc: Literal["ibm-3740", "xmodem", "none"] = Field(
+        default="ibm-3740", description="the CRC-16 at the end of each frame"
+    )
+    crc_order: Literal["big", "little"] = Field(default="big", description="its byte order")
+    stream_ids: bool = Field(
+        default=False, description="whether each frame begins with a byte that names its stream"
+    )
+
+    @property
+    def crc_bytes(self) -> int:
+        """Bytes that the CRC takes."""
+        return 0 if self.crc == "none" else CRC_BYTES
+
+
+class CobsBus(_BinaryBus):
+    """A serial port with COBS frames, each followed by a zero byte."""
+
+    kind: ClassVar[str] = 'a serial port with framing = "cobs"'
+
+    framing: Annotated[Literal["cobs"], Field(description="what tells frames apart", examples=["cobs"])]
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{self._line()}, COBS frames, CRC {self.crc}"
+
+
+class SyncBus(_BinaryBus):
+    """A serial port with frames of fixed length behind sync words."""
+
+    kind: ClassVar[str] = 'a serial port with framing = "sync"'
+
+    framing: Annotated[Literal["sync"], Field(description="what tells frames apart", examples=["sync"])]
+    sync_word: Annotated[
+        str,
+        AfterValidator(_sync_word),
+        Field(description="the bytes that each frame begins with, in hexadecimal", examples=["a55a"]),
+    ]
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        return f"{self._line()}, frames behind {self.sync_word}, CRC {self.crc}"
+
+
+class LinesBus(SerialBus):
+    """A serial port with lines of text."""
+
+    kind: ClassVar[str] = 'a serial port with framing = "lines"'
+
+    framing: Annotated[Literal["lines"], Field(description="what tells frames apart", examples=["lines"])]
+    checksum: Literal["none", "xor", "crc16"] = Field(
+        default="none", description="behind a * at the end of each line, in hexadecimal; xor as in NMEA 0183"
+    )
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        checksum = "no checksum" if self.checksum == "none" else f"checksum {self.checksum}"
+        return f"{self._line()}, lines of text, {checksum}"
+
+
+class SerialLayout(Section):
+    """Samples side by side in a binary frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
+
+    kind: ClassVar[str] = "a layout of a binary serial frame"
+
+    payload_length: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=LONGEST_PAYLOAD,
+            description="bytes of a frame without sync word, stream id and CRC",
+            examples=[124],
+        ),
+    ]
+    stream_id: Annotated[int, Field(ge=0, le=255, description="the byte that names the stream")] | None = None
+    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
+    counter: Annotated[
+        Counter,
+        Field(description="the frame's counter", examples=['{ byte = 0, bits = 32, counts = "samples" }']),
+    ]
+    first_byte: Annotated[
+        int, Field(ge=0, lt=LONGEST_PAYLOAD, description="where the samples start", examples=[4])
+    ]
+    samples_per_frame: Annotated[
+        int, Field(ge=1, le=LONGEST_PAYLOAD, description="samples per channel", examples=[20])
+    ]
+    channels: Annotated[
+        tuple[Channel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
+        ),
+    ]
+
+    @property
+    def samples_end_byte(self) -> int:
+        """One past the last byte of the samples."""
+        return self.first_byte + self.samples_per_frame * sum(channel.raw_bytes for channel in self.channels)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        named = "" if self.stream_id is None else f"id {self.stream_id}, "
+        return (
+            f"{named}{self.payload_length} bytes, {self.samples_per_frame} x {len(self.channels)} samples, "
+            f"{self.counter.bits} bit {self.counter.counts}"
+        )
+
+
+class LineCounter(Section):
+    """The column that counts lines, and so samples."""
+
+    column: Annotated[Name, Field(description="which column it is", examples=["seq"])]
+    bits: Literal[8, 16, 32] = Field(default=32, description="its width: it begins again at 0 after 2**bits")
+
+
+class LineTime(Section):
+    """The column with the time of the device's own clock, of a device that does not count its lines."""
+
+    column: Annotated[Name, Field(description="which column it is", examples=["t"])]
+    unit: Annotated[Literal["s", "ms", "us"], Field(description="its unit", examples=["ms"])]
+
+
+class LineChannel(Section):
+    """One quantity of a line: wire value = value * scale + offset, as for a channel of a frame."""
+
+    name: Annotated[Name, Field(description="name of the channel, and of its column", examples=["x"])]
+    scale: Annotated[float, AfterValidator(not_zero)] = Field(default=1.0, description="wire value of a 1")
+    offset: float = Field(default=0.0, description="wire value of a 0")
+
+
+class LineLayout(Section):
+    """A sample of every channel as the columns of a line."""
+
+    kind: ClassVar[str] = "a layout of a line of text"
+
+    line: Annotated[
+        tuple[Name, ...],
+        Field(
+            strict=False,
+            min_length=2,
+            description="names of the columns; those named nowhere else are left out",
+            examples=['["seq", "x", "y"]'],
+        ),
+    ]
+    separator: Annotated[
+        str, AfterValidator(_separator), Field(min_length=1, max_length=1, description="between columns")
+    ] = ","
+    prefix: (
+        Annotated[
+            str,
+            Field(pattern=r"^[!$]?[A-Za-z0-9_-]+$", max_length=16, description="first field of each line"),
+        ]
+        | None
+    ) = None
+    counter: LineCounter | None = Field(default=None, description="the column that counts")
+    time: LineTime | None = Field(default=None, description="the device's time, where it does not count")
+    channels: Annotated[
+        tuple[LineChannel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            description="the channels of each sample",
+            examples=['[{ name = "x" }]'],
+        ),
+    ]
+
+    @property
+    def samples_per_frame(self) -> int:
+        """One line, one sample of each channel."""
+        return 1
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def summary(self) -> str:
+        """What a person should know about it, in a few words."""
+        named = "" if self.prefix is None else f"{self.prefix}, "
+        place = "device's time" if self.counter is None else f"{self.counter.bits} bit counter"
+        return f"{named}lines of {len(self.line)} columns, {len(self.channels)} channels, {place}"
+
+
+FRAMINGS: dict[str, type[SerialBus]] = {"cobs": CobsBus, "sync": SyncBus, "lines": LinesBus}

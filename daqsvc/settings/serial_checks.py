@@ -1,0 +1,194 @@
+"""Whether what a machine file says of serial ports and of the layouts on them fits together."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.settings.buses import Stream
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import KeyPath
+
+LINE_CHARACTERS = 4
+"""A line has at least a digit, a separator, another digit and an end."""
+
+_NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
+
+
+def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
+    """The layout belongs to the bus, and its parts fit each other."""
+    bus, layout, path = draft.buses.get(stream.bus), stream.layout, (*at, "layout")
+    if isinstance(bus, LinesBus):
+        if not isinstance(layout, LineLayout):
+            yield Finding(
+                path,
+                f'is no layout of a line, and bus "{stream.bus}" carries lines',
+                'write line = ["seq", "x"], the names of the columns',
+            )
+            return
+    elif isinstance(bus, CobsBus | SyncBus):
+        if not isinstance(layout, SerialLayout):
+            yield Finding(
+                path,
+                f'is no layout of a binary serial frame, and bus "{stream.bus}" carries such frames',
+                "write payload_length (and stream_id if stream_ids = true) in place of id and length",
+            )
+            return
+        yield from _check_id(bus, stream.bus, layout, path)
+    elif isinstance(layout, SerialLayout | LineLayout) and bus is not None:
+        yield Finding(
+            path,
+            f'is one of a serial port, but bus "{stream.bus}" is none',
+            'correct bus, or write driver = "serial", port, baud and framing in its table',
+        )
+        return
+    if isinstance(layout, LineLayout):
+        yield from _check_columns(layout, path)
+    elif isinstance(layout, SerialLayout):
+        yield from _check_room(layout, path)
+
+
+def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
+    """Ports are named so that they are found again, are named once, and are fast enough for their streams."""
+    owners: dict[str, str] = {}
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if not isinstance(bus, SerialBus):
+                continue
+            owner = owners.setdefault(bus.port, name)
+            if owner != name:
+                yield Finding(
+                    ("buses", name, "port"),
+                    f'belongs to bus "{owner}" already',
+                    "give each bus its own port",
+                )
+            if _NUMBERED.fullmatch(bus.port):
+                yield Finding(
+                    ("buses", name, "port"),
+                    "may be another device once a port has been re-plugged",
+                    "write its path below /dev/serial/by-id (ls -l /dev/serial/by-id)",
+                    fatal=False,
+                )
+            yield from _check_streams(draft, name, bus)
+
+
+def _check_id(bus: CobsBus | SyncBus, name: str, layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:
+    if bus.stream_ids and layout.stream_id is None:
+        yield Finding(
+            (*path, "stream_id"),
+            f'is missing: frames on bus "{name}" begin with the id of their stream',
+            f"add stream_id = 1, as the device sends it, or write stream_ids = false in [buses.{name}]",
+        )
+    if not bus.stream_ids and layout.stream_id is not None:
+        yield Finding(
+            (*path, "stream_id"),
+            f'has no effect: bus "{name}" carries no stream ids',
+            f"write stream_ids = true in [buses.{name}], or remove it",
+        )
+
+
+def _check_room(layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:
+    """Counter and samples lie within the payload and beside each other."""
+    fields = [
+        ("counter", "the counter", layout.counter.byte, layout.counter.end_byte),
+        ("first_byte", "the samples", layout.first_byte, layout.samples_end_byte),
+    ]
+    for key, what, start, end in fields:
+        if end > layout.payload_length:
+            yield Finding(
+                (*path, key),
+                f"{what} would take bytes {start} to {end - 1} of a payload of {layout.payload_length} bytes",
+                f"write payload_length = {end} or more, or fewer samples_per_frame",
+            )
+    for (_, first, _, end), (key, what, later, later_end) in combinations(
+        sorted(fields, key=lambda f: f[2]), 2
+    ):
+        if later < end:
+            yield Finding(
+                (*path, key),
+                f"{what} (bytes {later} to {later_end - 1}) would overlap {first} (up to byte {end - 1})",
+                f"move {what} to byte {end} or behind, as the device sends it",
+            )
+
+
+def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
+    """Every column is there once; a line has a counter, or the device's time."""
+    seen: set[str] = set()
+    for place, name in enumerate(layout.line):
+        if name in seen:
+            yield Finding(
+                (*path, "line", place),
+                "is the name of an earlier column already",
+                "give each column its own name",
+            )
+        seen.add(name)
+    if layout.counter is None and layout.time is None:
+        yield Finding(
+            path,
+            "has neither counter nor time: lost lines would not be noticed",
+            'add counter = { column = "seq" } or time = { column = "t", unit = "ms" }, whichever it sends',
+        )
+    if layout.counter is not None and layout.time is not None:
+        yield Finding(
+            (*path, "time"),
+            "has no effect beside counter, which tells loss exactly",
+            "remove time; its column may stay in line",
+        )
+    for key, part in (("counter", layout.counter), ("time", layout.time)):
+        if part is not None and part.column not in layout.line:
+            yield Finding(
+                (*path, key, "column"), "the line has no such column", choice(part.column, layout.line)
+            )
+    for index, channel in enumerate(layout.channels):
+        if channel.name not in layout.line:
+            yield Finding(
+                (*path, "channels", index, "name"),
+                "the line has no such column",
+                choice(channel.name, layout.line),
+            )
+
+
+def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Finding]:
+    """The streams of a port can be told apart, and the port has time for them."""
+    owners: dict[object, str] = {}
+    characters_per_s = 0.0
+    for key, stream in draft.streams.items():
+        with suppress(UnusableValueError):
+            layout = stream.layout
+            if stream.bus != name or not isinstance(layout, SerialLayout | LineLayout):
+                continue
+            mark: object
+            if isinstance(layout, LineLayout):
+                mark, what, where = layout.prefix, "prefix", "a prefix"
+                characters = len(layout.prefix or "") + LINE_CHARACTERS
+            else:
+                mark, what = layout.stream_id, "stream_id"
+                where = f"a stream_id (with stream_ids = true in [buses.{name}])"
+                characters = layout.payload_length + 1
+            if mark is None and isinstance(bus, CobsBus | SyncBus) and bus.stream_ids:
+                continue  # that is reported already
+            if owners and (mark is None or None in owners or mark in owners):
+                owner = owners.get(mark, next(iter(owners.values())))
+                yield Finding(
+                    ("streams", key, "layout", what),
+                    f'does not tell this stream from "{owner}" on the same port',
+                    f"give each stream of a port {where} of its own, as the device sends it",
+                )
+            owners[mark] = key
+            characters_per_s += stream.rate_hz / layout.samples_per_frame * characters
+    needed = characters_per_s * bus.bits_per_character
+    if needed > bus.baud:
+        yield Finding(
+            ("buses", name, "baud"),
+            f"is too slow: the streams on the port need {needed:,.0f} bit/s at least",
+            "correct the rates of the streams, or set port and device to a faster rate",
+        )
