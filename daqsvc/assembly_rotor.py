@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.rotor_synchronous import SpeedReference
     from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.settings.alignment import Grid
     from daqsvc.settings.models import MachineFile, RotorBank, RotorSynchronous
 
 log = logging.getLogger(__name__)
@@ -49,15 +50,15 @@ def rotor_bank(machine: MachineFile, bank: RotorBank) -> Detector:
     assert rotor is not None  # noqa: S101
     assert rotor.eccentricity_um is not None  # noqa: S101
     assert rotor.contact_stiffness is not None  # noqa: S101
-    stream = machine.sensor(bank.keyphasor).stream
-    rate_hz = machine.streams[stream].rate_hz
+    grid = machine.grid(bank)
+    rate_hz = grid.rate_hz
     return RotorBankDetector(
         machine=machine.machine.name,
-        stream=stream,
+        stream=grid.name,
         rate_hz=rate_hz,
         speed_rpm=machine.machine.speed_rpm,
-        probes=_probes(machine, bank.probes),
-        keyphasor=_keyphasor(machine, bank.keyphasor),
+        probes=_probes(machine, grid, bank.probes),
+        keyphasor=_keyphasor(machine, grid, bank.keyphasor),
         rotor=RotorParameters(
             natural_frequency_hz=rotor.natural_frequency_hz,
             damping_ratio=rotor.damping_ratio,
@@ -154,19 +155,19 @@ def rotor_synchronous(
     if calibration is None and store is not None:
         kept = store / f"{ROTOR_SYNCHRONOUS}.toml"
         calibration = _kept_calibration(kept, machine.machine.speed_rpm, rotor)
-    stream = machine.sensor(given.probes[0]).stream
+    grid = machine.grid(given)
     reference: SpeedReference
     if given.reference == "keyphasor":
         assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
-        reference = _keyphasor(machine, given.keyphasor)
+        reference = _keyphasor(machine, grid, given.keyphasor)
     else:
         reference = given.reference
     return RotorSynchronousDetector(
         machine=machine.machine.name,
-        stream=stream,
-        rate_hz=machine.streams[stream].rate_hz,
+        stream=grid.name,
+        rate_hz=grid.rate_hz,
         speed_rpm=machine.machine.speed_rpm,
-        probes=_probes(machine, given.probes),
+        probes=_probes(machine, grid, given.probes),
         reference=reference,
         rotor=rotor,
         rules=WatchRules(
@@ -199,18 +200,18 @@ def _keep_calibration(path: Path, calibration: Calibration) -> None:
         log.error("the healthy state of the rotor will be lost at the next restart: %s", error)  # noqa: TRY400
 
 
-def _probes(machine: MachineFile, names: tuple[str, str]) -> tuple[Probe, Probe]:
+def _probes(machine: MachineFile, grid: Grid, names: tuple[str, str]) -> tuple[Probe, Probe]:
     def probe(name: str) -> Probe:
         sensor = machine.sensor(name)
         assert isinstance(sensor, ProximityProbe)  # noqa: S101 - settings/rotor_checks.py
         assert sensor.angle_deg is not None  # noqa: S101 - settings/rotor_checks.py
-        return Probe(name, machine.column(sensor), sensor.angle_deg, _UM_PER_UNIT[sensor.unit])
+        return Probe(name, grid.column(sensor), sensor.angle_deg, _UM_PER_UNIT[sensor.unit])
 
     return probe(names[0]), probe(names[1])
 
 
-def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
+def _keyphasor(machine: MachineFile, grid: Grid, name: str) -> KeyphasorProbe:
     sensor = machine.sensor(name)
     assert isinstance(sensor, Keyphasor)  # noqa: S101 - settings/rotor_checks.py
-    column = machine.column(sensor)
+    column = grid.column(sensor)
     return KeyphasorProbe(name, column, sensor.threshold_v, sensor.hysteresis_v, sensor.edge)

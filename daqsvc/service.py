@@ -15,11 +15,13 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
+from daqsvc.assembly_alignment import alignment
 from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
+from daqsvc.settings.alignment import Grid
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
@@ -106,7 +108,9 @@ class Service:
         self.ready = asyncio.Event()
         self._identity = identity(machine)
         detectors = assembly.detectors(machine, store)
-        self.rings = {name: _ring(machine, name, detectors) for name in machine.streams}
+        grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
+        self.rings = {grid.name: _ring(machine, grid, detectors) for grid in grids}
+        self.alignment = alignment(machine, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
         self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
         self.desk = AlarmDesk(
@@ -200,6 +204,7 @@ class Service:
 
     def _deliver(self, block: SampleBlock) -> None:
         self.rings[block.stream].write(block)
+        self.alignment.accept(block)
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self.desk.take(diagnosis)
@@ -240,6 +245,7 @@ class Service:
         return {
             "streams": streams,
             "buses": buses,
+            "grids": self.alignment.figures(),
             "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
             "loop_lag_ms": self.lag.figures_ms(),
             "suspensions": self.lag.suspensions,
@@ -252,12 +258,11 @@ class Service:
         }
 
 
-def _ring(machine: MachineFile, stream: str, detectors: Sequence[Detector]) -> SampleRing:
-    described = machine.streams[stream]
-    wanted = round(machine.pipeline.ring_s * described.rate_hz)
+def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:
+    wanted = round(machine.pipeline.ring_s * grid.rate_hz)
     # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
-    needed = max((4 * d.block for d in detectors if d.stream == stream), default=1)
-    return SampleRing(stream, described.layout.channel_names, max(wanted, needed))
+    needed = max((4 * d.block for d in detectors if d.stream == grid.name), default=1)
+    return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
 
 
 async def _cancel(tasks: list[asyncio.Task[Any]], patience_s: float) -> None:

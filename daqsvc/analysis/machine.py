@@ -227,6 +227,9 @@ class MachineAnalyst:
         pipeline = machine.pipeline.model_copy(update={"rotor_synchronous": None, "bearing": None})
         others = machine.model_copy(update={"pipeline": pipeline})
         streams = {name: self._stream(machine, name, recording) for name in machine.streams}
+        for grid in machine.grids:
+            # A recording has all its channels on one grid already.
+            streams[grid.name] = np.concatenate([streams[name] for name in grid.streams], axis=1)
         return {
             statements.detector: statements
             for detector in assembly.detectors(others)

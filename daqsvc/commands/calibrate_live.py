@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daqsvc import assembly, assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
+from daqsvc.assembly_alignment import alignment
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
@@ -83,9 +84,11 @@ class _Listener:
         (detector,) = assembly.detectors(_only_rotor(machine, revolutions))
         assert isinstance(detector, RotorSynchronousDetector)  # noqa: S101 - the only one left
         self._detector = detector
-        stream = machine.streams[detector.stream]
-        capacity = max(round(_RING_S * stream.rate_hz), 4 * detector.block)
-        self._ring = SampleRing(detector.stream, stream.layout.channel_names, capacity)
+        assert machine.pipeline.rotor_synchronous is not None  # noqa: S101 - the command has asked for it
+        grid = machine.grid(machine.pipeline.rotor_synchronous)
+        capacity = max(round(_RING_S * grid.rate_hz), 4 * detector.block)
+        self._ring = SampleRing(grid.name, grid.channel_names, capacity)
+        self._alignment = alignment(machine, self._deliver)
         self._reason = ""
         self.drivers = assembly_drivers.drivers(machine, clock, self._deliver)
         self.pipeline = Pipeline({detector.stream: self._ring}, [detector], self._report, clock)
@@ -93,6 +96,7 @@ class _Listener:
     def _deliver(self, block: SampleBlock) -> None:
         if block.stream == self._detector.stream:
             self._ring.write(block)
+        self._alignment.accept(block)
 
     def _report(self, diagnosis: Diagnosis) -> None:
         self._reason = "" if diagnosis.quality == "good" else diagnosis.reason

@@ -56,7 +56,7 @@ def foresee_vector(
                 f"{' and '.join(lacking)}, or calibrate the machine and name the file as "
                 "pipeline.rotor_synchronous.calibration"
             )
-        rate_hz = machine.streams[machine.sensor(given.probes[0]).stream].rate_hz
+        rate_hz = machine.grid(given).rate_hz
         calibration = stated_calibration(
             rotor,
             speed_rpm=machine.machine.speed_rpm,

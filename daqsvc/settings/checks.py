@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarm_checks import alarm_checks
+from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.broker_url import is_tls
 from daqsvc.settings.buses import DbcLayout, PlainLayout
@@ -97,6 +98,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield _window(draft)
             yield _velocity_band(draft)
     yield from rotor_checks(draft)
+    yield from alignment_checks(draft)
     yield from bearing_checks(draft)
     yield from alarm_checks(draft)
     with suppress(UnusableValueError):

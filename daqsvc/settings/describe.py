@@ -159,6 +159,12 @@ def _sensor_details(sensor: Sensor) -> Iterator[str]:
 def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
     pipeline = machine.pipeline
     yield "ring", f"{pipeline.ring_s:g} s of every stream"
+    for grid in machine.grids:
+        reference, *others = grid.streams
+        assert pipeline.alignment is not None  # noqa: S101 - settings/rotor_checks.py
+        error_us, wait_ms = pipeline.alignment.max_error_us, pipeline.alignment.max_wait_ms
+        text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
+        yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
     if pipeline.levels is not None:
         vibration = [sensor.name for sensor in machine.sensors if not isinstance(sensor, Keyphasor)]
         text = f"RMS, peak and crest factor over {pipeline.levels.window_s:g} s of {', '.join(vibration)}"

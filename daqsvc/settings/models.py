@@ -18,6 +18,7 @@ from daqsvc.settings.alarms import (
     SetpointAlarm,
     VotingAlarm,
 )
+from daqsvc.settings.alignment import Grid
 from daqsvc.settings.bearing import BEARING, Bearing, WatchedBearing
 from daqsvc.settings.buses import (
     Bus,
@@ -239,6 +240,22 @@ class MachineFile(Section):
             if sensor.name == name:
                 return sensor
         raise KeyError(f"no sensor {name!r}; there are {', '.join(s.name for s in self.sensors)}")
+
+    def grid(self, detector: RotorBank | RotorSynchronous) -> Grid:
+        """Where a detector of the rotor finds its samples.
+
+        The keyphasor's stream is the reference if there is one: its edges are not to be interpolated.
+        """
+        names = sorted(detector.sensors, key=lambda name: name != detector.keyphasor)
+        streams = [self.sensor(name).stream for name in names]
+        return Grid({name: self.streams[name] for name in streams})
+
+    @property
+    def grids(self) -> tuple[Grid, ...]:
+        """The grids of several streams that the detectors need, each once."""
+        detectors = (self.pipeline.rotor_bank, self.pipeline.rotor_synchronous)
+        grids = [self.grid(detector) for detector in detectors if detector is not None]
+        return tuple({grid.name: grid for grid in grids if grid.aligned}.values())
 
     def column(self, sensor: Sensor) -> int:
         """Where a sensor stands among the channels of its stream."""

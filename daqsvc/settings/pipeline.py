@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.alignment import Alignment  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.bearing import Bearing  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.rotor import RotorSynchronous  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import DampingRatio, Name, NotNegative, Positive, Section
@@ -110,12 +111,20 @@ class RotorBank(Section):
         ),
     ]
 
+    @property
+    def sensors(self) -> tuple[Name, ...]:
+        """The sensors that it rests on."""
+        return (*self.probes, self.keyphasor)
+
 
 class Pipeline(Section):
     """The detectors, and how much of the past they can reach."""
 
     ring_s: Annotated[Positive, Field(le=3600)] = Field(
         default=30.0, description="length of each stream's ring"
+    )
+    alignment: Alignment | None = Field(
+        default=None, description="sensors of a rotor detector in several streams"
     )
     levels: Levels | None = Field(default=None, description="level detectors")
     rotor_bank: RotorBank | None = Field(default=None, description="the rotor's model bank")

@@ -114,7 +114,7 @@ def _named(draft: MachineFile) -> dict[str, Sensor]:
 def _sensors(
     draft: MachineFile, at: KeyPath, probes: tuple[str, str], keyphasor: str | None
 ) -> Iterator[Finding]:
-    """The probes and the keyphasor exist, are what they should be, and share a stream."""
+    """The probes and the keyphasor exist, are what they should be, and are or can be sampled together."""
     sensors = _named(draft)
     asked: list[tuple[KeyPath, str, str]] = [
         ((*at, "probes", 0), probes[0], "proximity"),
@@ -128,6 +128,8 @@ def _sensors(
         elif sensors[name].type != wanted:
             suitable = [sensor.name for sensor in draft.sensors if sensor.type == wanted]
             yield Finding(path, f'must be a sensor of type "{wanted}"', choice(name, suitable))
+    if draft.pipeline.alignment is not None:
+        return
     streams = {
         name: sensors[name].stream
         for _, name, _ in asked
@@ -140,7 +142,8 @@ def _sensors(
             yield Finding(
                 (*at, "probes", index),
                 f'is in stream "{streams[probe]}", but {other} "{its_name}" is in stream "{stream}"',
-                "take sensors of one stream: their samples must be taken at the same instants",
+                "take sensors of one stream, or write a table [pipeline.alignment]: it puts samples that are "
+                "not taken at the same instants on one grid",
             )
 
 
@@ -196,10 +199,12 @@ def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
 
 def _samples_per_rev(draft: MachineFile, synchronous: RotorSynchronous) -> Iterator[Finding]:
     """A revolution has enough samples for its harmonics."""
-    probe = _named(draft).get(synchronous.probes[0])
-    if probe is None or probe.stream not in draft.streams:
+    named = _named(draft)
+    sensors = [named[name] for name in synchronous.sensors if name in named]
+    rates_hz = [draft.streams[s.stream].rate_hz for s in sensors if s.stream in draft.streams]
+    if not rates_hz:
         return
-    rate_hz, speed_rpm = draft.streams[probe.stream].rate_hz, abs(draft.machine.speed_rpm)
+    rate_hz, speed_rpm = min(rates_hz), abs(draft.machine.speed_rpm)
     samples = 60.0 * rate_hz / speed_rpm
     if samples < _LEAST_SAMPLES_PER_REV:
         yield Finding(
