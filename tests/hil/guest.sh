@@ -17,10 +17,10 @@ rm -f "$out/exit-code" "$out/console"
 
 {   # What crosses into the guest: the folder, the variables that the tests read, the command.
     printf 'cd %q\n' "$PWD"
-    for name in PATH HIL_OUT OMP_NUM_THREADS NUMBA_CACHE_DIR ${!DAQSVC_@}; do
+    for name in PATH OMP_NUM_THREADS NUMBA_CACHE_DIR ${!DAQSVC_@}; do
         [ -n "${!name:-}" ] && printf 'export %s=%q\n' "$name" "${!name}"
     done
-    printf 'export HIL_OUT=%q\nexec' "$out"
+    printf 'export DAQSVC_HIL_GUEST=1 HIL_OUT=%q\nexec' "$out"
     printf ' %q' "$@"
     echo
 } >"$out/command"

@@ -16,7 +16,7 @@ command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ] || missing mosquit
 
 export PATH="$PWD/.venv/bin:$PATH:/usr/sbin" DAQSVC_HIL=1 DAQSVC_REQUIRE_MOSQUITTO=1 OMP_NUM_THREADS=1
 export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/kernels}
-suite=(python -m pytest -q -p no:cacheprovider "$@" tests/hil tests/conformance -k "hil or socketcan_vcan")
+suite=(python -m pytest -q -p no:cacheprovider tests/hil tests/conformance -k vcan "$@")
 
 has_vcan() { unshare --net ip link add dev probe type vcan 2>/dev/null; }
 if [ -z "${HIL_GUEST:-}" ] && { has_vcan || { modprobe -a can-raw vcan 2>/dev/null && has_vcan; }; }; then
