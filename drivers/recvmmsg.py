@@ -35,24 +35,16 @@ _AFTER_STAMP = 16 + 16
 _AFTER_HARDWARE_STAMP = _AFTER_STAMP + 16 + 48
 
 
-class _IoVec(ctypes.Structure):
-    _fields_ = (("base", ctypes.c_void_p), ("length", ctypes.c_size_t))
-
-
-class _MsgHdr(ctypes.Structure):
-    _fields_ = (
-        ("name", ctypes.c_void_p),
-        ("name_length", ctypes.c_uint32),
-        ("iov", ctypes.c_void_p),
-        ("iov_length", ctypes.c_size_t),
-        ("control", ctypes.c_void_p),
-        ("control_length", ctypes.c_size_t),
-        ("flags", ctypes.c_int),
-    )
-
-
-class _MMsgHdr(ctypes.Structure):
-    _fields_ = (("header", _MsgHdr), ("length", ctypes.c_uint32))
+# struct iovec, and struct mmsghdr with the struct msghdr that it begins with, on 64-bit Linux.
+_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
+_MMSGHDR = np.dtype(
+    {
+        "names": ["iov", "iov_length", "control", "control_length", "size"],
+        "formats": [np.uint64, np.uint64, np.uint64, np.uint64, np.uint32],
+        "offsets": [16, 24, 32, 40, 56],
+        "itemsize": 64,
+    }
+)
 
 
 class Stamps(NamedTuple):
@@ -82,23 +74,18 @@ class DatagramBuffer:
     def __init__(self, count: int, size: int) -> None:
         self.datagrams = np.zeros((count, size), np.uint8)
         self._control = np.zeros((count, _CONTROL_BYTES), np.uint8)
-        self._iovecs = (_IoVec * count)()
-        self._headers = (_MMsgHdr * count)()
-        data, control = self.datagrams.ctypes.data, self._control.ctypes.data
-        for i in range(count):
-            self._iovecs[i].base = data + i * size
-            self._iovecs[i].length = size
-            header = self._headers[i].header
-            header.iov = ctypes.addressof(self._iovecs[i])
-            header.iov_length = 1
-            header.control = control + i * _CONTROL_BYTES
-            header.control_length = _CONTROL_BYTES
-        memory = (ctypes.c_uint8 * ctypes.sizeof(self._headers)).from_buffer(self._headers)
-        raw: NDArray[np.uint8] = np.ctypeslib.as_array(memory).reshape(count, ctypes.sizeof(_MMsgHdr))
-        at = _MMsgHdr.length.offset
-        self._sizes: NDArray[np.uint32] = raw[:, at : at + 4].view(np.uint32)[:, 0]
-        at = _MMsgHdr.header.offset + _MsgHdr.control_length.offset
-        self._control_lengths: NDArray[np.uint64] = raw[:, at : at + 8].view(np.uint64)[:, 0]
+        rows = np.arange(count, dtype=np.uint64)
+        self._iovecs = np.zeros(count, _IOVEC)
+        self._iovecs["base"] = self.datagrams.ctypes.data + rows * np.uint64(size)
+        self._iovecs["length"] = size
+        self._headers = np.zeros(count, _MMSGHDR)
+        self._headers["iov"] = self._iovecs.ctypes.data + rows * np.uint64(_IOVEC.itemsize)
+        self._headers["iov_length"] = 1
+        self._headers["control"] = self._control.ctypes.data + rows * np.uint64(_CONTROL_BYTES)
+        self._headers["control_length"] = _CONTROL_BYTES
+        self._address = self._headers.ctypes.data
+        self._sizes: NDArray[np.uint32] = self._headers["size"]
+        self._control_lengths: NDArray[np.uint64] = self._headers["control_length"]
         self._count = count
         self._used = 0
         self._recvmmsg = _recvmmsg()
@@ -123,9 +110,7 @@ class DatagramBuffer:
         self._control_lengths[: self._used] = _CONTROL_BYTES  # the kernel overwrites what it used
         self._used = 0
         while True:
-            taken: int = self._recvmmsg(
-                descriptor, ctypes.addressof(self._headers), self._count, _MSG_DONTWAIT, None
-            )
+            taken: int = self._recvmmsg(descriptor, self._address, self._count, _MSG_DONTWAIT, None)
             if taken >= 0:
                 self._used = taken
                 return taken
