@@ -226,6 +226,7 @@ class ModbusClient:
             opened = await self._client.connect()
         except (ModbusException, OSError, ValueError) as error:
             opened, why = False, f"{error}"
+        _heed_cancellation()
         if not opened:
             self._counters.open_failures += 1
             raise LineLostError(f"{self._options.where} cannot be opened: {why}")
@@ -282,9 +283,11 @@ class ModbusClient:
         try:
             await transactions.execute(False, request)
         except ModbusException as error:
+            _heed_cancellation()
             self._explain(expected, error)
         finally:
             transactions.expect(None)
+        _heed_cancellation()
         pdu = transactions.accepted
         self._counters.replies += 1
         if pdu[0] != expected.function:
@@ -403,3 +406,13 @@ class _Transactions(TransactionManager):
     def _fail(self, why: str) -> None:
         if self._waits:
             self.response_future.set_exception(ModbusException(why))
+
+
+def _heed_cancellation() -> None:
+    """Raise the cancellation that `asyncio.wait_for` has swallowed, as it does when a result comes with it.
+
+    Python 3.12 does not any more.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError

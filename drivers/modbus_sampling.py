@@ -312,6 +312,7 @@ class WaveformReader(_Reader[Waveform]):
         self._deliver: Callable[[SampleBlock], None] = port.deliver
         self._last_id: int | None = None
         self._end: tuple[int, int] | None = None
+        self._lost_since = 0
         self._restarts = 0
         self._triggered_ns: int | None = None
 
@@ -342,7 +343,7 @@ class WaveformReader(_Reader[Waveform]):
         if await self._id(line) != block_id:
             self._counters.blocks_torn += 1
             self._lose_until(block_id)
-            self._stream_counters.samples_lost += self._layout.samples
+            self._lose(1)
             return
         self._lose_until(block_id)
         self._triggered_ns = None
@@ -376,7 +377,11 @@ class WaveformReader(_Reader[Waveform]):
             self._restarts += 1
             return
         self._counters.blocks_missed += missed
-        self._stream_counters.samples_lost += missed * self._layout.samples
+        self._lose(missed)
+
+    def _lose(self, blocks: int) -> None:
+        self._lost_since += blocks * self._layout.samples
+        self._stream_counters.samples_lost += blocks * self._layout.samples
 
     def _hand_on(self, rows: bytes, seen_ns: int) -> None:
         raw = np.frombuffer(rows, np.uint8).reshape(self._layout.samples, -1)
@@ -386,8 +391,9 @@ class WaveformReader(_Reader[Waveform]):
         quality = Quality.TIME_UNSETTLED
         if self._end is not None:
             end_index, end_ns = self._end
-            missing = max(round((seen_ns - span_ns - end_ns) / self._period_ns), 0)
+            missing = max(round((seen_ns - span_ns - end_ns) / self._period_ns), self._lost_since)
             first = end_index + missing
+        self._lost_since = 0
         if missing:
             quality |= Quality.AFTER_LOSS | Quality.LOSS_ESTIMATED
             self._stream_counters.gaps += 1

@@ -1,0 +1,238 @@
+"""A unit on a Modbus line: its registers, and samples that it hands out as a layout says."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from drivers.modbus_layouts import Fifo, Ring, Trend, Waveform
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from drivers.modbus_layouts import ModbusLayout, Table
+    from drivers.registers import RegisterRecord
+
+ADDRESSES = 65_536
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
+_TABLES: dict[int, Table] = {3: "holding", 4: "input"}
+_MAX_READ, _MAX_WRITE = 125, 123
+_LAST_ID = 65_535
+
+
+class ModbusUnit:
+    """Registers behind one unit address; all of them exist and are 0 at first."""
+
+    def __init__(self) -> None:
+        self._registers: dict[Table, NDArray[np.uint8]] = {
+            name: np.zeros(2 * ADDRESSES, np.uint8) for name in _TABLES.values()
+        }
+        self._queues: dict[int, Callable[[], bytes]] = {}
+        self._watchers: dict[int, Callable[[int], None]] = {}
+
+    def put(self, table: Table, address: int, raw: bytes | NDArray[np.uint8]) -> None:
+        """Set registers, high byte of each first."""
+        data = np.frombuffer(bytes(raw), np.uint8)
+        self._registers[table][2 * address : 2 * address + len(data)] = data
+
+    def get(self, table: Table, address: int, count: int) -> bytes:
+        """Registers, high byte of each first."""
+        return self._registers[table][2 * address : 2 * (address + count)].tobytes()
+
+    def add_queue(self, address: int, read: Callable[[], bytes]) -> None:
+        """Let function 24 at ``address`` return what ``read`` returns: at most 31 registers."""
+        self._queues[address] = read
+
+    def watch(self, address: int, told: Callable[[int], None]) -> None:
+        """Call ``told`` with the value whenever a holding register is written by request."""
+        self._watchers[address] = told
+
+    def answer(self, pdu: bytes) -> bytes:
+        """The PDU of the reply to the PDU of a request."""
+        function, address, data = pdu[0], int.from_bytes(pdu[1:3], "big"), pdu[3:]
+        if function in _TABLES:
+            reply = self._read(_TABLES[function], address, int.from_bytes(data, "big"))
+        elif function == 24:
+            reply = self._read_queue(address)
+        elif function == 16:
+            reply = self._write(address, data)
+        else:
+            reply = ILLEGAL_FUNCTION
+        return bytes([function | 0x80, reply]) if isinstance(reply, int) else bytes([function]) + reply
+
+    def _read(self, table: Table, address: int, count: int) -> bytes | int:
+        """What follows the function in a reply, or the code of an exception; so the next ones."""
+        if not 1 <= count <= _MAX_READ:
+            return ILLEGAL_VALUE
+        if address + count > ADDRESSES:
+            return ILLEGAL_ADDRESS
+        return bytes([2 * count]) + self.get(table, address, count)
+
+    def _read_queue(self, address: int) -> bytes | int:
+        if address not in self._queues:
+            return ILLEGAL_ADDRESS
+        raw = self._queues[address]()
+        return (2 + len(raw)).to_bytes(2, "big") + (len(raw) // 2).to_bytes(2, "big") + raw
+
+    def _write(self, address: int, data: bytes) -> bytes | int:
+        count, raw = int.from_bytes(data[:2], "big"), data[3:]
+        if not 1 <= count <= _MAX_WRITE or data[2] != 2 * count or len(raw) != 2 * count:
+            return ILLEGAL_VALUE
+        self.put("holding", address, raw)
+        for k in range(count):
+            if (told := self._watchers.get(address + k)) is not None:
+                told(int.from_bytes(raw[2 * k : 2 * k + 2], "big"))
+        return address.to_bytes(2, "big") + data[:2]
+
+
+class SampleStore(Protocol):
+    """How a unit keeps its samples until they are read."""
+
+    def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
+        """Take samples: the device's count of the first, and uint8 ``[n, 2 * registers]``."""
+        ...
+
+
+class TrendStore:
+    """Registers that show the newest sample."""
+
+    def __init__(self, unit: ModbusUnit, layout: Trend) -> None:
+        self._unit, self._layout = unit, layout
+
+    def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
+        """See `SampleStore.put`."""
+        del first_index
+        at = 0
+        for run in self._layout.record.runs:
+            self._unit.put(self._layout.table, run.address, rows[-1, at : at + 2 * run.count])
+            at += 2 * run.count
+
+
+class RingStore:
+    """A ring and its write counter; each sample is written before it is counted."""
+
+    def __init__(self, unit: ModbusUnit, layout: Ring) -> None:
+        self._unit, self._layout = unit, layout
+
+    def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
+        """See `SampleStore.put`."""
+        layout = self._layout
+        for k, row in enumerate(rows):
+            place = (first_index + k) % layout.depth
+            self._unit.put(layout.table, layout.address + place * layout.record.registers, row)
+            self._unit.put(layout.table, layout.count.address, layout.count.encode(first_index + k + 1))
+
+
+class FifoStore:
+    """A queue of bounded length, from which the oldest samples are lost when nobody reads them.
+
+    Args:
+        unit: where it is read.
+        layout: of the queue.
+        depth: samples that it holds.
+    """
+
+    def __init__(self, unit: ModbusUnit, layout: Fifo, depth: int = 1024) -> None:
+        self._layout = layout
+        self._queue: deque[tuple[int, bytes]] = deque(maxlen=depth)
+        self._told: dict[int, int] = {}
+        unit.add_queue(layout.address, self._read)
+        if layout.acknowledge is not None:
+            for k in range(layout.count.run.count):
+                unit.watch(layout.acknowledge + k, lambda value, k=k: self._acknowledge(k, value))  # type: ignore[misc]
+
+    def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
+        """See `SampleStore.put`."""
+        self._queue.extend((first_index + k, row.tobytes()) for k, row in enumerate(rows))
+
+    def _read(self) -> bytes:
+        oldest = [self._queue[k] for k in range(min(len(self._queue), self._layout.samples_per_read))]
+        if not oldest:
+            return b""
+        # One count stands for all: samples behind a gap must wait for the next reply.
+        first = oldest[0][0]
+        together = [row for k, (index, row) in enumerate(oldest) if index == first + k]
+        if self._layout.acknowledge is None:
+            for _ in together:
+                self._queue.popleft()
+        return self._layout.count.encode(first) + b"".join(together)
+
+    def _acknowledge(self, word: int, value: int) -> None:
+        self._told[word] = value
+        if len(self._told) < self._layout.count.run.count:
+            return
+        raw = b"".join(self._told[k].to_bytes(2, "big") for k in sorted(self._told))
+        self._told.clear()
+        following = self._layout.count.decode(raw)
+        modulus = self._layout.count.modulus
+        while self._queue and (following - self._queue[0][0] - 1) % modulus < modulus // 2:
+            self._queue.popleft()
+
+
+class WaveformStore:
+    """The last whole block, with an id that changes when the block does.
+
+    Without a trigger every block is shown as soon as it is full; with one, a block is begun when the
+    trigger is written.
+    """
+
+    def __init__(self, unit: ModbusUnit, layout: Waveform) -> None:
+        self._unit, self._layout = unit, layout
+        self._taking = layout.trigger is None
+        self._rows: list[NDArray[np.uint8]] = []
+        self._block = b""
+        self._id = 0
+        self.block_starts: dict[int, int] = {}
+        if layout.trigger is not None:
+            unit.watch(layout.trigger.address, lambda _value: self._begin())
+        if layout.page is not None:
+            unit.watch(layout.page.select, self._show)
+
+    def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
+        """See `SampleStore.put`."""
+        for k, row in enumerate(rows):
+            if not self._taking:
+                continue
+            self._rows.append(row)
+            if len(self._rows) == self._layout.samples:
+                self._finish(first_index + k + 1 - self._layout.samples)
+
+    def _begin(self) -> None:
+        if not self._taking:
+            self._taking = True
+            self._rows = []
+
+    def _finish(self, first_index: int) -> None:
+        self._block = np.stack(self._rows).tobytes()
+        self._rows = []
+        self._taking = self._layout.trigger is None
+        self._id = self._id % _LAST_ID + 1
+        self.block_starts[self._id] = first_index
+        self._unit.put(self._layout.table, self._layout.block_id, self._id.to_bytes(2, "big"))
+        self._show(0)
+
+    def _show(self, page: int) -> None:
+        if self._layout.page is None:
+            window = self._block
+        else:
+            size = 2 * self._layout.page.registers
+            window = self._block[page * size : (page + 1) * size]
+        self._unit.put(self._layout.table, self._layout.address, window)
+
+
+def store_for(unit: ModbusUnit, layout: ModbusLayout) -> SampleStore:
+    """A store of samples in a unit, as a layout says."""
+    if isinstance(layout, Trend):
+        return TrendStore(unit, layout)
+    if isinstance(layout, Fifo):
+        return FifoStore(unit, layout)
+    return RingStore(unit, layout) if isinstance(layout, Ring) else WaveformStore(unit, layout)
+
+
+def encode(record: RegisterRecord, samples: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Registers of samples ``[n, channels]``, saturated as an analogue input does."""
+    return record.encode(samples, clip=True)
