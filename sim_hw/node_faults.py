@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -147,6 +147,11 @@ class NodeFaults:
     def of_link(cls, link: LinkFaults) -> NodeFaults:
         """Only a link's faults, all the time."""
         return cls(link=[(EVER, link)], seed=link.seed)
+
+    @property
+    def without_babble(self) -> NodeFaults:
+        """The same, but for the babbling node: for the second and any other node on a bus."""
+        return replace(self, babble=())
 
     def plan(
         self, samples: int, rate_hz: float, *, samples_per_frame: int, length: int, first_index: int = 0

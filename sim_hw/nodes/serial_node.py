@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.clock import NS_PER_S
-from sim_hw.link_faults import Fault, FaultCounts
+from sim_hw.link_faults import Fault
+from sim_hw.node_faults import NodeFaults
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from drivers.frames import FrameLayout
     from drivers.serial_framing import Framing
     from drivers.serial_lines import LineLayout
-    from sim_hw.link_faults import LinkFaults
+    from sim_hw.link_faults import FaultCounts, LinkFaults
+    from sim_hw.node_faults_plan import NodePlan
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
@@ -29,7 +30,7 @@ DELIMITER_BYTES = 2
 class SerialNode:
     """Sends samples over a serial cable, each frame at the time its last sample is taken.
 
-    All frames are made, and all faults of the link planned, when the node is: playing only sends. While the
+    All frames are made, and all faults planned, when the node is: playing only sends. While the
     cable is out, or nobody has the port open, what is sent is gone.
 
     Args:
@@ -40,7 +41,8 @@ class SerialNode:
         samples: ``[n, channels]`` in the layout's physical units, in the order of its channels; those left
             over at the end that do not fill a frame are not sent.
         rate_hz: samples per second.
-        faults: what the link does to the frames; nothing unless given.
+        faults: what goes wrong with the device, or with its link alone; nothing unless given. Nobody else
+            is on the cable: there is no babble.
         first_index: the device's sample count at ``samples[0]``.
         clip: saturate values that do not fit the layout, as an analogue input does, instead of raising.
         give_up_s: real seconds for which an open port may take no byte before that is an error.
@@ -58,7 +60,7 @@ class SerialNode:
         samples: NDArray[np.float64] | NDArray[np.float32],
         rate_hz: float,
         *,
-        faults: LinkFaults | None = None,
+        faults: NodeFaults | LinkFaults | None = None,
         first_index: int = 0,
         clip: bool = False,
         give_up_s: float = 10.0,
@@ -72,22 +74,31 @@ class SerialNode:
                 f"samples are {list(samples.shape)}; a frame of stream {stream!r} takes {self._per_frame} of "
                 f"{', '.join(layout.channels)}"
             )
-        start = np.arange(n, dtype=np.int64) * self._per_frame
-        whole = samples[: n * self._per_frame].reshape(n, self._per_frame, -1)
-        frames = framing.encode(stream, first_index + start, whole, clip=clip)
-        t_ns = np.rint((start + self._per_frame - 1) * (NS_PER_S / rate_hz)).astype(np.int64)
-        if faults is None:
-            self._t_ns, self._frames = t_ns, frames
-            self._faults = np.zeros(n, np.uint8)
-        else:
-            plan = faults.plan(t_ns, min(map(len, frames)) - DELIMITER_BYTES)
-            self._t_ns, self._faults = plan.t_ns, plan.fault
-            self._frames = [
-                _flipped(frames[frame], flips) if fault == Fault.CORRUPTED else frames[frame]
-                for frame, fault, flips in zip(
-                    plan.frame.tolist(), plan.fault.tolist(), plan.flips, strict=True
-                )
-            ]
+        if not isinstance(faults, NodeFaults):
+            faults = NodeFaults() if faults is None else NodeFaults.of_link(faults)
+
+        def planned(length: int) -> NodePlan:
+            return faults.without_babble.plan(
+                len(samples),
+                rate_hz,
+                samples_per_frame=self._per_frame,
+                length=length,
+                first_index=first_index,
+            )
+
+        # First which frames there are; bits are then flipped in what all of them have.
+        schedule = planned(1).schedule
+        if not len(schedule.sample):
+            raise ValueError(f"the faults of stream {stream!r} leave no frame of it; end a brown-out earlier")
+        rows = schedule.sample[:, None] + np.arange(self._per_frame)
+        frames = framing.encode(stream, schedule.count, samples[rows], clip=clip)
+        self._plan = planned(min(map(len, frames)) - DELIMITER_BYTES)
+        self._frames = [
+            _flipped(frames[frame], flips) if fault == Fault.CORRUPTED else frames[frame]
+            for frame, fault, flips in zip(
+                self._plan.frame.tolist(), self._plan.fault.tolist(), self._plan.flips, strict=True
+            )
+        ]
         self._played = 0
         self._retries = 0
         self._unheard = 0
@@ -95,7 +106,7 @@ class SerialNode:
     @property
     def injected(self) -> FaultCounts:
         """Frames played so far, and the faults that were really done to them."""
-        return FaultCounts.of(self._faults[: self._played])
+        return self._plan.injected(self._played)
 
     @property
     def samples_sent(self) -> int:
@@ -115,7 +126,7 @@ class SerialNode:
     @property
     def duration_ns(self) -> int:
         """Simulated time from the first sample to the last frame."""
-        return int(self._t_ns[-1])
+        return int(self._plan.t_ns[-1])
 
     async def play(self, pacer: Pacer) -> None:
         """Send everything, as the pacer lets time pass.
@@ -123,9 +134,10 @@ class SerialNode:
         Raises:
             TimeoutError: the port is open and has taken no byte for ``give_up_s``.
         """
-        for k, (t_ns, fault) in enumerate(zip(self._t_ns.tolist(), self._faults.tolist(), strict=True)):
+        plan = zip(self._plan.t_ns.tolist(), self._plan.sends.tolist(), strict=True)
+        for k, (t_ns, sends) in enumerate(plan):
             await pacer.wait_until(t_ns)
-            if fault != Fault.DROPPED:
+            if sends:
                 await self._send(self._frames[k])
             self._played = k + 1
         # A pseudo-terminal does not tell when it has room again.

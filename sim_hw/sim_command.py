@@ -1,0 +1,288 @@
+"""``daqsvc sim``: simulated devices on real or virtual buses, for whatever client is pointed at them."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import signal
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.recording.channels import channel_map, sampling_rate_hz
+from sim_hw.demo import arguments as arguments_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from daqsvc.settings import MachineFile
+    from sim_hw.node_faults import NodeFaults
+    from sim_hw.nodes.pacing import Pacer
+    from sim_hw.sim_command_nodes import SimNode
+    from sim_hw.sim_command_signals import Signals
+
+EXIT_FAILED = 1
+EXIT_BAD_FILE = 2
+SCENARIO = "paper"
+DEFAULT_BUS = "daqsvc-can0"
+"""Name of the virtual bus below the folder for temporary files, where none is given."""
+
+
+class SimCommand:
+    """The verb ``sim`` (entry-point group ``daqsvc.commands``)."""
+
+    help = "put simulated devices on a bus, for the service or any other client"
+    description = (
+        "Put the devices of a machine file on their buses and play a scenario or a measured recording: CAN "
+        "frames over a virtual bus between processes or SocketCAN, a Modbus server, a serial port behind a "
+        "pseudo-terminal. At the end, or when stopped, print as JSON what was sent and what was done to it."
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        self._parser = parser
+        parser.add_argument(
+            "what",
+            nargs="?",
+            metavar="FILE|SCENARIO",
+            help="a machine file, the same as for daqsvc run; or a scenario, played by the rig of the demo",
+        )
+        play = parser.add_argument_group("what to play")
+        play.add_argument(
+            "--scenario", metavar="NAME|FILE", help=f"scenario for a machine file (default: {SCENARIO})"
+        )
+        play.add_argument("--seed", type=arguments_of.whole, metavar="N", help="of everything random")
+        play.add_argument("--snr-db", type=arguments_of.decibels, metavar="DB", help="of the sensors")
+        play.add_argument(
+            "--recording", type=Path, metavar="FILE", help="play a measured recording instead of a plant"
+        )
+        play.add_argument(
+            "--map",
+            type=channel_map,
+            metavar="SENSOR=VARIABLE,...",
+            help="which variable of the recording is which sensor",
+        )
+        play.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
+        play.add_argument(
+            "--duration", type=arguments_of.positive, metavar="S", help="seconds to play, instead of all"
+        )
+        play.add_argument(
+            "--stream", action="append", metavar="NAME", help="play only this stream (may be repeated)"
+        )
+        where = parser.add_argument_group("where to play it")
+        where.add_argument(
+            "--bus",
+            type=Path,
+            metavar="PATH",
+            help="virtual CAN bus instead of the machine file's interface; alone: run that bus for others",
+        )
+        where.add_argument(
+            "--link", type=Path, metavar="PATH", help="link to the pseudo-terminal of a serial port"
+        )
+        where.add_argument("--port", type=_port, metavar="N", help="TCP port of a Modbus server")
+        where.add_argument(
+            "--speed",
+            type=arguments_of.positive,
+            default=1.0,
+            metavar="N",
+            help="N times as fast as real time (default: 1); daqsvc run knows the sampling rate, and needs 1",
+        )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        if wrong := _misuse(arguments):
+            self._parser.error(wrong)
+        from daqsvc.cli import start_logging  # noqa: PLC0415
+
+        start_logging(verbose=False)
+        if arguments.what is None:
+            from sim_hw.bus_socket import run_hub  # noqa: PLC0415
+
+            return run_hub(str(arguments.bus))
+        from daqsvc.assembly_drivers import AssemblyError  # noqa: PLC0415
+        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
+        from daqsvc.settings import MachineFileError  # noqa: PLC0415
+        from sim_hw.scenario import ScenarioError  # noqa: PLC0415
+        from sim_hw.sim_command_nodes import NodeError  # noqa: PLC0415
+        from sim_hw.sim_command_signals import SignalError  # noqa: PLC0415
+
+        try:
+            return asyncio.run(_simulate(arguments))
+        except MachineFileError as error:
+            _say(str(error))
+            return EXIT_BAD_FILE
+        except (AssemblyError, NodeError, RecordingError, ScenarioError, SignalError, TimeoutError) as error:
+            _say(str(error))
+            return EXIT_FAILED
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the console script ``daqsvc-sim``; returns the exit code."""
+    command = SimCommand()
+    parser = argparse.ArgumentParser(prog="daqsvc-sim", description=command.description)
+    command.add_arguments(parser)
+    return command.run(parser.parse_args(arguments))
+
+
+def _misuse(arguments: argparse.Namespace) -> str | None:
+    """What is wrong with arguments that are valid each for itself; None if nothing is."""
+    if arguments.what is None:
+        if arguments.bus is None:
+            return "name a machine file or a scenario to play, or a bus to run (--bus PATH)"
+        return None
+    if arguments.recording is None:
+        for name in ("map", "fs"):
+            if getattr(arguments, name) is not None:
+                return f"--{name} goes with a recording; give that with --recording, or leave --{name} out"
+    else:
+        for name in ("seed", "snr_db"):
+            if getattr(arguments, name) is not None:
+                option = name.replace("_", "-")
+                return f"--{option} goes with a plant, and --recording plays none; leave one of the two out"
+    return None
+
+
+async def _simulate(arguments: argparse.Namespace) -> int:
+    from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
+    from sim_hw.nodes.pacing import RealTimePacer  # noqa: PLC0415
+    from sim_hw.sim_command_nodes import NodeOrder, node_for  # noqa: PLC0415
+    from sim_hw.sim_command_signals import SignalError, stream_samples  # noqa: PLC0415
+
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    machine, signals, faults, unixbus = await asyncio.to_thread(_script, arguments)
+    streams = arguments.stream or list(machine.streams)
+    if unknown := [name for name in streams if name not in machine.streams]:
+        raise SignalError(
+            f"{machine.path} has no stream {unknown[0]!r}; there are {', '.join(machine.streams)}"
+        )
+    samples = await asyncio.to_thread(lambda: [stream_samples(machine, name, signals) for name in streams])
+    nodes: dict[str, SimNode] = {}
+    async with contextlib.AsyncExitStack() as stack:
+        for bus in machine.buses:
+            wanted = [played for played in samples if machine.streams[played.stream].bus == bus]
+            if not wanted:
+                continue
+            order = NodeOrder(machine, bus, wanted, faults, unixbus, arguments.link, arguments.port)
+            nodes[bus] = await node_for(order)
+            stack.push_async_callback(nodes[bus].close)
+            _say(f"playing {', '.join(s.stream for s in wanted)} on {nodes[bus].address}")
+        pacer = _Faster(RealTimePacer(SystemClock()), arguments.speed)
+        complete = await _until_played(list(nodes.values()), pacer, stop)
+        summary: dict[str, Any] = {"complete": complete, "buses": {}, "streams": {}}
+        for bus, node in nodes.items():
+            summary["buses"][bus] = node.address
+            summary["streams"] |= node.figures()
+    print(json.dumps(summary), flush=True)  # noqa: T201 - this is the output
+    return 0
+
+
+async def _until_played(nodes: Sequence[SimNode], pacer: Pacer, stop: asyncio.Event) -> bool:
+    """Play all nodes to their end, or until told to stop; whether it came to the end.
+
+    Raises:
+        TimeoutError: a bus has taken nothing for too long.
+    """
+
+    async def play() -> None:
+        async with asyncio.TaskGroup() as group:
+            for node in nodes:
+                group.create_task(node.play(pacer))
+
+    playing = asyncio.create_task(play())
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait({playing, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if not playing.done():
+            return False
+        if isinstance(error := playing.exception(), BaseExceptionGroup):
+            raise _first(error)
+        playing.result()
+        return True
+    finally:
+        for task in (playing, stopping):
+            task.cancel()
+        await asyncio.wait({playing, stopping})
+
+
+class _Faster:
+    """A pacer whose simulated time passes ``speed`` times as fast as that of another."""
+
+    def __init__(self, pacer: Pacer, speed: float) -> None:
+        self._pacer, self._speed = pacer, speed
+
+    async def wait_until(self, t_ns: int) -> None:
+        await self._pacer.wait_until(round(t_ns / self._speed))
+
+
+def _script(
+    arguments: argparse.Namespace,
+) -> tuple[MachineFile, Signals, NodeFaults | None, Path | None]:
+    """The machine, what its sensors see, what goes wrong, and the virtual bus if there is one."""
+    from daqsvc.settings import load_machine_file  # noqa: PLC0415
+    from sim_hw.scenario import Scenario, load_any_scenario  # noqa: PLC0415
+    from sim_hw.sim_command_signals import (  # noqa: PLC0415
+        BearingSignals,
+        RecordedSignals,
+        RotorSignals,
+        SignalError,
+    )
+
+    given = Path(arguments.what)
+    is_machine = given.is_file() and not _is_scenario(given)
+    scenario = None
+    if not is_machine or arguments.scenario is not None or arguments.recording is None:
+        scenario = load_any_scenario(arguments.scenario or SCENARIO if is_machine else arguments.what)
+    unixbus: Path | None = arguments.bus
+    if is_machine:
+        machine = load_machine_file(given)
+    elif isinstance(scenario, Scenario):
+        from sim_hw.demo.machines import laval_rig  # noqa: PLC0415
+
+        machine = laval_rig(scenario, 1.0, "mqtt://127.0.0.1")
+        unixbus = unixbus or Path(tempfile.gettempdir()) / DEFAULT_BUS
+    else:
+        raise SignalError(
+            f"a bearing needs sensors: name a machine file too, daqsvc sim FILE --scenario {given}"
+        )
+    faults = None if scenario is None else scenario.node_faults(arguments.seed)
+    signals: Signals
+    if arguments.recording is not None:
+        from daqsvc.recording.recording import load_recording  # noqa: PLC0415
+
+        recording = load_recording(arguments.recording, arguments.map, arguments.fs)
+        signals = RecordedSignals(recording, arguments.duration)
+    elif isinstance(scenario, Scenario):
+        signals = RotorSignals(scenario, arguments.duration, arguments.seed, arguments.snr_db)
+    else:
+        assert scenario is not None  # noqa: S101 - without a recording one was loaded
+        signals = BearingSignals(scenario, arguments.duration, arguments.seed, arguments.snr_db)
+    return machine, signals, faults, unixbus
+
+
+def _is_scenario(path: Path) -> bool:
+    try:
+        return "plant" in tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return False  # the reader of machine files says what is wrong with it
+
+
+def _port(text: str) -> int:
+    port = arguments_of.whole(text)
+    if not 0 < port < 2**16:
+        raise argparse.ArgumentTypeError(f"{text} is not a TCP port; give one from 1 to 65535")
+    return port
+
+
+def _first(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    first = group.exceptions[0]
+    return _first(first) if isinstance(first, BaseExceptionGroup) else first
+
+
+def _say(message: str) -> None:
+    print(f"daqsvc sim: {message}", file=sys.stderr, flush=True)  # noqa: T201 - stdout is for the summary

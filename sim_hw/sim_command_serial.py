@@ -1,0 +1,89 @@
+"""Serial devices behind pseudo-terminals, for ``daqsvc sim``."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc import assembly_drivers
+from drivers.base import StreamSpec
+from drivers.serial_port import framing_of
+from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import SerialNode
+from sim_hw.sim_command_nodes import NodeError
+
+if TYPE_CHECKING:
+    from sim_hw.nodes.pacing import Pacer
+    from sim_hw.sim_command_nodes import NodeOrder
+
+
+class SerialNodes:
+    """All streams of a serial port, each a device of its own on the same cable."""
+
+    def __init__(self, cable: PseudoTerminal, nodes: dict[str, SerialNode]) -> None:
+        self.address = str(cable.path)
+        self._cable = cable
+        self._nodes = nodes
+
+    @classmethod
+    async def open(cls, order: NodeOrder) -> SerialNodes:
+        """See `sim_hw.sim_command_nodes.node_for`."""
+        options = order.options
+        path = order.link or Path(options["port"])
+        specs: list[StreamSpec[Any]] = [
+            StreamSpec(s.stream, assembly_drivers.stream_layout(order.machine, s.stream), s.rate_hz)
+            for s in order.streams
+        ]
+        if path.exists() and not path.is_symlink():
+            raise NodeError(f"{path} is a real port; put the simulated one elsewhere with --link PATH")
+        try:
+            cable = PseudoTerminal(path)
+        except OSError as error:
+            raise NodeError(
+                f"no link to a pseudo-terminal can be made at {path}: {error.strerror}; name a place that "
+                "can be written with --link PATH, and as port in the machine file"
+            ) from error
+        nodes: dict[str, SerialNode] = {}
+        try:
+            for spec, played in zip(specs, order.streams, strict=True):
+                nodes[spec.name] = SerialNode(
+                    cable,
+                    framing_of(options, specs),
+                    spec.name,
+                    spec.layout,
+                    played.samples,
+                    played.rate_hz,
+                    faults=order.faults,
+                    clip=True,
+                )
+        except BaseException as error:
+            cable.unplug()
+            if isinstance(error, ValueError):
+                raise NodeError(f"no device at {path}: {error}") from error
+            raise
+        return cls(cable, nodes)
+
+    async def play(self, pacer: Pacer) -> None:
+        """See `sim_hw.sim_command_nodes.SimNode.play`."""
+        async with asyncio.TaskGroup() as group:
+            for node in self._nodes.values():
+                group.create_task(node.play(pacer))
+
+    def figures(self) -> dict[str, dict[str, Any]]:
+        """See `sim_hw.sim_command_nodes.SimNode.figures`."""
+        return {
+            name: {
+                "samples_sent": node.samples_sent,
+                "frames_sent": node.injected.sent - node.frames_unheard,
+                "frames_unsent": node.frames_unheard,
+                "send_retries": node.send_retries,
+                "injected": asdict(node.injected),
+            }
+            for name, node in self._nodes.items()
+        }
+
+    async def close(self) -> None:
+        """See `sim_hw.sim_command_nodes.SimNode.close`."""
+        self._cable.unplug()

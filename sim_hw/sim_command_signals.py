@@ -1,0 +1,217 @@
+"""What the sensors of a machine file see of a simulated plant, or of a measured recording."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from sim_hw.scenario import Scenario
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from daqsvc.recording.recording import Recording
+    from daqsvc.settings import MachineFile
+    from daqsvc.settings.sensors import BaseSensor
+    from sim_hw.scenario_bearing import BearingScenario, Run
+
+G_M_S2 = 9.80665
+_PER_UM = {"um": 1.0, "mm": 1e-3, "mil": 1.0 / 25.4}
+_PER_M_S2 = {"m/s2": 1.0, "g": 1.0 / G_M_S2}
+
+
+class SignalError(ValueError):
+    """What is to be played has nothing for a sensor; says which, and what there is."""
+
+
+class Signals(Protocol):
+    """A source of samples for any sensor that it knows."""
+
+    def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
+        """What a sensor says: float64 ``[n]`` in the sensor's unit.
+
+        Raises:
+            SignalError: there is nothing for this sensor.
+        """
+        ...
+
+
+class RotorSignals:
+    """Proximity probes and keyphasor of a rotor; probes without an angle point to +x, then to +y.
+
+    Args:
+        scenario: what happens to the rotor.
+        duration_s: length of the run, instead of the scenario's.
+        seed: instead of the scenario's.
+        snr_db: instead of the scenario's.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        duration_s: float | None = None,
+        seed: int | None = None,
+        snr_db: float | None = None,
+    ) -> None:
+        self._scenario = scenario
+        self._revolutions = (
+            scenario.revolutions if duration_s is None else duration_s * scenario.plant.speed_rpm / 60.0
+        )
+        self._seed, self._snr_db = seed, snr_db
+        self._runs: dict[float, dict[str, NDArray[np.float64]]] = {}
+        self._angles_deg: dict[str, float] = {}
+
+    def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
+        """See `Signals.of`."""
+        kind = getattr(sensor, "type", "")
+        channels = self._run(rate_hz)
+        if kind == "keyphasor":
+            return channels["keyphasor_v"]
+        if kind != "proximity":
+            raise SignalError(
+                f"sensor {sensor.name!r} is of type {kind!r}, and a rotor scenario gives proximity probes "
+                "and keyphasors; choose the streams that hold those with --stream"
+            )
+        stated = getattr(sensor, "angle_deg", None)
+        angle_deg = self._angles_deg.setdefault(
+            sensor.name, 90.0 * (len(self._angles_deg) % 2) if stated is None else stated
+        )
+        angle = math.radians(angle_deg)
+        displacement_um = math.cos(angle) * channels["x_um"] + math.sin(angle) * channels["y_um"]
+        return displacement_um * _PER_UM[getattr(sensor, "unit", "um")]
+
+    def _run(self, rate_hz: float) -> dict[str, NDArray[np.float64]]:
+        if rate_hz not in self._runs:
+            speed_hz = self._scenario.plant.speed_rpm / 60.0
+            onsets = tuple(
+                onset
+                for onset in self._scenario.onset
+                if onset.at_rev + self._scenario.dither_rev < self._revolutions
+            )
+            run = Scenario.model_validate(
+                {
+                    **self._scenario.model_dump(),
+                    "samples_per_rev": rate_hz / speed_hz,
+                    "revolutions": self._revolutions,
+                    "onset": [onset.model_dump() for onset in onsets],
+                }
+            )
+            self._runs[rate_hz] = run.simulate(self._seed, self._snr_db).channels
+        return self._runs[rate_hz]
+
+
+class BearingSignals:
+    """Accelerometers of a machine with a bearing: the first one on the rotor's side, others on the housing.
+
+    Args:
+        scenario: what happens to the bearing.
+        duration_s: length of the run, instead of the scenario's.
+        seed: instead of the scenario's.
+        snr_db: instead of the plant's.
+    """
+
+    def __init__(
+        self,
+        scenario: BearingScenario,
+        duration_s: float | None = None,
+        seed: int | None = None,
+        snr_db: float | None = None,
+    ) -> None:
+        if duration_s is not None:
+            kept = tuple(damage for damage in scenario.damage if damage.at_s < duration_s)
+            scenario = scenario.model_copy(update={"duration_s": duration_s, "damage": kept})
+        self._scenario, self._seed, self._snr_db = scenario, seed, snr_db
+        self._runs: dict[float, Run] = {}
+        self._seen: list[str] = []
+
+    def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
+        """See `Signals.of`."""
+        kind = getattr(sensor, "type", "")
+        if kind != "accelerometer":
+            raise SignalError(
+                f"sensor {sensor.name!r} is of type {kind!r}, and a bearing scenario gives accelerometers; "
+                "choose the streams that hold those with --stream"
+            )
+        if rate_hz not in self._runs:
+            self._runs[rate_hz] = self._scenario.accelerations(rate_hz, self._seed, self._snr_db)
+        run = self._runs[rate_hz]
+        if sensor.name not in self._seen:
+            self._seen.append(sensor.name)
+        on_rotor = self._seen.index(sensor.name) == 0
+        return (run.rotor_m_s2 if on_rotor else run.housing_m_s2) * _PER_M_S2[getattr(sensor, "unit", "m/s2")]
+
+
+class RecordedSignals:
+    """Channels of a recording, each for the sensor (or the stream's channel) of the same name.
+
+    Args:
+        recording: in the sensors' units. It is played again from its beginning as often as it takes.
+        duration_s: how long to play; once through unless given.
+    """
+
+    def __init__(self, recording: Recording, duration_s: float | None = None) -> None:
+        if recording.nan_count or recording.infinity_count:
+            raise SignalError(
+                f"{recording.source} holds samples that are no numbers, which no device could send; cut them "
+                "out or interpolate them"
+            )
+        self._recording = recording
+        self._n = (
+            len(recording.samples) if duration_s is None else max(round(duration_s * recording.rate_hz), 1)
+        )
+
+    def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
+        """See `Signals.of`."""
+        names = self._recording.names
+        name = next((name for name in (sensor.name, sensor.channel) if name in names), None)
+        if name is None:
+            raise SignalError(
+                f"{self._recording.source} has no channel for sensor {sensor.name!r} (channel "
+                f"{sensor.channel!r}); it gives {', '.join(names)}: name them with --map SENSOR=VARIABLE,..."
+            )
+        if not math.isclose(rate_hz, self._recording.rate_hz, rel_tol=1e-3):
+            raise SignalError(
+                f"stream {sensor.stream!r} is sampled at {rate_hz:g} Hz and {self._recording.source} at "
+                f"{self._recording.rate_hz:g} Hz; set the stream's rate_hz, or state the recording's with "
+                "--fs"
+            )
+        return np.resize(self._recording.samples[:, names.index(name)], self._n)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamSamples:
+    """What is played as one stream.
+
+    Attributes:
+        stream: its name in the machine file.
+        rate_hz: samples per second.
+        samples: ``[n, channels]`` in the sensors' units; a channel that no sensor has is 0.
+    """
+
+    stream: str
+    rate_hz: float
+    samples: NDArray[np.float64]
+
+
+def stream_samples(machine: MachineFile, stream: str, signals: Signals) -> StreamSamples:
+    """What is to be played as one stream of a machine.
+
+    Raises:
+        SignalError: there is nothing for one of its sensors, or it has none.
+    """
+    described = machine.streams[stream]
+    by_channel = {sensor.channel: sensor for sensor in machine.sensors if sensor.stream == stream}
+    columns = {
+        name: signals.of(by_channel[name], described.rate_hz)
+        for name in described.layout.channel_names
+        if name in by_channel
+    }
+    if not columns:
+        raise SignalError(f"stream {stream!r} has no sensor; leave it out by naming the others with --stream")
+    length = min(map(len, columns.values()))
+    silent = np.zeros(length)
+    samples = np.column_stack([columns.get(name, silent)[:length] for name in described.layout.channel_names])
+    return StreamSamples(stream, described.rate_hz, samples)
