@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Checksum = Literal["none", "xor", "crc16"]
 TimeUnit = Literal["s", "ms", "us"]
 
-END = b"\r\n"
+NEWLINE = b"\n"
 LONGEST_LINE = 1024
 """Bytes; a line that is longer is garbage."""
 
@@ -171,8 +171,8 @@ class DeviceTime:
     """Sample counts from a device's time stamps.
 
     Each stamp is compared with the one expected after the stamp before it, so that a device whose rate is
-    not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to half a
-    sampling period. Time that goes back means that the device was restarted: the count begins at 0 again.
+    not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to a quarter
+    of a sampling period; where several samples share a stamp, have the device count. Time that goes back means that the device was restarted: the count begins at 0 again.
 
     Args:
         rate_hz: nominal samples per second.
@@ -209,13 +209,18 @@ class LineFraming:
         checksum: behind a ``*`` at the end of each line, in hexadecimal, over what stands between an opening
             ``$`` or ``!`` (if there is one) and the ``*``: all characters combined by XOR, as in NMEA 0183,
             or their CRC-16/IBM-3740.
+        delimiter: the byte at the end of each line; a carriage return before it is no part of the line.
 
     Raises:
         LayoutError: the streams cannot be told apart.
     """
 
     def __init__(
-        self, layouts: Mapping[str, LineLayout], rates_hz: Mapping[str, float], checksum: Checksum = "none"
+        self,
+        layouts: Mapping[str, LineLayout],
+        rates_hz: Mapping[str, float],
+        checksum: Checksum = "none",
+        delimiter: bytes = NEWLINE,
     ) -> None:
         self._layouts = dict(layouts)
         self._rates_hz = dict(rates_hz)
@@ -235,7 +240,8 @@ class LineFraming:
         self._times = {
             name: DeviceTime(rates_hz[name]) for name, layout in layouts.items() if layout.time is not None
         }
-        self._pieces = Pieces(b"\n", LONGEST_LINE)
+        self._pieces = Pieces(delimiter, LONGEST_LINE)
+        self._end = b"\r\n" if delimiter == NEWLINE else delimiter
         self._astray = False
 
     def restart(self) -> None:
@@ -259,10 +265,11 @@ class LineFraming:
             raise LayoutError("a sample to be written is not finite; a line carries finite numbers only")
         lines = [layout.write(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
         if self._checksum == "none":
-            return [line + END for line in lines]
+            return [line + self._end for line in lines]
         sums = self._sums([line[line[:1] in {b"$", b"!"} :] for line in lines])
         digits = DIGITS[self._checksum]
-        return [b"%b*%0*X" % (line, digits, value) + END for line, value in zip(lines, sums, strict=True)]
+        ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
+        return [line + end for line, end in zip(lines, ends, strict=True)]
 
     def cut(self, data: bytes) -> Found:
         """See `drivers.serial_framing.Framing.cut`."""

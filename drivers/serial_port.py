@@ -73,8 +73,8 @@ class SerialDriver:
     Options of the bus, all but ``port`` and ``framing`` with a default: ``port`` (path of the device),
     ``baud``, ``data_bits``, ``parity``, ``stop_bits``, ``flow_control``, ``low_latency``; ``framing``, and
     what that framing needs: ``crc``, ``crc_order`` and ``stream_ids`` for ``"cobs"`` and ``"sync"``, the
-    ``sync_word`` in hexadecimal, ``checksum`` for ``"lines"``. The layouts of its streams are `FrameLayout`,
-    or `LineLayout` for lines.
+    ``sync_word`` in hexadecimal, ``checksum`` and ``delimiter`` for ``"lines"``. The layouts of its streams
+    are `FrameLayout`, or `LineLayout` for lines.
 
     Args:
         port: settings, streams, clock and where to deliver.
@@ -228,7 +228,8 @@ def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -
     if options["framing"] == "lines":
         lines: dict[str, LineLayout] = {s.name: s.layout for s in streams}
         rates_hz = {s.name: s.rate_hz for s in streams}
-        return LineFraming(lines, rates_hz, options.get("checksum", "none"))
+        delimiter = options.get("delimiter", "\n").encode("ascii")
+        return LineFraming(lines, rates_hz, options.get("checksum", "none"), delimiter)
     layouts: dict[str, FrameLayout] = {s.name: s.layout for s in streams}
     codec = BodyCodec(
         layouts,

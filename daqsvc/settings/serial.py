@@ -54,6 +54,16 @@ def _separator(text: str) -> str:
     return text
 
 
+def _delimiter(text: str) -> str:
+    if not text.isascii() or text.isalnum() or text in "+-.* ,":
+        raise PydanticCustomError(
+            "delimiter",
+            "cannot stand at the end of a line",
+            {"remedy": r'write the character that the device puts there, e.g. "\n" or ";"'},
+        )
+    return text
+
+
 class SerialBus(Section):
     """What all serial ports have."""
 
@@ -143,6 +153,11 @@ class LinesBus(SerialBus):
     checksum: Literal["none", "xor", "crc16"] = Field(
         default="none", description="behind a * at the end of each line, in hexadecimal; xor as in NMEA 0183"
     )
+    delimiter: Annotated[
+        str,
+        AfterValidator(_delimiter),
+        Field(min_length=1, max_length=1, description="at the end of each line"),
+    ] = "\n"
 
     @property
     def summary(self) -> str:

@@ -35,6 +35,12 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
                 'write line = ["seq", "x"], the names of the columns',
             )
             return
+        if layout.separator == bus.delimiter:
+            yield Finding(
+                (*path, "separator"),
+                f'is the delimiter of bus "{stream.bus}" too',
+                "correct one of them, as the device sends it",
+            )
     elif isinstance(bus, CobsBus | SyncBus):
         if not isinstance(layout, SerialLayout):
             yield Finding(

@@ -1,0 +1,232 @@
+"""Parts of the serial framings against published vectors, and what they do in their special cases."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+
+from drivers.frames import FrameLayout, LayoutError
+from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
+from drivers.serial_lines import LATEST_S, DeviceTime, LineFraming, LineLayout
+
+
+def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:
+    return FrameLayout.plain(
+        frame_id=frame_id,
+        length=length,
+        channels=[("x", 8, "unsigned", 1.0, 0.0)],
+        samples_per_frame=length - 1,
+        counter_byte=0,
+        counter_bits=8,
+        first_byte=1,
+    )
+
+
+def line(**changes) -> LineLayout:
+    values = {"columns": ("seq", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
+    return LineLayout(**(values | {"counter": "seq"} | changes))
+
+
+# The check values of the catalogue of parametrised CRC algorithms: the CRC of "123456789".
+@pytest.mark.parametrize(
+    ("crc", "order", "tail"),
+    [
+        ("ibm-3740", "big", "29b1"),
+        ("ibm-3740", "little", "b129"),
+        ("xmodem", "big", "31c3"),
+        ("xmodem", "little", "c331"),
+        ("none", "big", ""),
+    ],
+)
+def test_bodies_end_with_the_crc_that_was_asked_for(crc, order, tail):
+    codec = BodyCodec({"a": layout(9)}, crc=crc, crc_order=order)
+    samples = np.frombuffer(b"23456789", np.uint8).astype(float).reshape(1, 8, 1)
+    (body,) = codec.encode("a", np.array([0x31]) * 1, samples)
+    assert body == b"123456789" + bytes.fromhex(tail)
+    assert codec.is_intact(body)
+    assert codec.intact([body]).tolist() == [True]
+    if tail:
+        assert not codec.is_intact(body[:-1] + bytes([body[-1] ^ 1]))
+
+
+def test_cobs_as_it_is_published():
+    # Cheshire and Baker 1999, and a run of 254 bytes without a zero.
+    codec = BodyCodec({"a": layout(4)}, crc="none")
+    samples = np.array([[[0x22], [0x00], [0x33]]], float)
+    (frame,) = CobsFraming(codec).encode("a", np.array([0x11]), samples)
+    assert frame == bytes.fromhex("03 11 22 02 33 00")
+    long = BodyCodec({"a": layout(300)}, crc="none")
+    (frame,) = CobsFraming(long).encode("a", np.array([1]), np.full((1, 299, 1), 7.0))
+    assert frame[0] == 0xFF
+    assert len(frame) == 303
+
+
+def test_the_end_of_a_frame_that_began_before_the_port_was_opened_is_no_fault():
+    framing = CobsFraming(BodyCodec({"a": layout()}))
+    frames = framing.encode("a", np.arange(3) * 3, np.full((3, 3, 1), 5.0))
+    found = framing.cut(frames[0][3:] + frames[1] + frames[2])
+    assert (found.malformed, found.resyncs, found.garbage_bytes) == (0, 0, len(frames[0]) - 3)
+    assert found.frames["a"].decoded.counter.tolist() == [3, 6]
+    assert found.frames["a"].ends.tolist() == [len(frames[0]) - 3 + len(frames[0]) * k for k in (1, 2)]
+
+
+def test_frames_of_unknown_streams_and_of_the_wrong_length_are_told_apart():
+    known = BodyCodec({"a": layout(4, 1)}, ids=True)
+    wider = CobsFraming(BodyCodec({"a": layout(6, 1), "b": layout(4, 0x2A)}, ids=True))
+    framing = CobsFraming(known)
+    index = np.array([0])
+    found = framing.cut(
+        wider.encode("a", index, np.ones((1, 5, 1)))[0]
+        + wider.encode("b", index, np.ones((1, 3, 1)))[0]
+        + framing.encode("a", index, np.ones((1, 3, 1)))[0]
+    )
+    assert found.unknown == {"0x2a": 1}
+    assert found.wrong_length == {"a": (1, 9)}
+    assert (found.malformed, len(found.frames["a"].ends)) == (0, 1)
+
+
+def test_a_frame_with_a_bad_crc_is_handed_on_as_corrupt():
+    framing = SyncFraming(BodyCodec({"a": layout()}), b"\xaa")
+    frames = framing.encode("a", np.arange(3) * 3, np.full((3, 3, 1), 5.0))
+    spoilt = bytearray(b"".join(frames))
+    spoilt[len(frames[0]) + 3] ^= 4
+    found = framing.cut(bytes(spoilt))
+    assert found.frames["a"].decoded.intact.tolist() == [True, False, True]
+    assert (found.garbage_bytes, found.resyncs) == (0, 0)
+
+
+def test_without_a_crc_a_sync_word_must_follow():
+    framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
+    frames = framing.encode("a", np.arange(4) * 3, np.full((4, 3, 1), 5.0))
+    assert not framing.cut(frames[0]).frames
+    assert framing.cut(frames[1]).frames["a"].decoded.counter.tolist() == [0]
+    # A frame that lost a byte takes none of the next one's.
+    found = framing.cut(frames[2][:-1] + frames[3] + frames[0])
+    counters = found.frames["a"].decoded
+    assert counters.counter[counters.intact].tolist() == [3, 9]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: BodyCodec({"a": layout(), "b": layout()}), "without stream ids"),
+        (lambda: BodyCodec({"a": layout(4, 7), "b": layout(4, 7)}, ids=True), "share id 7"),
+        (lambda: BodyCodec({"a": layout(4, 256)}, ids=True), "is no byte"),
+        (lambda: SyncFraming(BodyCodec({"a": layout()}), b""), "sync word is empty"),
+        (lambda: line(counter=None), "needs a counter or a time"),
+        (lambda: line(time="x"), "not both"),
+        (lambda: line(columns=("seq", "y")), "column 'x' is there 0 times"),
+        (lambda: LineFraming({"a": line(), "b": line()}, {}), "cannot be told apart"),
+        (
+            lambda: LineFraming({"a": line(prefix="a"), "b": line(prefix="b", separator=";")}, {}),
+            "different separators",
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused(make, message):
+    with pytest.raises(LayoutError, match=message):
+        make()
+
+
+def test_a_sentence_of_a_gps_receiver_is_a_line():
+    gll = line(columns=("lat", "ns", "lon", "ew", "utc", "status"), channels=("lat", "lon"), counter="utc")
+    gll = LineLayout(gll.columns, gll.channels, np.ones(2), np.zeros(2), counter="utc", prefix="$GPGLL")
+    framing = LineFraming({"a": gll}, {"a": 1.0}, "xor")
+    found = framing.cut(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*28\r\n")
+    decoded = found.frames["a"].decoded
+    assert decoded.counter.tolist() == [125926]
+    np.testing.assert_allclose(decoded.samples[0, 0], [5300.97914, 259.98174], rtol=1e-7)
+    assert decoded.intact.all()
+    found = framing.cut(b"$GPGLL,5300.97914,N,00259.98174,E,125927,A*28\r\n")
+    assert not found.frames["a"].decoded.intact.any()
+
+
+def test_records_with_another_delimiter_are_lines_too():
+    # As a telephone's logger wrote them: three averages, three accelerations in m/s^2, ms.
+    layout = LineLayout(
+        ("ax", "ay", "az", "x", "y", "z", "t"), ("x", "y", "z"), np.ones(3), np.zeros(3), time="t"
+    )
+    framing = LineFraming({"a": layout}, {"a": 30.0}, delimiter=b";")
+    text = (
+        b"999,999,999,999,999,999,999;-0.4999469,0.038457453,9.345161,-0.4999469,0.15382981,9.460533,0.0;"
+        b"-0.4999469,0.038457453,9.345161,-0.9229789,-0.038457453,9.768193,33.5;"
+        b"-0.4999469,0.038457453,9.345161,-0.6537767,-0.34611708,9.268247,100.6633;"
+    )
+    decoded = framing.cut(text).frames["a"].decoded
+    assert decoded.counter.tolist() == [0, 1, 3]
+    np.testing.assert_allclose(
+        decoded.samples[:, 0],
+        [
+            [-0.4999469, 0.15382981, 9.460533],
+            [-0.9229789, -0.038457453, 9.768193],
+            [-0.6537767, -0.34611708, 9.268247],
+        ],
+        rtol=1e-6,
+    )
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"5,nan",
+        b"5,inf",
+        b"5,1_0",
+        b"5",
+        b"5,1,2",
+        b"5.0,1",
+        b"-1,1",
+        b"65536,1",
+        b"x,1",
+        b"5,",
+        b"\xff,\xfe",
+        b",",
+    ],
+)
+def test_what_is_no_sample_is_left_out_and_its_neighbours_are_not(bad):
+    framing = LineFraming({"a": line(counter_bits=16)}, {"a": 1.0})
+    framing.cut(b"0,0\n")
+    found = framing.cut(b"6,1.5\n" + bad + b"\n\n7, -2e0\r\n")
+    assert found.frames["a"].decoded.counter.tolist() == [6, 7]
+    assert found.frames["a"].decoded.samples[:, 0, 0].tolist() == [1.5, -2.0]
+    assert (found.malformed, found.resyncs, found.garbage_bytes) == (1, 1, len(bad) + 1)
+
+
+def test_the_first_line_without_a_checksum_may_lack_a_digit():
+    framing = LineFraming({"a": line()}, {"a": 1.0})
+    found = framing.cut(b"7,1\n18,1\n")
+    assert found.frames["a"].decoded.counter.tolist() == [18]
+    assert found.malformed == 0
+
+
+@pytest.mark.parametrize("rate_error", [-0.003, 0.0, 0.003])
+def test_a_device_whose_rate_is_off_gains_and_loses_no_sample(rate_error):
+    # 1 kHz nominal, stamps rounded to 0.25 ms, jitter of 0.03 ms (standard deviation).
+    n = 20_000
+    taken = np.arange(n) * 1e-3 * (1 + rate_error) + np.random.default_rng(1).normal(0, 3e-5, n)
+    stamps = np.round(taken / 0.25e-3) * 0.25e-3
+    kept = np.delete(np.arange(n), [5000, 5001, 5002, 9000])
+    counts = np.array(DeviceTime(1000.0).count(stamps[kept].tolist()))
+    assert (counts == kept).all()
+
+
+def test_a_stamp_that_comes_twice_is_a_repeat_and_time_that_goes_back_a_restart():
+    assert DeviceTime(100.0).count([5.00, 5.01, 5.01, 5.02, 0.0, 0.01]) == [0, 1, 1, 2, 0, 1]
+    assert DeviceTime(1e7).count([0.0, LATEST_S]) == [0, int(LATEST_S * 1e7) % 2**32]
+
+
+def test_a_corrupt_stamp_moves_no_other():
+    stamped = line(columns=("t", "x"), counter=None, time="t", time_unit="s")
+    framing = LineFraming({"a": stamped}, {"a": 10.0}, "xor")
+    good = framing.encode("a", np.arange(5), np.ones((5, 1, 1)))
+    spoilt = good[2].replace(b"0.2", b"9.2")
+    decoded = framing.cut(good[0] + good[1] + spoilt + good[3] + good[4]).frames["a"].decoded
+    assert decoded.intact.tolist() == [True, True, False, True, True]
+    assert decoded.counter[decoded.intact].tolist() == [0, 1, 3, 4]
+
+
+def test_nothing_is_logged_by_a_framing(caplog):
+    with caplog.at_level(logging.DEBUG):
+        LineFraming({"a": line()}, {"a": 1.0}).cut(b"garbage\n" * 10)
+    assert not caplog.records
