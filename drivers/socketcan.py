@@ -4,7 +4,8 @@ python-can takes one frame per call, gives the receive buffer no size and cannot
 drops (python-can#474, #1881), so on Linux the raw socket is read here. Options of the bus, beside those
 of every CAN bus:
 
-- ``receive_buffer_bytes``: how much the kernel holds while nobody reads; a frame takes some 768 bytes.
+- ``receive_buffer_bytes``: how much the kernel holds while nobody reads. It allows itself twice that, and
+  a frame takes some 768 bytes of it.
 - ``filter``: whether the kernel passes on only frames that some stream has (and error frames). It saves
   the work for all others, which are then not seen and hence not counted as unknown.
 

@@ -43,7 +43,7 @@ def _payload_length(length: int) -> int:
 
 
 class CanBus(Section):
-    """A CAN or CAN FD bus, opened through python-can."""
+    """A CAN or CAN FD bus: SocketCAN read directly, any other interface through python-can."""
 
     kind: ClassVar[str] = "a CAN bus"
 
@@ -57,7 +57,15 @@ class CanBus(Section):
     fd: Annotated[bool, Field(description="whether CAN FD frames are on the bus", examples=[True])] = False
     bitrate: Annotated[int, Field(gt=0, le=1_000_000, description="bit/s")] | None = None
     data_bitrate: Annotated[int, Field(gt=0, le=20_000_000, description="bit/s of FD data")] | None = None
-    options: dict[str, Any] = Field(default={}, description="handed to python-can as they are")
+    options: dict[str, Any] = Field(
+        default={}, description="handed to python-can as they are; none with SocketCAN"
+    )
+    receive_buffer_bytes: Annotated[int, Field(ge=4096, le=1 << 30)] = Field(
+        default=4 << 20, description="SocketCAN: what the kernel holds for us; a frame takes some 400 of it"
+    )
+    filter: bool = Field(
+        default=True, description="SocketCAN: let the kernel leave out frames of no stream, uncounted"
+    )
     start: StartPolicy = Field(default="retry", description="what to do if the device is absent at start")
 
 

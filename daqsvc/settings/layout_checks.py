@@ -173,6 +173,12 @@ def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
                     "python-can knows no such interface",
                     f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it",
                 )
+            elif isinstance(bus, CanBus) and bus.interface == "socketcan" and bus.options:
+                yield Finding(
+                    ("buses", name, "options"),
+                    "mean nothing to SocketCAN",
+                    f"remove {', '.join(bus.options)}; set the interface up by `ip link set {bus.channel}`",
+                )
 
 
 def check_frame_length(
