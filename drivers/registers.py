@@ -185,16 +185,16 @@ class RegisterRecord:
             float32 ``[n, channels]`` in physical units.
         """
         values = np.empty((len(raw), len(self.fields)), np.float64)
-        for group in self._groups:
-            numbers = np.take(raw, group.places, axis=1).view(group.dtype)
-            for k, (field, column) in enumerate(zip(group.fields, group.columns, strict=True)):
-                number = numbers[:, k]
-                if field.bits is not None:
-                    lowest, width = field.bits
-                    wide = number.astype(np.uint64)
-                    number = (wide >> np.uint64(lowest)) & np.uint64(2**width - 1)
-                values[:, column] = number
-        with np.errstate(over="ignore", invalid="ignore"):  # a device may send any float64, NaN among them
+        with np.errstate(over="ignore", invalid="ignore"):  # a device may send any float, NaN among them
+            for group in self._groups:
+                numbers = np.take(raw, group.places, axis=1).view(group.dtype)
+                for k, (field, column) in enumerate(zip(group.fields, group.columns, strict=True)):
+                    number = numbers[:, k]
+                    if field.bits is not None:
+                        lowest, width = field.bits
+                        wide = number.astype(np.uint64)
+                        number = (wide >> np.uint64(lowest)) & np.uint64(2**width - 1)
+                    values[:, column] = number
             return np.asarray(values * self._scale + self._offset, np.float32)
 
     def encode(
