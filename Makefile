@@ -1,5 +1,6 @@
 # make demo   the whole service against a simulated machine, live in the terminal
 # make test   the tests
+# make hil    tests on real CAN interfaces (vcan), in a guest kernel where this one has none; as root
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
@@ -18,7 +19,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench bench-data nothing-lost lock clean
+.PHONY: help demo test hil check bench bench-data nothing-lost lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -37,6 +38,9 @@ demo: $(READY)
 
 test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+
+hil: $(READY)
+	@tests/hil/run.sh $(ARGS)
 
 check: $(READY)
 	@$(BIN)/ruff check .
