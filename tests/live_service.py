@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from daqsvc.acquisition.clock import Clock
     from daqsvc.settings import MachineFile
 
 
 @contextlib.asynccontextmanager
-async def running(machine: MachineFile, store: Path) -> AsyncIterator[Service]:
+async def running(machine: MachineFile, store: Path, clock: Clock | None = None) -> AsyncIterator[Service]:
     """A service that is ready; it is stopped at the end."""
-    service = Service(machine, store)
+    service = Service(machine, store, clock)
     stop = asyncio.Event()
     task = asyncio.create_task(service.run(stop))
     try:

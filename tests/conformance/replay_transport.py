@@ -23,19 +23,20 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
+    from drivers.frames import FrameLayout
 
 
 LOOK_NS = POLL_NS // 10
 
 
-class _Device(FaultyDevice):
+class LogDevice(FaultyDevice):
     """Logs frames as ``candump -L`` does; its file is taken away and a new one begun."""
 
-    def __init__(self, path: Path, clock: Clock) -> None:
-        super().__init__(PER_FRAME)
+    def __init__(self, path: Path, clock: Clock, frames: FrameLayout) -> None:
+        super().__init__(frames.samples_per_frame)
         self._path = path
         self._clock = clock
-        self._layout = layout()
+        self._layout = frames
         self._old = (path.with_name(f"rotated-{k}.log") for k in itertools.count())
         path.touch()
 
@@ -82,7 +83,7 @@ class GrowingLog:
         self.time = SimulatedTime()
 
     async def start(self) -> None:
-        self.device = _Device(self._path, self.time.clock)
+        self.device = LogDevice(self._path, self.time.clock, layout())
 
     async def stop(self) -> None:
         pass

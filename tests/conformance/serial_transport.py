@@ -55,7 +55,7 @@ LINES = LineLayout(
 )
 
 
-class _Device(FaultyDevice):
+class CableDevice(FaultyDevice):
     def __init__(self, cable: PseudoTerminal, options: dict[str, Any], spec: StreamSpec[Any]) -> None:
         super().__init__(spec.layout.samples_per_frame)
         self.cable = cable
@@ -97,6 +97,9 @@ class _Device(FaultyDevice):
         super().come_back()
         self.cable.plug()
 
+    def close(self) -> None:
+        self.unplug()
+
 
 def _flipped(data: bytes, place: int) -> bytes:
     spoilt = bytearray(data)
@@ -125,7 +128,7 @@ class SerialTransport:
         self._spec: StreamSpec[Any] = StreamSpec(STREAM, layout, RATE_HZ, window_ns)
 
     async def start(self) -> None:
-        self.device = _Device(PseudoTerminal(self._path), self._options, self._spec)
+        self.device = CableDevice(PseudoTerminal(self._path), self._options, self._spec)
 
     async def stop(self) -> None:
         self.device.unplug()

@@ -66,10 +66,17 @@ def layout() -> FrameLayout:
     )
 
 
-class _Device(FaultyDevice):
-    def __init__(self, channel: str) -> None:
-        super().__init__(PER_FRAME)
-        self._layout = layout()
+class CanDevice(FaultyDevice):
+    """Sends frames of a layout on a channel of the virtual bus.
+
+    Args:
+        channel: of the bus.
+        frames: how it lays them out, with a CRC.
+    """
+
+    def __init__(self, channel: str, frames: FrameLayout) -> None:
+        super().__init__(frames.samples_per_frame)
+        self._layout = frames
         self._channel = channel
         self.bus = can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD)
 
@@ -92,6 +99,10 @@ class _Device(FaultyDevice):
         super().come_back()
         PluggedBus.unplugged.discard(self._channel)
 
+    def close(self) -> None:
+        self.come_back()
+        self.bus.shutdown()
+
 
 class VirtualCan:
     """See `conformance.transport.Transport`."""
@@ -111,11 +122,10 @@ class VirtualCan:
         self.time = SimulatedTime()
 
     async def start(self) -> None:
-        self.device = _Device(self.channel)
+        self.device = CanDevice(self.channel, layout())
 
     async def stop(self) -> None:
-        PluggedBus.unplugged.discard(self.channel)
-        self.device.bus.shutdown()
+        self.device.close()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
         options = {
