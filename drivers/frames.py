@@ -10,7 +10,7 @@ from __future__ import annotations
 import binascii
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -123,10 +123,25 @@ class _FieldGroup:
         picks = [row[::8] for row in rows] if self._by_byte else rows
         self._index = np.asarray(picks, np.intp) // (8 if self._by_byte else 1)
         self._used = self._index.shape[1] - self._shift // (8 if self._by_byte else 1)
+        self._run, self._run_dtype = self._find_run(width) if self._by_byte else (None, self._dtype)
 
-    def read(self, payloads: Payloads) -> NDArray[np.float64] | NDArray[np.int64]:
-        """Raw numbers ``[n, fields]`` of payloads ``[n, length]``."""
+    def _find_run(self, width: int) -> tuple[slice | None, np.dtype[Any]]:
+        """The bytes of fields that lie side by side in machine words, and the dtype of the words."""
+        side_by_side = np.arange(self._index.size).reshape(-1, width)
+        for dtype, ordered in (
+            (self._dtype, self._index),
+            (self._dtype.newbyteorder("<"), self._index[:, ::-1]),
+        ):
+            start = int(ordered[0, 0])
+            if self._shift == 0 and (ordered - start == side_by_side).all():
+                return slice(start, start + ordered.size), dtype
+        return None, self._dtype
+
+    def read(self, payloads: Payloads) -> NDArray[Any]:
+        """Raw numbers ``[n, fields]`` of payloads ``[n, length]``, as wide as the fields' containers."""
         n = len(payloads)
+        if self._run is not None:
+            return np.ascontiguousarray(payloads[:, self._run]).view(self._run_dtype)
         cells = payloads if self._by_byte else np.unpackbits(payloads, axis=1)
         padded = np.concatenate([cells, np.zeros((n, 1), np.uint8)], axis=1)
         gathered = padded[:, self._index]
@@ -134,9 +149,9 @@ class _FieldGroup:
             gathered = np.packbits(gathered, axis=2)
         values = np.ascontiguousarray(gathered).view(self._dtype)[:, :, 0]
         if self._kind == "float":
-            return values.astype(np.float64)
+            return values
         native = values.astype(self._dtype.newbyteorder("="))
-        raw: NDArray[np.int64] = (native >> native.dtype.type(self._shift)).astype(np.int64)
+        raw: NDArray[Any] = native >> native.dtype.type(self._shift)
         return raw
 
     def write(self, payloads: Payloads, values: NDArray[np.float64] | NDArray[np.int64]) -> None:
@@ -320,8 +335,11 @@ class FrameLayout:
         # Floats on the wire may be anything: beyond float32 they become infinite, signalling NaNs quiet.
         with np.errstate(over="ignore", invalid="ignore"):
             for group in self._sample_groups:
-                raw[:, group.columns] = group.read(payloads)
-            samples = (raw.reshape(n, *self.scale.shape) * self.scale + self.offset).astype(np.float32)
+                raw[:, slice(None) if len(self._sample_groups) == 1 else group.columns] = group.read(payloads)
+            scaled = raw.reshape(n, *self.scale.shape)
+            scaled *= self.scale
+            scaled += self.offset
+            samples = scaled.astype(np.float32)
         counter = self._counter_group.read(payloads)[:, 0].astype(np.int64)
         if self.crc_byte is None:
             intact = np.ones(n, np.bool_)
