@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import termios
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -224,7 +225,7 @@ class ModbusClient:
         why = "nobody answers there"
         try:
             opened = await self._client.connect()
-        except (ModbusException, OSError, ValueError) as error:
+        except (ModbusException, OSError, ValueError, termios.error) as error:
             opened, why = False, f"{error}"
         _heed_cancellation()
         if not opened:

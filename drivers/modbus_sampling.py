@@ -186,6 +186,7 @@ class FifoReader(_AssembledReader[Fifo]):
 
     def __init__(self, spec: StreamSpec[Fifo], port: BusPort, counters: ModbusCounters) -> None:
         super().__init__(spec, port, counters, counter_bits=spec.layout.count.bits)
+        self._unacknowledged: tuple[int, int] | None = None
 
     async def _look(self, line: ModbusLine) -> None:
         layout = self._layout
@@ -199,14 +200,27 @@ class FifoReader(_AssembledReader[Fifo]):
             return
         if taken:
             first = layout.count.decode(raw)
-            counts = (first + np.arange(taken, dtype=np.int64)) % layout.count.modulus
-            self._accept(counts, raw[head:], np.full(taken, arrival_ns, np.int64))
+            repeated = self._repeated(first, taken)
+            counts = (first + np.arange(repeated, taken, dtype=np.int64)) % layout.count.modulus
+            if len(counts):
+                rows = raw[head + repeated * 2 * layout.record.registers :]
+                self._accept(counts, rows, np.full(len(counts), arrival_ns, np.int64))
             if layout.acknowledge is not None:
+                self._unacknowledged = first, taken
                 told = layout.count.encode(first + taken)
                 words = [int.from_bytes(told[k : k + 2], "big") for k in range(0, len(told), 2)]
                 await line.write(layout.unit, layout.acknowledge, words)
+                self._unacknowledged = None
         if taken < layout.samples_per_read:
             await self._clock.sleep_ns(layout.poll_ns)
+
+    def _repeated(self, first: int, taken: int) -> int:
+        """How many samples of a reply were in the one before, which the device does not know to be taken."""
+        if self._unacknowledged is None or self._unacknowledged[0] != first:
+            return 0
+        repeated = min(self._unacknowledged[1], taken)
+        self._assembler.counters.frames_duplicate += repeated
+        return repeated
 
     async def _pause_after_failure(self) -> None:
         await self._clock.sleep_ns(self._layout.poll_ns)

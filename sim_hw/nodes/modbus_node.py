@@ -147,17 +147,23 @@ class ModbusTcpServer:
         self._plan = plan
         self._server: asyncio.Server | None = None
         self._connections: set[_TcpConnection] = set()
+        self._starting: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Listen on 127.0.0.1; again on the same port after `stop`."""
-        loop = asyncio.get_running_loop()
-        self._server = await loop.create_server(
+        self._server = await asyncio.get_running_loop().create_server(
             lambda: _TcpConnection(self._units, self._plan, self._connections), "127.0.0.1", self.port
         )
         self.port = self._server.sockets[0].getsockname()[1]
 
+    def start_at_once(self) -> None:
+        """As `start`, for callers that cannot wait; there is nobody to answer until the next turn or two."""
+        self._starting = asyncio.get_running_loop().create_task(self.start(), name="modbus-server-start")
+
     def stop(self) -> None:
         """Listen no more, and reset every connection."""
+        if self._starting is not None:
+            self._starting.cancel()
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -219,7 +225,7 @@ class ModbusRtuServer:
         self._fds: tuple[int, int] | None = None
         self._wire: ModbusWire | None = None
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Plug in."""
         # The device's end of the terminal stays open, or the line would hang up with every client.
         line, device = os.openpty()

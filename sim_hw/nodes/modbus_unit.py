@@ -140,10 +140,20 @@ class FifoStore:
         self._layout = layout
         self._queue: deque[tuple[int, bytes]] = deque(maxlen=depth)
         self._told: dict[int, int] = {}
+        self._handed_out = 0
         unit.add_queue(layout.address, self._read)
         if layout.acknowledge is not None:
             for k in range(layout.count.run.count):
                 unit.watch(layout.acknowledge + k, lambda value, k=k: self._acknowledge(k, value))  # type: ignore[misc]
+
+    @property
+    def full(self) -> bool:
+        """Whether the next sample costs the oldest one."""
+        return len(self._queue) == self._queue.maxlen
+
+    def clear(self) -> None:
+        """Forget what has not been read, as a device does that is switched off."""
+        self._queue.clear()
 
     def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
         """See `SampleStore.put`."""
@@ -156,6 +166,7 @@ class FifoStore:
         # One count stands for all: samples behind a gap must wait for the next reply.
         first = oldest[0][0]
         together = [row for k, (index, row) in enumerate(oldest) if index == first + k]
+        self._handed_out = len(together)
         if self._layout.acknowledge is None:
             for _ in together:
                 self._queue.popleft()
@@ -169,8 +180,12 @@ class FifoStore:
         self._told.clear()
         following = self._layout.count.decode(raw)
         modulus = self._layout.count.modulus
-        while self._queue and (following - self._queue[0][0] - 1) % modulus < modulus // 2:
+        # Only what has been handed out: behind it the count may have begun again.
+        for _ in range(self._handed_out):
+            if not self._queue or (following - self._queue[0][0] - 1) % modulus >= modulus // 2:
+                break
             self._queue.popleft()
+        self._handed_out = 0
 
 
 class WaveformStore:
