@@ -14,7 +14,7 @@ from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.serial import LineLayout as LineSettings
 from daqsvc.settings.serial import SerialLayout
-from drivers.base import BusPort, StreamSpec
+from drivers.base import BusOptionError, BusPort, StreamSpec
 from drivers.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
 from drivers.modbus_layouts import (
@@ -35,6 +35,7 @@ from drivers.serial_lines import LineLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from importlib.metadata import EntryPoint
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
@@ -222,7 +223,7 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
     """One driver per bus, found by its entry point.
 
     Raises:
-        AssemblyError: no driver of that name is installed.
+        AssemblyError: a driver is not installed, cannot be loaded, or cannot use an option.
         LayoutError: see `frame_layout`.
     """
     installed = {point.name: point for point in entry_points(group=DRIVERS)}
@@ -248,5 +249,19 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
             if stream.bus == name
         ]
         port = BusPort(name, options, streams, clock, deliver, bus.start)
-        made.append(installed[bus.driver].load()(port))
+        made.append(_driver(installed[bus.driver], port, f"{machine.path}: buses.{name}"))
     return made
+
+
+def _driver(point: EntryPoint, port: BusPort, bus: str) -> Driver:
+    try:
+        make: Callable[[BusPort], Driver] = point.load()
+    except Exception as error:
+        raise AssemblyError(
+            f"{bus}.driver = {point.name!r}: it cannot be loaded from {point.value}: {error}; "
+            "install the package that brings it again, or remove the bus"
+        ) from error
+    try:
+        return make(port)
+    except BusOptionError as error:
+        raise AssemblyError(f"{bus}: {error}") from error

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
+    from drivers.frames import FrameLayout
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "example_driver" / "tcp_frames.py"
 SEND_BUFFER = 65_536
@@ -44,12 +45,12 @@ def example() -> ModuleType:
     return sys.modules["tcp_frames"]
 
 
-class _Device(FaultyDevice):
+class LoggerDevice(FaultyDevice):
     """A logger that serves one client, and drops what that client does not take."""
 
-    def __init__(self) -> None:
-        super().__init__(PER_FRAME)
-        self._layout = layout()
+    def __init__(self, frames: FrameLayout) -> None:
+        super().__init__(frames.samples_per_frame)
+        self._layout = frames
         self._client: socket.socket | None = None
         self.tcp_port = 0
         self._listen()
@@ -127,7 +128,7 @@ class ExampleLogger:
         self.time = SimulatedTime()
 
     async def start(self) -> None:
-        self.device = _Device()
+        self.device = LoggerDevice(layout())
 
     async def stop(self) -> None:
         self.device.close()
