@@ -65,8 +65,8 @@ class SequenceMark:
         told = line.split()
         if len(told) != 4 or _hexadecimal(told[3]) != zlib.crc32(line[: line.rindex(b" ")]):
             log.warning(
-                "outbox mark %s is damaged; sequence numbers go on from the journal or, without one, from "
-                "the wall clock",
+                "outbox mark %s is damaged; sequence numbers go on from the wall clock, or from the journal if "
+                "that is ahead",
                 self._path,
             )
             return
@@ -79,8 +79,10 @@ class SequenceMark:
             stored: the highest number that the journal knows; None for a new file.
             wall_ns: the wall clock, ns since the Unix epoch.
         """
-        if stored is None:
-            return max(self._ceiling, wall_ns // NS_PER_MS) + 1
+        started = wall_ns // NS_PER_MS
+        if stored is None or not self._ceiling:
+            # Without a mark nobody knows what the journal may have forgotten: only the clock has gone on.
+            return max(stored or 0, self._ceiling, started) + 1
         return max(stored, self._used if self._is_exact() else self._ceiling) + 1
 
     def vanished(self, stored: int | None) -> int:
