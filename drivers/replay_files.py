@@ -363,7 +363,7 @@ def words(error: BaseException) -> str:
 def _table(path: Path, wanted: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     try:
         if path.suffix.lower() == ".npz":
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            with path.open("rb") as packed, np.load(packed, allow_pickle=False) as arrays:
                 there = list(arrays.files)
                 found = {name: np.asarray(arrays[name], np.float64) for name in wanted if name in there}
         else:
