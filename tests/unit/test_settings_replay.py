@@ -1,0 +1,77 @@
+"""Recordings in a machine file: what fits together is described, what does not is named with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daqsvc.settings import parse_machine_file
+from daqsvc.settings.describe import describe
+from daqsvc.settings.problems import MachineFileError
+
+TEXT = """
+schema_version = 1
+site = "lab"
+box = "edge-1"
+[machine]
+name = "replayed"
+speed_rpm = 600.0
+[buses.tape]
+driver = "replay"
+file = "gap.npz"
+at_end = "loop"
+[streams.shaft]
+bus = "tape"
+rate_hz = 640.0
+layout = { columns = [{ name = "x", column = "probe_v" }] }
+[[sensors]]
+name = "casing-x"
+type = "accelerometer"
+stream = "shaft"
+channel = "x"
+unit = "g"
+"""
+FRAMES = """{ id = 1, length = 8, counter = { byte = 0, bits = 16, counts = "samples" }, first_byte = 2, \
+samples_per_frame = 1, channels = [{ name = "x", type = "int16", scale = 1.0 }] }"""
+COLUMNS = '{ columns = [{ name = "x", column = "probe_v" }] }'
+MODBUS = """{ way = "registers", unit = 1, channels = [{ name = "x", address = 0, type = "int16" }] }"""
+
+
+def test_a_recording_is_described() -> None:
+    text = describe(parse_machine_file(TEXT, Path("/m/replayed.toml")))
+    assert "replay of gap.npz, again and again" in text
+    assert "columns probe_v" in text
+
+
+def test_a_can_log_takes_frames() -> None:
+    machine = parse_machine_file(
+        TEXT.replace("gap.npz", "gap.blf").replace(COLUMNS, FRAMES), Path("/m/replayed.toml")
+    )
+    assert machine.resolve(machine.buses["tape"].file) == Path("/m/gap.blf")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"loop"', '"wait"', 'buses.tape.at_end = "wait": gap.npz cannot be read while it is written'),
+        ('"loop"', '"rewind"', "buses.tape.at_end"),
+        (
+            "gap.npz",
+            "gap.blf",
+            "layout.columns = .* has no columns: only the replay of an .npz or .csv file has",
+        ),
+        (COLUMNS, FRAMES, "replays columns of a table, and this describes something else"),
+        (COLUMNS, MODBUS, "replays columns of a table, and this describes something else"),
+        (
+            '"probe_v" }',
+            '"probe_v", scale = 0.0 }',
+            r"columns\[0\].scale = 0.0: would make every sample the same",
+        ),
+        ('"probe_v" }]', '"probe_v" }, { name = "x", column = "t" }]', r"columns\[1\].name = \"x\""),
+    ],
+)
+def test_what_does_not_fit_is_named(old: str, new: str, said: str) -> None:
+    assert old in TEXT
+    with pytest.raises(MachineFileError, match=said):
+        parse_machine_file(TEXT.replace(old, new), Path("/m/replayed.toml"))
