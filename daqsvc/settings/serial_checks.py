@@ -165,12 +165,13 @@ def _check_columns(layout: LineLayout, path: KeyPath) -> Iterator[Finding]:
 
 def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Finding]:
     """The streams of a port can be told apart, and the port has time for them."""
+    wanted = LineLayout if isinstance(bus, LinesBus) else SerialLayout
     owners: dict[object, str] = {}
     characters_per_s = 0.0
     for key, stream in draft.streams.items():
         with suppress(UnusableValueError):
             layout = stream.layout
-            if stream.bus != name or not isinstance(layout, SerialLayout | LineLayout):
+            if stream.bus != name or not isinstance(layout, wanted):
                 continue
             mark: object
             if isinstance(layout, LineLayout):

@@ -1,0 +1,171 @@
+"""Serial ports in machine files: what is read, what is refused, and with which words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from machine_files import MACHINES, changed, problems_of
+
+from daqsvc import assembly_drivers
+from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialLayout
+from drivers.serial_lines import LineLayout as DriverLines
+from drivers.serial_port import SerialDriver
+
+SERIAL = MACHINES / "serial-probes.toml"
+COBS = 'framing = "cobs"                 # "cobs", "sync" (with sync_word = "a55a") or "lines"'
+LAYOUT = "payload_length = 64\n"
+LINE = 'line = ["seq", "vertical", "horizontal"]\n'
+COUNTER = (
+    'counter = { column = "seq", bits = 16 }    # or, without one: time = { column = "t", unit = "ms" }\n'
+)
+PORT = '"/dev/serial/by-id/usb-Raspberry_Pi_Pico_E66118604B826C2A-if00"'
+
+
+def test_the_example_as_it_is_read():
+    machine = load_machine_file(SERIAL)
+    probes, casing = machine.buses["probes"], machine.buses["casing"]
+    assert isinstance(probes, CobsBus)
+    assert isinstance(casing, LinesBus)
+    assert (probes.bits_per_character, probes.crc_bytes, casing.delimiter) == (10, 2, "\n")
+    assert isinstance(machine.streams["shaft"].layout, SerialLayout)
+    assert isinstance(machine.streams["casing"].layout, LineLayout)
+    packed = assembly_drivers.stream_layout(machine, "shaft")
+    samples = packed.decode(np.zeros((1, 64), np.uint8)).samples
+    np.testing.assert_allclose(samples[0, 0], [10 / 7.87e-3, 10 / 7.87e-3, 0.0], rtol=1e-6)
+    lines = assembly_drivers.stream_layout(machine, "casing")
+    assert isinstance(lines, DriverLines)
+    assert (lines.prefix, lines.counter, lines.counter_bits) == ("$ACC", "seq", 16)
+
+
+def test_the_driver_is_found_by_its_name():
+    from daqsvc.acquisition.clock import SystemClock
+
+    drivers = assembly_drivers.drivers(load_machine_file(SERIAL), SystemClock(), lambda _: None)
+    assert [type(driver) for driver in drivers] == [SerialDriver, SerialDriver]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "message", "remedy"),
+    [
+        (COBS, "", "buses.probes.framing", "is missing", 'framing = "cobs"'),
+        (COBS, 'framing = "slip"', "buses.probes.framing", "must be", 'framing = "cobs"'),
+        (COBS, 'framing = "sync"', "buses.probes.sync_word", "is missing", 'sync_word = "a55a"'),
+        (
+            COBS,
+            COBS + '\nsync_word = "a5"',
+            "buses.probes.sync_word",
+            "belongs to a serial port",
+            "remove it",
+        ),
+        (
+            COBS,
+            'framing = "sync"\nsync_word = "a5z"',
+            "buses.probes.sync_word",
+            "is not 1 to 8 bytes in hexadecimal",
+            'e.g. "a55a"',
+        ),
+        (PORT, '"ttyUSB0"', "buses.casing.port", "is not the whole path", "/dev/ttyUSB0"),
+        ("baud = 3_000_000", "baud = 115_200", "buses.probes.baud", "is too slow", "a faster rate"),
+        (
+            LAYOUT,
+            "payload_length = 60\n",
+            "streams.shaft.layout.first_byte",
+            "bytes 4 to 63",
+            "payload_length = 64",
+        ),
+        ("first_byte = 4", "first_byte = 2", "streams.shaft.layout.first_byte", "would overlap", "byte 4"),
+        (
+            LAYOUT,
+            LAYOUT + "stream_id = 1\n",
+            "streams.shaft.layout.stream_id",
+            "has no effect",
+            "stream_ids = true",
+        ),
+        (
+            COBS,
+            COBS + "\nstream_ids = true",
+            "streams.shaft.layout.stream_id",
+            "is missing: frames on bus",
+            "stream_id = 1",
+        ),
+        (
+            LAYOUT,
+            "id = 0x101\nlength = 64\n",
+            "streams.shaft.layout",
+            "is no layout of a binary serial frame",
+            "payload_length",
+        ),
+        (
+            'bus = "casing"',
+            'bus = "probes"',
+            "streams.casing.layout",
+            "is no layout of a binary",
+            "payload_length",
+        ),
+        ('bus = "probes"', 'bus = "casing"', "streams.shaft.layout", "carries lines", "line ="),
+        (COUNTER, "", "streams.casing.layout", "has neither counter nor time", "counter = {"),
+        ('column = "seq"', 'column = "sek"', "streams.casing.layout.counter.column", "no such column", "seq"),
+        (
+            LINE,
+            'line = ["seq", "vertical", "horizont"]\n',
+            "streams.casing.layout.channels[1].name",
+            "no such column",
+            "horizont",
+        ),
+        (
+            LINE,
+            'line = ["seq", "vertical", "horizontal", "seq"]\n',
+            "streams.casing.layout.line[3]",
+            "earlier",
+            "own name",
+        ),
+        (LINE, LINE + 'separator = "."\n', "streams.casing.layout.separator", "cannot stand between", '";"'),
+        (
+            LINE,
+            LINE + 'time = { column = "seq", unit = "ms" }\n',
+            "streams.casing.layout.time",
+            "has no effect beside counter",
+            "remove time",
+        ),
+    ],
+)
+def test_each_mistake_is_named_once_with_its_remedy(old, new, key, message, remedy):
+    text, _ = changed(SERIAL, (old, new))
+    found = [p for p in problems_of(text, SERIAL) if key in str(p)]
+    assert len(found) == 1, problems_of(text, SERIAL)
+    assert message in str(found[0])
+    assert remedy in str(found[0])
+
+
+def test_a_port_with_a_number_is_a_warning():
+    text, _ = changed(SERIAL, (PORT, '"/dev/ttyUSB0"'))
+    (warning,) = parse_machine_file(text, SERIAL).warnings
+    assert "may be another device once a port has been re-plugged" in str(warning)
+    assert "/dev/serial/by-id" in str(warning)
+
+
+def test_a_port_belongs_to_one_bus():
+    text, _ = changed(
+        SERIAL, (PORT, '"/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"')
+    )
+    (problem,) = problems_of(text, SERIAL)
+    assert 'belongs to bus "probes" already' in str(problem)
+
+
+def test_two_streams_of_a_port_have_marks_of_their_own():
+    second = '[streams.more]\nbus = "probes"\nrate_hz = 1000.0\n[streams.more.layout]\npayload_length = 64\n'
+    text = SERIAL.read_text()
+    body = text[text.index("counter = { byte") : text.index("[buses.casing]")]
+    text = text.replace("[buses.casing]", second + body + "[buses.casing]")
+    (problem,) = problems_of(text, SERIAL)
+    assert 'does not tell this stream from "shaft"' in str(problem)
+    ids = text.replace(COBS, COBS + "\nstream_ids = true").replace(
+        "payload_length = 64", "stream_id = 1\npayload_length = 64"
+    )
+    (problem,) = problems_of(ids, SERIAL)
+    assert 'does not tell this stream from "shaft"' in str(problem)
+    good = ids.replace(
+        "1000.0\n[streams.more.layout]\nstream_id = 1", "1000.0\n[streams.more.layout]\nstream_id = 2"
+    )
+    assert parse_machine_file(good, SERIAL).streams["more"].layout.stream_id == 2
