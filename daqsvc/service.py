@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc import assembly, assembly_drivers
+from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarm_desk import AlarmDesk
@@ -112,7 +113,8 @@ class Service:
         self.rings = {grid.name: _ring(machine, grid, detectors) for grid in grids}
         self.alignment = alignment(machine, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
-        self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock)
+        settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
+        self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock, settling_ns=settling_ns)
         self.desk = AlarmDesk(
             self._identity,
             alarm_rules(machine),

@@ -5,8 +5,9 @@ pass as they are (the edge of a keyphasor stays an edge). The samples of every o
 at the instants of the reference's, as the two time bases see them. How far off that may be goes with the
 data; samples that cannot be placed well enough are left out.
 
-The grid never waits long for a stream that is silent: its columns are NaN, and if it is the reference, the
-grid goes on by its last known rate.
+The grid begins when all streams can be placed, some seconds after their first samples, or after `SETTLE_NS`
+at the latest. From then on it never waits long for a stream that is silent: its columns are NaN, and if it is
+the reference, the grid goes on by its last known rate.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ _LEAST_S = 0.01
 """Shorter blocks are not worth the work."""
 _MOST_S = 1.0
 """Of one block: what is missing for longer is filled up block by block."""
-_SETTLE_S = 60.0
-"""By then a time base has seen all that it remembers."""
+SETTLE_NS = 30 * NS_PER_S
+"""In which time bases should have found out where samples belong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,7 @@ class Aligner:
         # What is older than a source remembers has no samples anyway.
         self._longest = self._most + max(round(f.memory_s * rate_hz) for f in self._followers)
         self._next: int | None = None
+        self._since_ns: int | None = None
 
     @property
     def counters(self) -> Mapping[str, SourceCounters]:
@@ -148,34 +150,41 @@ class Aligner:
         if follower is None:
             return
         follower.append(block)
-        if self._next is None:
-            if follower is not self._reference:
-                return
-            self._next = block.first_index
-        while (rows := self._ready()) >= self._least:
+        if self._next is None and self._can_begin():
+            self._next = self._reference.line.index
+        while self._next is not None and (rows := self._ready(self._next)) >= self._least:
             skipped = rows - self._most if rows > self._longest else 0
-            self._emit(min(rows, self._most), skipped)
+            self._next += skipped
+            self._emit(self._next, min(rows, self._most), skipped)
+            self._next += min(rows, self._most)
 
-    def _ready(self) -> int:
-        """Rows that can be made: all streams are there, or one is too late."""
-        assert self._next is not None  # noqa: S101 - `accept` has set it
+    def _can_begin(self) -> bool:
+        """Whether all streams can be placed, or that has been waited for long enough."""
+        if not self._reference.started:
+            return False
         line = self._reference.line
-        covered = min(self._reference.end - self._next, *(f.covers(self._next, line) for f in self._others))
+        if self._since_ns is None:
+            self._since_ns = line.t_ns
+        waited_ns = max(f.newest_ns for f in self._followers if f.started) - self._since_ns
+        return waited_ns >= SETTLE_NS or all(f.placeable(line) for f in self._others)
+
+    def _ready(self, first: int) -> int:
+        """Rows from index ``first`` on that can be made: all streams are there, or one is too late."""
+        line = self._reference.line
+        covered = min(self._reference.end - first, *(f.covers(first, line) for f in self._others))
         newest_ns = max(f.newest_ns for f in self._followers if f.started)
         due_ns = newest_ns - self._max_wait_ns - self._filter_ns
         # A reference that has just begun to speak again may be ahead of what a silent one was due for.
-        overdue = math.floor(line.samples_to(due_ns)) + line.index - self._next
+        overdue = math.floor(line.samples_to(due_ns)) + line.index - first
         return max(covered, overdue)
 
-    def _emit(self, rows: int, skipped: int) -> None:
-        assert self._next is not None  # noqa: S101 - `accept` has set it
-        first, line = self._next + skipped, self._reference.line
+    def _emit(self, first: int, rows: int, skipped: int) -> None:
+        line = self._reference.line
         for follower in self._followers if skipped else ():
             follower.skip(skipped)
         columns = [self._reference.own(first, rows)]
         columns += [follower.at(first, rows, line) for follower in self._others]
-        self._next = first + rows
-        self._reference.trim(self._next)
+        self._reference.trim(first + rows)
         t_ns = line.time_of(first)
         settled = all(follower.trusted for follower in self._others)
         self._deliver(
@@ -196,7 +205,7 @@ class Aligner:
 
     def _tell(self, follower: Follower) -> None:
         """Say once that a stream can be placed, that it no longer can, and that it never could."""
-        said = follower.news(round(_SETTLE_S * self._reference.source.rate_hz))
+        said = follower.news(round(SETTLE_NS / NS_PER_S * self._reference.source.rate_hz))
         if said is None:
             return
         error_us = follower.error_ns / 1e3

@@ -187,6 +187,12 @@ class Follower:
         self._count(samples)
         return samples
 
+    def placeable(self, grid: Line) -> bool:
+        """Whether its samples are known well enough to lie where on the grid."""
+        if self._line is None:
+            return False
+        return math.hypot(self._line.error_ns, grid.error_ns) <= self.max_error_ns
+
     def covers(self, first: int, grid: Line) -> int:
         """Rows of the grid from index ``first`` on that can be made now."""
         if self._line is None:

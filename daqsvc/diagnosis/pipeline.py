@@ -61,6 +61,7 @@ class Pipeline:
         report: called on the event loop with each diagnosis, per detector in order.
         clock: tells how long a stream has been silent.
         threads: kernels that may run at a time.
+        settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
     """
 
     def __init__(
@@ -70,11 +71,13 @@ class Pipeline:
         report: Callable[[Diagnosis], None],
         clock: Clock,
         threads: int = 2,
+        settling_ns: Mapping[str, int] | None = None,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
         self._rings = rings
+        self._settling_ns = settling_ns or {}
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._report = report
         self._clock = clock
@@ -130,7 +133,7 @@ class Pipeline:
         """
         ends = {name: ring.end_index for name, ring in self._rings.items()}
         looked_ns = self._clock.monotonic_ns()
-        since_ns = dict.fromkeys(self._rings, looked_ns)
+        since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         said: set[str] = set()
         while True:
             await self._clock.sleep_ns(LOOK_NS)

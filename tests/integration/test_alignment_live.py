@@ -141,6 +141,8 @@ async def test_probes_on_two_buses_give_the_diagnosis_of_one(shaft, tmp_path: Pa
     assert {d.stream for d in said[1]} == {"shaft-y+shaft-x"}
     for service in (one, two):
         assert "unbalance" in service.desk.manager.alarms["rotor-changed"].message
+        # Nobody is alarmed because clocks must be learnt first.
+        assert "detector-ok/rotor-synchronous" not in service.desk.manager.alarms
     # The healthy state too: 1X forward and backward, and the mean position, in um.
     baselines = []
     for service in (one, two):

@@ -27,7 +27,7 @@ def skew(delays, seed):
     _, rows = aligned(
         devices, lambda t_ns: (t_ns / RAMP_NS).astype(np.float64), LAST_S, seed, max_error_ns=1e9
     )
-    late = slice(round(FIRST_S * 6400.0), None)
+    late = slice(round(FIRST_S * 6400.0) - rows.first_index, None)
     # Rows hold float32, 2 us at the end of the ramp: the mean over a tenth of a second does not mind.
     error_ns = (rows.samples[late, 1].astype(np.float64) - rows.samples[late, 0]) * RAMP_NS
     whole = len(error_ns) // 640 * 640
