@@ -219,9 +219,9 @@ class RegistersLayout(_ModbusLayout):
     max_count: Annotated[int, Field(ge=4, le=MAX_REGISTERS)] = Field(
         default=MAX_REGISTERS, description="registers in a request, at most"
     )
-    forbidden: Annotated[tuple[tuple[Address, Address], ...], Field(strict=False)] = Field(
-        default=(), description="first and last register of ranges that must never be read"
-    )
+    forbidden: Annotated[
+        tuple[Annotated[tuple[Address, Address], Field(strict=False)], ...], Field(strict=False)
+    ] = Field(default=(), description="first and last register of ranges that must never be read")
 
     @property
     def channel_names(self) -> tuple[str, ...]:

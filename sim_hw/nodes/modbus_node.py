@@ -42,6 +42,7 @@ ReplyFault: TypeAlias = Literal[
 ]
 
 DEVICE_FAILURE = 4
+_EXCEPTION_BIT = 0x80
 _MBAP = 7
 _REQUEST_BYTES = {3: 5, 4: 5, 6: 5, 24: 3}
 """Lengths of the PDUs of requests, by function; that of function 16 is in the PDU."""
@@ -118,7 +119,8 @@ class ModbusWire:
         answer = self._plan(unit, pdu)
         if answer.fault == "silent":
             return
-        reply = self._units[unit].answer(pdu)
+        refused = bytes([pdu[0] | _EXCEPTION_BIT, DEVICE_FAILURE])
+        reply = refused if answer.fault == "exception" else self._units[unit].answer(pdu)
         frame = _faulty(answer.fault, head, unit, reply, serial=self._serial)
         if not answer.delay_ns:
             self._send(frame)
@@ -325,9 +327,7 @@ def _rtu_request(buffer: bytes) -> tuple[int, bytes, int, bytes] | None:
 
 def _faulty(fault: ReplyFault, head: bytes, unit: int, pdu: bytes, *, serial: bool) -> bytes:
     """The frame of a reply, with its fault."""
-    if fault == "exception":
-        pdu = bytes([pdu[0] | 0x80, DEVICE_FAILURE])
-    elif fault == "wrong function":
+    if fault == "wrong function":
         pdu = bytes([pdu[0] ^ 7]) + pdu[1:]
     elif fault == "truncated":  # a whole frame, with two registers fewer than it was asked for
         pdu = bytes([pdu[0], max(pdu[1] - 4, 0)]) + pdu[2 : 2 + max(pdu[1] - 4, 0)]

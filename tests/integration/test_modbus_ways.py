@@ -28,11 +28,14 @@ class Faults:
         self.coming = []
         self.asked = []
         self.meanwhile = None
+        self.refuse = lambda _pdu: False
 
     def __call__(self, unit, pdu):
         self.asked.append((unit, pdu))
         if self.meanwhile is not None and self.meanwhile(pdu) is None:
             self.meanwhile = None
+        if self.refuse(pdu):
+            return Answer("exception")
         return self.coming.pop(0) if self.coming else Answer()
 
 
@@ -104,6 +107,24 @@ async def test_a_lost_fifo_reply_costs_what_was_in_it_unless_the_device_waits_to
     # The reply may have been one of an empty queue: then nothing was lost with it.
     assert lost[700] == 0
     assert lost[None] in (0, 10)
+
+
+async def test_samples_whose_acknowledgement_failed_are_not_delivered_twice():
+    layout = Fifo(1, 33, Count(0, 32), SAMPLE, 700, poll_ns=1_000_000)
+    writes = [{"unit": 1, "address": 700, "count": 2}]
+    async with serving(layout, 1000.0, writes=writes) as (rig, faults, put), rig.running():
+        await until(lambda: rig.driver.link.state == "up")
+        failing = [True]
+        # The write itself gets lost: the device is told nothing, and hands the samples out again.
+        faults.refuse = lambda pdu: pdu[0] == 16 and bool(failing) and failing.pop()
+        put(0, 10)
+        await until(lambda: not failing)
+        put(10, 3)
+        await until(lambda: rig.counters("s").samples_received == 13)
+    rig.check_books("s")
+    np.testing.assert_array_equal(rig.samples("s"), ramp(13))
+    assert rig.counters("s").frames_duplicate == 10
+    assert rig.counters("s").samples_lost == 0
 
 
 async def test_a_fifo_reply_that_ends_within_a_sample_is_counted_and_left_out():
