@@ -25,6 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from daqsvc.alarms.commands import CommandHandler
@@ -144,7 +145,7 @@ class ControlServer:
         """Begin to listen.
 
         Raises:
-            ControlError: the path is too long for a socket, or taken by something else, or not writable.
+            ControlError: the path is taken by something else, or cannot be written.
         """
         binding = asyncio.ensure_future(asyncio.to_thread(_bind, self.path))
         try:
@@ -264,11 +265,11 @@ def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOu
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
     path = store / SOCKET
-    _check_length(path)
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(timeout_s)
-            client.connect(os.fspath(path))
+            with _address(path) as address:
+                client.connect(address)
             client.sendall(_json_line(request))
             with client.makefile("rb") as answers:
                 answer = Answer.model_validate_json(answers.readline(LONGEST_LINE))
@@ -325,14 +326,14 @@ def _peer(writer: asyncio.StreamWriter) -> str:
 
 def _bind(path: Path) -> tuple[socket.socket, int]:
     """A socket that only this user can open, in place of one that was left over, and its inode; blocks."""
-    _check_length(path)
     # The mode is set under another name, no longer than its own, and nobody can connect before `listen`.
     draft = path.with_name(".control")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
         _check_free(path)
         draft.unlink(missing_ok=True)
-        made.bind(os.fspath(draft))
+        with _address(draft) as address:
+            made.bind(address)
         draft.chmod(MODE)
         draft.rename(path)
         return made, path.lstat().st_ino
@@ -359,13 +360,21 @@ def _remove(path: Path, inode: int | None) -> None:
             path.unlink()
 
 
-def _check_length(path: Path) -> None:
-    length = len(os.fsencode(path))
-    if length > LONGEST_PATH:
-        raise ControlError(
-            f"the path of the control socket {path} has {length} bytes, at most {LONGEST_PATH} are possible: "
-            "choose a store with a shorter path"
-        )
+@contextlib.contextmanager
+def _address(path: Path) -> Iterator[str]:
+    """An address for a socket at ``path``, which may be longer than the address has room for.
+
+    Raises:
+        OSError: the directory is not there.
+    """
+    if len(os.fsencode(path)) <= LONGEST_PATH:
+        yield os.fspath(path)
+        return
+    directory = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{directory}/{path.name}"
+    finally:
+        os.close(directory)
 
 
 def _first_problem(error: ValidationError) -> str:

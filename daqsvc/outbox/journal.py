@@ -24,7 +24,13 @@ from daqsvc.outbox.files import (
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.salvage import readable
 from daqsvc.outbox.sequence import SequenceMark
-from daqsvc.outbox.tables import FILL_LATEST, SCHEMA_VERSION, UNLIKELY_VERSION, bring_up_to_date
+from daqsvc.outbox.tables import (
+    FILL_LATEST,
+    SCHEMA_VERSION,
+    UNLIKELY_VERSION,
+    are_of_this_version,
+    bring_up_to_date,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -187,6 +193,8 @@ class Journal:
         version = pragma(connection, "user_version")
         if not 0 <= version < UNLIKELY_VERSION:
             raise corruption(f"schema version {version}")
+        if version > SCHEMA_VERSION and are_of_this_version(connection):
+            raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
         if version > SCHEMA_VERSION:
             raise OutboxError(
                 f"outbox {self.path} has schema version {version}, this program knows {SCHEMA_VERSION}; "

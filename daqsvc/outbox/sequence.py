@@ -65,8 +65,8 @@ class SequenceMark:
         told = line.split()
         if len(told) != 4 or _hexadecimal(told[3]) != zlib.crc32(line[: line.rindex(b" ")]):
             log.warning(
-                "outbox mark %s is damaged; sequence numbers go on from the wall clock, or from the journal if "
-                "that is ahead",
+                "outbox mark %s is damaged; sequence numbers go on from the wall clock, or from the journal "
+                "if that is ahead",
                 self._path,
             )
             return

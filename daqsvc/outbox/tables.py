@@ -42,6 +42,14 @@ INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP 
 """
 
 
+_COLUMNS = ["sequence", "topic", "payload", "retain", "sent", "wall_ns", "checksum"]
+
+
+def are_of_this_version(connection: sqlite3.Connection) -> bool:
+    """Whether the tables are those of `SCHEMA_VERSION`, whatever number the file gives for itself."""
+    return [row[1] for row in connection.execute("PRAGMA table_info(messages)")] == _COLUMNS
+
+
 def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int) -> None:
     """Create the tables in a new file, or change those of an earlier version; all or nothing.
 

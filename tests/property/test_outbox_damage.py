@@ -78,7 +78,7 @@ async def restarted(store, numbers):
         await outbox.close()
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_flipped_bytes(stores, data):
     kept, numbers = stores

@@ -35,7 +35,7 @@ FAULTS = [
     ('name = "F1"', 'name = "N"', "pipeline.rotor_bank.modes[1].name"),
     ("angle_deg = 90.0", "angle_deg = 180.0", "pipeline.rotor_bank.probes"),
     ("alert = 40.0", "alert = 90.0", "alarms[0].alert"),
-    ("latching = false", 'latching = "yes"', "alarms[2].latching"),
+    ("latching = true", 'latching = "yes"', "alarms[2].latching"),
     ('sensor = "probe-y"', 'sensor = "probe-z"', "alarms[1].sensor"),
     ("mqtts://", "mqtt://", "mqtt.url"),
     ('username = "daq"', "", "mqtt.password_file"),

@@ -256,3 +256,17 @@ def test_ballast_is_taken_where_there_is_room_and_thrown_off_once(tmp_path):
     assert not ballast.throw_off()
     Ballast(tmp_path / "ballast", MIB, reserve_bytes=free_bytes(tmp_path)).take()
     assert not (tmp_path / "ballast").exists()
+
+
+def test_a_damaged_version_number_costs_no_message_and_no_start(tmp_path, wall):
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    numbers = append(journal, 3)
+    journal.close()
+    with sqlite3.connect(path) as damaged:
+        damaged.execute("PRAGMA user_version = 258")
+    damaged.close()
+    journal = opened(path, wall)
+    assert [message.sequence for message in journal.pending(0, 10)] == numbers
+    assert journal.quarantined == 1
+    journal.close()

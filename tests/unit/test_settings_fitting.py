@@ -285,7 +285,11 @@ WARNINGS = [
     ),
     (
         LAVAL,
-        [("mqtts://", "mqtt://"), ("ca_file", "insecure = true\n# ca_file")],
+        [
+            ("mqtts://", "mqtt://"),
+            ("ca_file", "insecure = true\n# ca_file"),
+            ("enabled = true", "enabled = false"),
+        ],
         "mqtt.password_file",
         "would go to broker.example unencrypted",
     ),
