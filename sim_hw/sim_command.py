@@ -190,6 +190,9 @@ async def _until_played(nodes: Sequence[SimNode], pacer: Pacer, stop: asyncio.Ev
     """
 
     async def play() -> None:
+        # All begin together: what is sampled at the same time is sent at the same time.
+        for node in nodes:
+            await node.ready()
         async with asyncio.TaskGroup() as group:
             for node in nodes:
                 group.create_task(node.play(pacer))

@@ -66,6 +66,10 @@ class SimNode(Protocol):
     address: str
     """Where a client finds it, in words: an interface, a port, the path of a terminal."""
 
+    async def ready(self) -> None:
+        """Wait until a client is there, where that can be told."""
+        ...
+
     async def play(self, pacer: Pacer) -> None:
         """Play everything, as the pacer lets time pass."""
         ...
@@ -148,6 +152,9 @@ class CanNodes:
                 f"CAN bus {order.bus} ({interface} {channel}) cannot be opened: {error}"
             ) from error
         return cls(f"{interface} {channel}", nodes)
+
+    async def ready(self) -> None:
+        """See `SimNode.ready`: nobody can tell who listens to a CAN bus."""
 
     async def play(self, pacer: Pacer) -> None:
         """See `SimNode.play`."""

@@ -131,6 +131,9 @@ class ModbusNodes:
         address = f"127.0.0.1:{server.port}" if isinstance(server, ModbusTcpServer) else where
         return cls(address, server, nodes, replies)
 
+    async def ready(self) -> None:
+        """See `sim_hw.sim_command_nodes.SimNode.ready`: units sample whether they are asked or not."""
+
     async def play(self, pacer: Pacer) -> None:
         """See `sim_hw.sim_command_nodes.SimNode.play`; a client has time to read the last sample."""
         if self._replies is not None:

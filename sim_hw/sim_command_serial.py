@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.sim_command_nodes import NodeOrder
 
+LOOK_S = 0.01
+LINGER_S = 1.0
+"""What has not been read when a pseudo-terminal is closed is gone."""
+
 
 class SerialNodes:
     """All streams of a serial port, each a device of its own on the same cable."""
@@ -65,11 +69,17 @@ class SerialNodes:
             raise
         return cls(cable, nodes)
 
+    async def ready(self) -> None:
+        """See `sim_hw.sim_command_nodes.SimNode.ready`: whether the port is open can be told."""
+        while not self._cable.listening:  # noqa: ASYNC110 - a pseudo-terminal does not tell
+            await asyncio.sleep(LOOK_S)
+
     async def play(self, pacer: Pacer) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.play`."""
+        """See `sim_hw.sim_command_nodes.SimNode.play`; a client has time to read the last frame."""
         async with asyncio.TaskGroup() as group:
             for node in self._nodes.values():
                 group.create_task(node.play(pacer))
+        await asyncio.sleep(LINGER_S)
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `sim_hw.sim_command_nodes.SimNode.figures`."""
