@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.05
-BATCHES_UNDER_WAY = 32
+BATCHES_UNDER_WAY = 16
 SHUTDOWN_S = 0.5
 
 

@@ -27,6 +27,8 @@ SOL_SOCKET = 1
 """Linux numbers them so (asm-generic/socket.h); a control message has the option's number as its type."""
 
 _MSG_DONTWAIT = 0x40
+_MOST_PER_CALL = 1024
+"""``UIO_MAXIOV`` (linux/uio.h)."""
 _CONTROL_BYTES = 128
 _NS_PER_S = 1_000_000_000
 
@@ -64,10 +66,10 @@ class Stamps(NamedTuple):
 
 
 class DatagramBuffer:
-    """Room for datagrams, filled by one system call each time.
+    """Room for datagrams, filled by one system call for every 1024 of them.
 
     Args:
-        count: most datagrams per call (Linux takes at most 1024).
+        count: most datagrams at a time.
         size: bytes of room for each.
     """
 
@@ -88,6 +90,7 @@ class DatagramBuffer:
         self._control_lengths: NDArray[np.uint64] = self._headers["control_length"]
         self._count = count
         self._used = 0
+        self._error: OSError | None = None
         self._recvmmsg = _recvmmsg()
 
     @property
@@ -107,18 +110,30 @@ class DatagramBuffer:
         Raises:
             OSError: what the socket reports; whatever came before it has been handed over.
         """
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
         self._control_lengths[: self._used] = _CONTROL_BYTES  # the kernel overwrites what it used
         self._used = 0
-        while True:
-            taken: int = self._recvmmsg(descriptor, self._address, self._count, _MSG_DONTWAIT, None)
+        while self._used < self._count:
+            room = min(self._count - self._used, _MOST_PER_CALL)
+            at = self._address + self._used * _MMSGHDR.itemsize
+            taken: int = self._recvmmsg(descriptor, at, room, _MSG_DONTWAIT, None)
             if taken >= 0:
-                self._used = taken
-                return taken
+                self._used += taken
+                if taken < room:
+                    break
+                continue
             code = ctypes.get_errno()
             if code in {errno.EAGAIN, errno.EWOULDBLOCK}:
-                return 0
+                break
             if code != errno.EINTR:
-                raise OSError(code, os.strerror(code))
+                error = OSError(code, os.strerror(code))
+                if not self._used:
+                    raise error
+                self._error = error
+                break
+        return self._used
 
     def stamps(self) -> Stamps:
         """What the kernel said about the datagrams of the last `receive`.
@@ -126,15 +141,19 @@ class DatagramBuffer:
         The socket may ask for ``SO_TIMESTAMPNS``, with that ``SO_TIMESTAMPING`` for hardware stamps only, and
         ``SO_RXQ_OVFL``; they come in this order (``__sock_recv_timestamp``, ``sock_recv_drops``).
         """
-        n = self._used
-        lengths = self._control_lengths[:n]
+        lengths = self._control_lengths[: self._used]
         stamped = self._is(0, SO_TIMESTAMPNS, lengths)
         software = np.where(stamped, self._time(16), 0)
-        hardware_stamped = self._is(_AFTER_STAMP, SO_TIMESTAMPING, lengths) & stamped
-        # Three times: by software, a retired one, and as the hardware gave it.
-        hardware = np.where(hardware_stamped, self._time(_AFTER_STAMP + 16 + 32), 0)
+        hardware = np.zeros(self._used, np.int64)
+        longest = int(lengths.max(initial=0))
+        if longest >= _AFTER_HARDWARE_STAMP:
+            hardware_stamped = self._is(_AFTER_STAMP, SO_TIMESTAMPING, lengths) & stamped
+            # Three times: by software, a retired one, and as the hardware gave it.
+            hardware = np.where(hardware_stamped, self._time(_AFTER_STAMP + 16 + 32), 0)
         dropped: int | None = None
         for offset in (0, _AFTER_STAMP, _AFTER_HARDWARE_STAMP):
+            if longest < offset + 20:
+                break
             # The figure grows from datagram to datagram: the last one that carries it says it all.
             telling = np.flatnonzero(self._is(offset, SO_RXQ_OVFL, lengths))
             if len(telling):

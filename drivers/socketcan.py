@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-BATCH_FRAMES = 1024
+BATCH_FRAMES = 4096
 GATHER_S = 0.005
 RECEIVE_BUFFER_BYTES = 4 << 20
 """Doubled by the kernel: some 10 900 frames, more than a second of a full bus of 1 Mbit/s."""

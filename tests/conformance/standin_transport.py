@@ -48,7 +48,7 @@ class StandInSocketCan:
     jitter_ns = 1000
     latency_ns = 0
     poll_ns = 0
-    overflow_frames = 50_000
+    overflow_frames = 80_000
     cannot = {}  # noqa: RUF012
 
     def __init__(self, _folder: Path) -> None:

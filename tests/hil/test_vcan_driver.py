@@ -169,6 +169,22 @@ async def test_a_link_that_goes_down_a_hundred_times_leaves_nothing_behind(vcan:
     assert driver.streams["s"][0].samples_lost == 0
 
 
+async def test_an_adapter_that_is_unplugged_is_opened_again(vcan: VcanLink) -> None:
+    driver = driver_on(vcan, [])
+    async with running(driver):
+        for k in range(1, 6):
+            await until(lambda: driver.link.state == "up")
+            with vcan.sender() as sender:
+                sender.send(frame_bytes(0x101, (3 * k).to_bytes(2, "big") + bytes(6)))
+            await until(lambda: driver.streams["s"][0].frames_received == k)  # noqa: B023
+            await asyncio.to_thread(vcan.remove)
+            await until(lambda: driver.link.losses == k and driver.counters.open_failures >= k)  # noqa: B023
+            assert "No such device" in driver.link.reason
+            await asyncio.to_thread(vcan.add)
+        await until(lambda: driver.link.state == "up")
+    assert driver.streams["s"][0].samples_lost == 0
+
+
 async def test_bus_off_takes_the_link_down_until_the_controller_restarts(vcan: VcanLink) -> None:
     driver = driver_on(vcan, [])
     async with running(driver):

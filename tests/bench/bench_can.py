@@ -1,0 +1,239 @@
+"""How fast CAN frames are received: our SocketCAN reader, python-can's Notifier, and a bare socket.
+
+Run by ``make bench``. The frames lie ready in a local socket that carries the bytes of SocketCAN, so that it
+runs on a kernel without CAN, too. The ratios are of CPU time in one process and one run, and hold on any
+machine, however busy. At the end another process sends 50,000 frames a second for 30 s to the whole driver.
+"""
+
+# ruff: noqa: T201 - printing is what it is for
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import can
+import cantools
+import numpy as np
+from can.interfaces.socketcan.socketcan import SocketcanBus
+from can_standin import frames_bytes
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.acquisition.ring import SampleRing
+from drivers.base import BusPort, StreamSpec
+from drivers.can_batches import FrameSorter
+from drivers.can_bus import CanDriver
+from drivers.frames import FrameLayout
+from drivers.recvmmsg import SO_TIMESTAMPNS
+from drivers.socketcan import SocketCan
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+IDS = tuple(range(0x100, 0x108))
+FRAMES = 16_384
+ROUNDS = 5
+PER_FRAME = 3
+RATE_FRAMES = 50_000
+RATE_S = 30.0
+SEND_BUFFER_BYTES = 64 << 20
+_SO_SNDBUFFORCE = 32
+
+DBC = 'VERSION ""\nBU_: N\n' + "".join(
+    f"BO_ {frame_id} M{frame_id:x}: 8 N\n"
+    ' SG_ Count : 0|16@1+ (1,0) [0|65535] "" N\n'
+    + "".join(f' SG_ X{k} : {16 * (k + 1)}|16@1- (0.001,0) [-33|33] "g" N\n' for k in range(PER_FRAME))
+    for frame_id in IDS
+)
+
+
+def layout(frame_id: int) -> FrameLayout:
+    """A counter and three samples in eight bytes: what the DBC file says, too."""
+    return FrameLayout.plain(
+        frame_id=frame_id,
+        length=8,
+        channels=[("x", 16, "signed", 0.001, 0.0)],
+        samples_per_frame=PER_FRAME,
+        counter_byte=0,
+        counter_bits=16,
+        first_byte=2,
+    )
+
+
+def frames() -> list[bytes]:
+    """What eight devices send, frame by frame in turn."""
+    n = FRAMES // len(IDS)
+    samples = np.random.default_rng(0).normal(size=(n, PER_FRAME, 1))
+    index = PER_FRAME * np.arange(n, dtype=np.int64)
+    each = [frames_bytes(i, layout(i).encode(index, samples)) for i in IDS]
+    return [frame for turn in zip(*each, strict=True) for frame in turn]
+
+
+def full_socket(sent: list[bytes]) -> socket.socket:
+    """A socket that all of the frames lie in."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        ours.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, SEND_BUFFER_BYTES)
+    except PermissionError:
+        sys.exit("bench_can: the socket cannot hold the frames; run it as root")
+    theirs.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    for frame in sent:
+        ours.send(frame)
+    theirs.setblocking(False)
+    ours.detach()  # left open until the process ends: a closed end would be an end of file
+    return theirs
+
+
+SORTER = FrameSorter([StreamSpec(f"{i:x}", layout(i), 1000.0) for i in IDS])
+DATABASE = cantools.database.load_string(DBC, "dbc")
+"""The first round compiles what either of them compiles; the median leaves that out."""
+
+
+def with_reader(sock: socket.socket) -> int:
+    """Receive, sort to eight streams and decode with our reader."""
+    source = SocketCan(sock, SystemClock())
+    received = 0
+    while received < FRAMES:
+        found = SORTER.sort(source.read(0.0), source.error_classes)
+        received += sum(len(part.decoded.samples) for part in found.frames)
+    return received
+
+
+def with_notifier(sock: socket.socket) -> int:
+    """Receive with python-can's Notifier on an event loop, decode with cantools."""
+    bus = SocketcanBus.__new__(SocketcanBus)  # around our socket, as its own constructor leaves it
+    bus.socket, bus.channel, bus._bcm_sockets, bus._filters = sock, "bench", {}, None
+    bus._is_filtered, bus._periodic_tasks, bus._is_shutdown = True, [], True
+
+    async def receive() -> int:
+        received = 0
+        done = asyncio.Event()
+
+        def take(message: can.Message) -> None:
+            nonlocal received
+            DATABASE.decode_message(message.arbitration_id, message.data)
+            received += 1
+            if received == FRAMES:
+                done.set()
+
+        notifier = can.Notifier(bus, [take], loop=asyncio.get_running_loop())
+        await done.wait()
+        notifier.stop()
+        return received
+
+    return asyncio.run(receive())
+
+
+def with_bare_socket(sock: socket.socket) -> int:
+    """Receive into one buffer, decode nothing."""
+    room = bytearray(72)
+    received = 0
+    while received < FRAMES:
+        sock.recv_into(room)
+        received += 1
+    return received
+
+
+def cost_us(receive: Callable[[socket.socket], int], sent: list[bytes]) -> float:
+    """CPU microseconds per frame, the median of a few rounds."""
+    costs = []
+    for _ in range(ROUNDS):
+        with full_socket(sent) as sock:
+            begun = time.process_time()
+            received = receive(sock)
+            costs.append(1e6 * (time.process_time() - begun) / received)
+    return statistics.median(costs)
+
+
+def send_at_rate(descriptor: int) -> None:
+    """The other process: send at the rate, and say how many frames the socket did not take."""
+    refused = 0
+    with socket.socket(fileno=descriptor) as sock:
+        sock.setblocking(False)
+        n = round(RATE_FRAMES * RATE_S)
+        payloads = np.zeros((n, 8), np.uint8)
+        payloads[:, :2] = (PER_FRAME * np.arange(n)).astype(np.uint16)[:, None].view(np.uint8)
+        sent = frames_bytes(IDS[0], payloads)
+        begun = time.monotonic()
+        done = 0
+        while done < n:
+            due = min(n, int((time.monotonic() - begun) * RATE_FRAMES))
+            for frame in sent[done:due]:
+                try:
+                    sock.send(frame)
+                except BlockingIOError:
+                    refused += 1
+            done = due
+            time.sleep(0.001)
+    print(refused)
+
+
+async def at_rate() -> tuple[int, int, float]:
+    """Frames received, frames lost, and the CPU share of one core, of 30 s through the driver into a ring."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, SEND_BUFFER_BYTES)
+    rate_hz = float(RATE_FRAMES * PER_FRAME)
+    ring = SampleRing("s", ("x",), 1_000_000)
+    port = BusPort(
+        "b",
+        {"interface": "socketcan", "channel": "stand-in"},
+        [StreamSpec("s", layout(IDS[0]), rate_hz)],
+        SystemClock(),
+        ring.write,
+    )
+    driver = CanDriver(port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
+    running = asyncio.create_task(driver.run())
+    while driver.link.state != "up":
+        await asyncio.sleep(0.01)
+    sender = subprocess.Popen(  # noqa: ASYNC220 - returns at once
+        [sys.executable, __file__, "--send", str(ours.fileno())],
+        pass_fds=[ours.fileno()],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    counters = driver.streams["s"][0]
+    wanted = round(RATE_FRAMES * RATE_S)
+    while not counters.frames_received:
+        await asyncio.sleep(0.01)
+    begun, begun_at = time.process_time(), time.monotonic()
+    while sender.poll() is None:
+        await asyncio.sleep(0.2)
+    share = (time.process_time() - begun) / (time.monotonic() - begun_at)
+    output, _ = sender.communicate()
+    refused = int(output)
+    while counters.frames_received < wanted - refused:
+        await asyncio.sleep(0.05)
+    ours.close()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    return counters.samples_received // PER_FRAME, refused + counters.samples_lost // PER_FRAME, share
+
+
+def main() -> None:
+    """Measure and print."""
+    sent = frames()
+    ours, theirs, bare = (cost_us(way, sent) for way in (with_reader, with_notifier, with_bare_socket))
+    print(
+        f"SocketCAN reader  {ours:6.2f} us of CPU per frame: received, time-stamped, sorted by 8 ids, decoded"
+    )
+    print(f"Notifier+cantools {theirs:6.2f} us per frame on the same frames: {theirs / ours:.1f} times that")
+    print(
+        f"bare recv_into    {bare:6.2f} us per frame, decoding nothing: ours has {bare / ours:.2f} its speed"
+    )
+    received, lost, share = asyncio.run(at_rate())
+    print(
+        f"{RATE_FRAMES} frames/s     {received} received and {lost} lost in {RATE_S:.0f} s, through driver "
+        f"and time base into the ring, at {100 * share:.0f} % of one core"
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--send"]:
+        send_at_rate(int(sys.argv[2]))
+    else:
+        main()
