@@ -14,6 +14,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.levels import LevelDetector
 from daqsvc.settings import load_machine_file, parse_machine_file
+from drivers.frames import FrameLayout
 
 FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"))
 
@@ -22,7 +23,9 @@ FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"
 def test_frames_of_every_example_decode_to_the_sensors_units(file: Path) -> None:
     machine = load_machine_file(file)
     for name in machine.streams:
-        layout = assembly_drivers.frame_layout(machine, name)
+        layout = assembly_drivers.stream_layout(machine, name)
+        if not isinstance(layout, FrameLayout):
+            continue
         middle = np.tile(layout.offset, (3, 1, 1)) + 5 * layout.scale
         index = layout.samples_per_frame * np.arange(3, dtype=np.int64)
         back = layout.decode(layout.encode(index, middle))
