@@ -62,6 +62,7 @@ async def test_a_driver_that_was_stopped_can_run_again(transport: Transport) -> 
     rig.check_indices()
     assert rig.counters.samples_lost > 0
     assert rig.driver.link.losses == 0, "to be stopped is no loss"
+    assert rig.counters.frames_duplicate == rig.counters.frames_late == 0, "something was read twice"
 
 
 async def test_absent_at_start_is_an_error_if_the_machine_file_says_so(transport: Transport) -> None:
@@ -188,6 +189,19 @@ async def test_frames_dropped_are_counted_as_samples_lost(transport: Transport) 
     rig.check_indices()
     assert rig.counters.samples_lost == 4 * transport.samples_per_frame
     assert rig.counters.gaps == 2
+
+
+@pytest.mark.needs("drop")
+async def test_what_is_held_back_for_a_late_frame_is_handed_over_at_the_end(transport: Transport) -> None:
+    async with Rig(transport) as rig:
+        await rig.until_up()
+        await rig.send(5)
+        transport.device.drop()
+        await rig.send(2)
+    rig.check_books()
+    rig.check_indices()
+    assert rig.counters.samples_received == 6 * transport.samples_per_frame
+    assert rig.counters.samples_lost == transport.samples_per_frame
 
 
 @pytest.mark.needs("duplicate")
