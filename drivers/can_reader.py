@@ -133,4 +133,6 @@ def close_quietly(source: CanSource) -> None:
 
 def words(error: BaseException) -> str:
     """An error as a person should read it."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     return f"{error}" or type(error).__name__
