@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
+from daqsvc.diagnosis.standstill import StandstillWatch
 from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
 
 if TYPE_CHECKING:
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 MIN_PRESENT = 0.5
 """Share of a window's samples that must be there for its levels to be given."""
+
+_GLITCH = 2
+"""So few samples beyond the gap limits inside a window are interference, not the probe."""
 
 SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
 
@@ -41,7 +45,7 @@ class Limits(NamedTuple):
 
 
 class GapCheck(NamedTuple):
-    """OK limits of a proximity probe (API 670): its mean gap voltage must lie between them.
+    """OK limits of a proximity probe (API 670): its gap voltage must lie between them all the time.
 
     Attributes:
         volts_per_unit: gap voltage per unit of displacement.
@@ -107,6 +111,7 @@ class LevelDetector:
         self._channels = tuple(channels)
         self._band_hz = velocity_band_hz
         self._decided: dict[str, Severity] = {}
+        self._standstills = {channel.sensor: StandstillWatch() for channel in self._channels}
         self._next_index = 0
 
     def warm(self) -> None:
@@ -147,7 +152,9 @@ class LevelDetector:
             )
             return self._statement(channel, {}, first_index, end_index, t_ns, "missing", reason)
         statistics = self._measure(channel, samples)
-        reason = _why_not_ok(channel, statistics, samples[present])
+        known = samples[present]
+        still = self._standstills[channel.sensor].take(known)
+        reason = _beyond_gap(channel, statistics, known) or _dead(channel, len(known), *still)
         quality: DataQuality = "not_ok" if reason else "good"
         return self._statement(channel, statistics, first_index, end_index, t_ns, quality, reason)
 
@@ -222,16 +229,41 @@ def _severity(value: float, limits: Limits) -> Severity:
     return "normal"
 
 
-def _why_not_ok(channel: LevelChannel, statistics: Mapping[str, float], present: NDArray[np.float32]) -> str:
+def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: NDArray[np.float32]) -> str:
     gap = channel.gap
-    if gap is not None and not gap.low_v <= statistics["gap_voltage"] <= gap.high_v:
+    if gap is None:
+        return ""
+    volts = gap.zero_v + known.astype(np.float64) * gap.volts_per_unit
+    beyond = (volts < gap.low_v) | (volts > gap.high_v)
+    count, mean_v = int(beyond.sum()), statistics["gap_voltage"]
+    within = gap.low_v <= mean_v <= gap.high_v
+    # A gap that leaves its limits at the end of a window, or comes back at its beginning, is no glitch: the
+    # step would be taken for vibration.
+    if within and count <= _GLITCH and not (beyond[0] or beyond[-1]):
+        return ""
+    limits = f"its OK limits {gap.low_v:g} to {gap.high_v:g} V; check probe, cable and driver"
+    if not within:
+        return f"gap voltage of {channel.sensor} is {mean_v:.2f} V, outside {limits}"
+    farthest = volts[np.abs(volts - (gap.low_v + gap.high_v) / 2).argmax()]
+    return (
+        f"gap voltage of {channel.sensor} reached {farthest:.2f} V, for {count} of {len(known)} samples "
+        f"outside {limits}"
+    )
+
+
+def _dead(channel: LevelChannel, count: int, still: int, at: float) -> str:
+    if still == 0:
+        return ""
+    value = f"{round(at, 6) + 0.0:g} {channel.unit}"  # + 0.0: no "-0"
+    if still == count:
         return (
-            f"gap voltage of {channel.sensor} is {statistics['gap_voltage']:.2f} V, outside its OK limits "
-            f"{gap.low_v:g} to {gap.high_v:g} V; check probe, cable and driver"
+            f"{channel.sensor} does not move at all ({value}): dead or disconnected; "
+            "check sensor, cable and supply"
         )
-    if np.ptp(present) == 0:
-        return f"{channel.sensor} does not move at all ({present[0]:g} {channel.unit}): dead or disconnected"
-    return ""
+    return (
+        f"{channel.sensor} stood still at {value} for {still} of {count} samples: dead or disconnected for a "
+        "part of the time; check sensor, cable and supply"
+    )
 
 
 def _unit(statistic: str, unit: str) -> str:

@@ -1,0 +1,88 @@
+"""Whether a sensor was dead for a part of a window: it stood at one value for longer than it ever does.
+
+A coarse converter repeats its values, a square wave rests on two, and between impacts a quiet sensor stays
+at one. What tells a dead sensor from these is its own habit: how often a sample repeats the one before, and
+how long its other runs of one value are, in this window and in the good ones before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_SURE_NATS = 30.0
+"""A run is no chance if it was so improbable, given how often samples repeat: once in some 10^13 windows."""
+_LONGER = 6
+"""It is no habit if it is so many times as long as any other; at its crest a rounded sine rests up to 5."""
+_RUNS = 8
+"""So many other runs are needed to know a habit."""
+_REMEMBERED = 8
+"""Windows that the habit is taken from, besides the present one."""
+
+
+class _Habit(NamedTuple):
+    """Runs of one value each: how many, over how many samples, and the longest."""
+
+    runs: int
+    samples: int
+    longest: int
+
+
+class StandstillWatch:
+    """Follows one sensor from window to window; a run of one value goes on over their ends."""
+
+    def __init__(self) -> None:
+        self._habits: deque[_Habit] = deque(maxlen=_REMEMBERED)
+        self._last = math.nan
+        self._open = 0
+        self._dead = False
+
+    def take(self, samples: NDArray[np.float32]) -> tuple[int, float]:
+        """Take in the next window.
+
+        Args:
+            samples: float32 ``[n]``, finite, n at least 1; missing samples are left out.
+
+        Returns:
+            For how many samples of the window the sensor was dead (n if it never moved, 0 if it is good), and
+            the value that it stood at, in the unit of the samples.
+        """
+        starts = np.concatenate(([0], np.flatnonzero(samples[1:] != samples[:-1]) + 1))
+        inside = np.diff(np.append(starts, len(samples)))
+        runs = inside.copy()
+        if samples[0] == self._last:
+            runs[0] += self._open
+        at = self._standstill(runs, inside)
+        self._dead = at is not None
+        if at is None and len(runs) > 1:
+            # The last run may still grow: it belongs to the window in which it ends.
+            closed = runs[:-1]
+            self._habits.append(_Habit(len(closed), int(closed.sum()), int(closed.max())))
+        self._last, self._open = float(samples[-1]), int(runs[-1])
+        return (0, math.nan) if at is None else (int(inside[at]), float(samples[starts[at]]))
+
+    def _standstill(self, runs: NDArray[np.intp], inside: NDArray[np.intp]) -> int | None:
+        """Which run the sensor was dead for, if any."""
+        if len(runs) == 1:
+            return 0
+        longest = int(runs.argmax())
+        if self._no_habit_of(int(runs[longest]), np.delete(runs, longest)):
+            return longest
+        # Few samples after a standstill make no habit yet; most of the window is as dead as before.
+        goes_on = self._dead and runs[0] > inside[0] and 2 * inside[0] >= inside.sum()
+        return 0 if goes_on else None
+
+    def _no_habit_of(self, run: int, others: NDArray[np.intp]) -> bool:
+        known = [_Habit(len(others), int(others.sum()), int(others.max())), *self._habits]
+        count = sum(habit.runs for habit in known)
+        samples = sum(habit.samples for habit in known)
+        if count < _RUNS or run < _LONGER * max(habit.longest for habit in known):
+            return False
+        repeats = (samples - count + 1) / (samples + 2)  # share of samples like the one before (Laplace)
+        return -run * math.log(repeats) >= _SURE_NATS
