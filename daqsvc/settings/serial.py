@@ -218,7 +218,7 @@ class SerialLayout(Section):
         named = "" if self.stream_id is None else f"id {self.stream_id}, "
         return (
             f"{named}{self.payload_length} bytes, {self.samples_per_frame} x {len(self.channels)} samples, "
-            f"{self.counter.bits} bit {self.counter.counts}"
+            f"{self.counter.bits} bit count"
         )
 
 
@@ -294,8 +294,8 @@ class LineLayout(Section):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         named = "" if self.prefix is None else f"{self.prefix}, "
-        place = "device's time" if self.counter is None else f"{self.counter.bits} bit counter"
-        return f"{named}lines of {len(self.line)} columns, {len(self.channels)} channels, {place}"
+        place = "device's time" if self.counter is None else f"{self.counter.bits} bit count"
+        return f"{named}{len(self.channels)} of {len(self.line)} columns, {place}"
 
 
 FRAMINGS: dict[str, type[SerialBus]] = {"cobs": CobsBus, "sync": SyncBus, "lines": LinesBus}

@@ -220,6 +220,7 @@ async def test_a_framing_that_fails_costs_the_link_and_not_the_service(
             os.write(cable.fd, b"1,1\n")
             await until(lambda: driver.counters.reader_failures == 1, "the failure is counted")
             patch.undo()
+            await until(lambda: driver.link.losses == 1, "the link is given up")
             await until(lambda: driver.link.state == "up", "the port is open again")
             os.write(cable.fd, b"1,1\n2,2\n3,3\n")
             await until(lambda: driver.streams["x"][0].frames_received > 1, "samples arrive")

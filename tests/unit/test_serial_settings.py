@@ -15,7 +15,7 @@ from drivers.serial_port import SerialDriver
 SERIAL = MACHINES / "serial-probes.toml"
 COBS = 'framing = "cobs"                 # "cobs", "sync" (with sync_word = "a55a") or "lines"'
 LAYOUT = "payload_length = 64\n"
-LINE = 'line = ["seq", "vertical", "horizontal"]\n'
+LINE = 'line = ["seq", "v", "h"]\n'
 COUNTER = (
     'counter = { column = "seq", bits = 16 }    # or, without one: time = { column = "t", unit = "ms" }\n'
 )
@@ -108,14 +108,14 @@ def test_the_driver_is_found_by_its_name():
         ('column = "seq"', 'column = "sek"', "streams.casing.layout.counter.column", "no such column", "seq"),
         (
             LINE,
-            'line = ["seq", "vertical", "horizont"]\n',
+            'line = ["seq", "v", "hh"]\n',
             "streams.casing.layout.channels[1].name",
             "no such column",
-            "horizont",
+            "hh",
         ),
         (
             LINE,
-            'line = ["seq", "vertical", "horizontal", "seq"]\n',
+            'line = ["seq", "v", "h", "seq"]\n',
             "streams.casing.layout.line[3]",
             "earlier",
             "own name",
