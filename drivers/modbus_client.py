@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU
+from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.file_message import ReadFifoQueueRequest
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersRequest,
@@ -41,8 +42,6 @@ from drivers.modbus_replies import (
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from pymodbus.pdu import ModbusPDU
 
     from daqsvc.acquisition.clock import Clock
 
@@ -394,10 +393,12 @@ class _Transactions(TransactionManager):
             self._fail(f"the reply is {verdict.fault}")
             if verdict.fault == "wrong_protocol" and self.transport is not None:
                 self.transport.close()  # where the next frame begins is not known any more
-        elif self._waits and (pdu := self.framer.decoder.decode(verdict.pdu)) is not None:
+        elif self._waits:
+            # The registers are decoded in bulk later; pymodbus only needs to see that this is its reply.
             self.accepted = verdict.pdu
-            pdu.dev_id, pdu.transaction_id = self.request_dev_id, self.request_transaction_id
-            self.response_future.set_result(pdu)
+            self.response_future.set_result(
+                ModbusPDU(dev_id=self.request_dev_id, transaction_id=self.request_transaction_id)
+            )
         self._expected = None
 
     @property

@@ -30,6 +30,9 @@ BATCH_POLLS = 64
 WORTH_A_BATCH_NS = 5_000_000
 """A pause of the poll schedule in which what has been read is handed on."""
 
+EARLY_NS = 500_000
+"""How early a poll may be: no event loop sleeps for less than a millisecond."""
+
 LARGEST_DRIFT = 0.05
 ID_MODULUS = 65_536
 
@@ -170,7 +173,8 @@ class TrendReader(_AssembledReader[Trend]):
         wait_ns = self._start_ns + round(slot * self._period_ns) - now_ns
         if wait_ns > WORTH_A_BATCH_NS:
             self._hand_on()
-        await self._clock.sleep_ns(wait_ns)
+        if wait_ns > EARLY_NS:
+            await self._clock.sleep_ns(wait_ns)
         self._done = slot
         return slot
 
