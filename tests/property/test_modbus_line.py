@@ -294,7 +294,7 @@ def test_a_line_on_which_nobody_answers_is_lost_and_opened_again():
 @given(
     st.integers(0, 2**32),
     st.sampled_from([16, 32]),
-    st.sampled_from([8, 64, 256]),
+    st.sampled_from([64, 128, 256]),
     st.booleans(),
 )
 def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, serial):
@@ -330,7 +330,7 @@ def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, ser
     indices = rig.indices("s")[fresh:]
     # Every sample lies where the device's counter puts it: what is missing is exactly what is counted.
     np.testing.assert_array_equal(numbers - numbers[0], indices - indices[0])
-    assert len(numbers) > (20 if depth > 8 else 0)  # a ring of 8 is full after 40 ms, and a reply may take 30
+    assert len(numbers) > 20
 
 
 def test_a_ring_that_overruns_loses_exactly_what_the_counter_says():
