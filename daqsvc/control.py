@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from daqsvc.alarms.commands import CommandHandler
@@ -44,6 +44,7 @@ ANSWER_S = 20.0
 """How long the client waits for the service: longer than that waits for its disk."""
 
 _REQUEST: Literal["daqsvc.control/1"] = "daqsvc.control/1"
+_QUESTION = b'{"schema": "daqsvc.control/1", "verb": "standing"}'
 _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 
@@ -94,7 +95,10 @@ class Request(BaseModel):
 
 
 class Answer(BaseModel):
-    """What came of it."""
+    """What came of it.
+
+    ``waiting`` counts the alarm events that are in the service's memory only.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, populate_by_name=True)
 
@@ -102,6 +106,7 @@ class Answer(BaseModel):
     accepted: bool
     reason: str
     events: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    waiting: int = 0
 
 
 @dataclass(slots=True)
@@ -130,13 +135,17 @@ class ControlServer:
         store: the store's directory; the caller holds the store, so that a socket found there is left over.
         machine: name of the machine that the service watches.
         obey: carries a command out.
+        waiting: how many alarm events the disk has not got yet.
     """
 
-    def __init__(self, store: Path, machine: str, obey: CommandHandler) -> None:
+    def __init__(
+        self, store: Path, machine: str, obey: CommandHandler, waiting: Callable[[], int] = lambda: 0
+    ) -> None:
         self.path = store / SOCKET
         self.counters = ControlCounters()
         self._machine = machine
         self._obey = obey
+        self._waiting = waiting
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
         self._clients: set[asyncio.Task[None]] = set()
@@ -201,6 +210,8 @@ class ControlServer:
                 writer.close()
 
     async def _answer(self, line: bytes, source: str) -> Answer:
+        if line.strip() == _QUESTION:
+            return Answer(accepted=True, reason="", waiting=self._waiting())
         try:
             request = parse_request(line, self._machine)
         except ValueError as error:
@@ -253,6 +264,15 @@ def request_of(command: AlarmCommand, machine: str | None) -> Request:
         raise ControlError(f"that cannot be asked, {_first_problem(error)}") from None
 
 
+def events_waiting(store: Path, timeout_s: float = PATIENCE_S) -> int:
+    """How many alarm events the service that runs on a store has in memory only; blocks.
+
+    Raises:
+        ControlError: there is no service, it is somebody else's, or it does not answer.
+    """
+    return _asked(store, _QUESTION + b"\n", timeout_s).waiting
+
+
 def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOutcome:
     """Have the service that runs on a store carry a command out; blocks.
 
@@ -264,15 +284,20 @@ def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOu
     Raises:
         ControlError: there is no service, it is somebody else's, or it does not answer.
     """
+    answer = _asked(store, _json_line(request), timeout_s)
+    return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
+
+
+def _asked(store: Path, line: bytes, timeout_s: float) -> Answer:
     path = store / SOCKET
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.settimeout(timeout_s)
             with _address(path) as address:
                 client.connect(address)
-            client.sendall(_json_line(request))
+            client.sendall(line)
             with client.makefile("rb") as answers:
-                answer = Answer.model_validate_json(answers.readline(LONGEST_LINE))
+                return Answer.model_validate_json(answers.readline(LONGEST_LINE))
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
         raise ControlError(
             f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
@@ -291,7 +316,6 @@ def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOu
             f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); "
             "whether it has obeyed, daqsvc alarms tells"
         ) from None
-    return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
 
 
 async def _next_line(reader: asyncio.StreamReader) -> bytes | None:

@@ -125,7 +125,9 @@ class Service:
             limits=outbox_limits(machine),
             sparkplug=sparkplug_settings(machine, store),
         )
-        self.control = ControlServer(store, machine.machine.name, self.desk.obey)
+        self.control = ControlServer(
+            store, machine.machine.name, self.desk.obey, lambda: self.desk.outbox.counters.waiting
+        )
 
     @property
     def publisher(self) -> MqttPublisher | None:

@@ -103,7 +103,8 @@ class OrderCommand:
             print(f"{alarm}: {outcome.reason or _DONE[self._verb]}")  # noqa: T201
         else:
             print(f"daqsvc {name}: refused: {outcome.reason}", file=sys.stderr)  # noqa: T201
-        return EXIT_OK if outcome.accepted else EXIT_FAILED
+        # Accepted with a reason: the disk has not got it yet.
+        return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 
 
 def order_commands(load: Load) -> dict[str, OrderCommand]:

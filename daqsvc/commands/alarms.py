@@ -69,12 +69,13 @@ class AlarmsCommand:
                 events = current(store)
                 if not arguments.all:
                     events = [told for told in events if told["state"] != "normal"]
+            _show(store, events, arguments)
+            _tell_waiting(store)
         except BadFileError:
             return EXIT_BAD_FILE
         except (StoreNotFoundError, OutboxError) as error:
             print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED
-        _show(store, events, arguments)
         return EXIT_OK
 
 
@@ -91,3 +92,19 @@ def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespa
         print(alarm_table.current(standing(store, events), time.time_ns()))  # noqa: T201
     else:
         print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201
+
+
+def _tell_waiting(store: Path) -> None:
+    """Say so if the journal is not how things stand: the service has events that the disk has not got."""
+    from daqsvc.control import ControlError, events_waiting  # noqa: PLC0415
+
+    try:
+        waiting = events_waiting(store)
+    except ControlError:
+        return  # no service, or one that this user may not ask: the journal is all there is
+    if waiting:
+        print(  # noqa: T201 - what goes wrong goes to stderr
+            f"daqsvc alarms: {waiting} events wait in the service's memory for a disk that cannot be "
+            "written: this is not how the alarms stand by now; make room on the disk",
+            file=sys.stderr,
+        )

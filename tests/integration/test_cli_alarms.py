@@ -17,6 +17,8 @@ from brokers import eventually, free_port
 from can_gateway import MACHINE, CanGateway, daqsvc_run
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
+from daqsvc.control import ControlServer
 from daqsvc.outbox.store import Outbox
 
 if TYPE_CHECKING:
@@ -343,3 +345,25 @@ async def test_what_cannot_be_meant_is_never_asked(arguments: list[str], why: st
     code, out, err = await daqsvc(*arguments)
     assert (code, out) == (2, "")
     assert why in err
+
+
+async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
+    """The journal alone would show an older state as the present one."""
+    outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    await outbox.open()
+    await outbox.close()
+
+    async def obey(command: AlarmCommand, source: str) -> CommandOutcome:
+        return CommandOutcome(accepted=True, reason="done, but the journal cannot be written yet", events=())
+
+    server = ControlServer(tmp_path, "rig", obey, lambda: 3)
+    await server.open()
+    try:
+        code, _, err = await daqsvc("alarms", "--store", tmp_path)
+        assert code == 0
+        assert "3 events wait in the service's memory" in err
+        code, out, _ = await daqsvc("ack", "shaking", "--store", tmp_path)
+        assert "cannot be written yet" in out
+        assert code == 1, "0 says that it is on disk"
+    finally:
+        await server.close()

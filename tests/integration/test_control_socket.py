@@ -17,7 +17,7 @@ from brokers import eventually
 
 from daqsvc import control
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.control import ControlError, ControlServer, Request, ask
+from daqsvc.control import ControlError, ControlServer, Request, ask, events_waiting
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -83,6 +83,7 @@ async def test_a_request_becomes_a_command_with_the_kernels_word_for_who_asks(tm
         "accepted": True,
         "reason": "",
         "events": ["edge-1-17"],
+        "waiting": 0,
     }
     (told,) = desk.told
     command = AlarmCommand(
@@ -244,6 +245,17 @@ async def test_a_socket_that_a_killed_service_left_is_replaced(tmp_path: Path) -
         await asyncio.to_thread(ask, tmp_path, RESET)
     async with serving(tmp_path) as server:
         assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
+
+
+async def test_what_waits_in_memory_is_told_to_who_asks(tmp_path: Path) -> None:
+    server = ControlServer(tmp_path, MACHINE, Desk(), lambda: 7)
+    await server.open()
+    try:
+        assert await asyncio.to_thread(events_waiting, tmp_path) == 7
+    finally:
+        await server.close()
+    with pytest.raises(ControlError, match="no daqsvc runs"):
+        events_waiting(tmp_path)
 
 
 async def test_what_is_in_the_way_and_no_socket_is_left_alone(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from brokers import LOOPBACK, Mosquitto, TcpProxy, eventually, free_port, runnin
 from sparkplug_host import Host, seen
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -71,7 +72,14 @@ class Machine:
         )
 
     async def says(self, decision: str, severity: str = "alert") -> None:
-        for event in self._manager.take(said(decision, severity)):
+        await self._tell(self._manager.take(said(decision, severity)))
+
+    async def shelves(self) -> None:
+        command = AlarmCommand(verb=Verb.SHELVE, alarm="rotor-fault", by="me", duration_s=60.0)
+        await self._tell(self._manager.obey(command))
+
+    async def _tell(self, events) -> None:
+        for event in events:
             topic = TOPICS.alarm("rig", event.alarm)
             await self._outbox.append(
                 topic, lambda sequence, event=event: alarm_payload(event, sequence).to_json(), retain=True
@@ -369,7 +377,7 @@ async def test_tck_id_message_flow_edge_node_birth_publish_phid_wait(broker, out
     async with Host(broker.port) as host:
         host.say_state(online=False, timestamp=1000)
         async with edge_node(outbox, tmp_path, broker.port, primary_host="scada") as edge:
-            await eventually(lambda: edge.counters.connected, "the node is connected")
+            await eventually(lambda: "STATE/scada (QoS 1)" in broker.log_text, "the node listens")
             host.say_state(online=True, timestamp=999)
             await eventually(lambda: edge.counters.states_refused == 1, "the old word is left alone")
             assert not host.messages
@@ -428,6 +436,16 @@ async def test_tck_id_operational_behavior_edge_node_intentional_disconnect_ndea
         assert [message.kind for message in host.messages] == ["NBIRTH", "DBIRTH", "NDEATH"]
         said_last = broker.log_text.rindex("NDEATH/edge-1'")
         assert said_last < broker.log_text.index("Received DISCONNECT from edge-1-sparkplug")
+
+
+async def test_a_shelved_alarm_still_says_that_its_condition_stands(broker, outbox, tmp_path) -> None:
+    machine = Machine(outbox)
+    async with Host(broker.port) as host, edge_node(outbox, tmp_path, broker.port):
+        await born(host)
+        await machine.says("F1")
+        await machine.shelves()
+        await eventually(lambda: "shelved" in host.told(STATE, historical=False), "it is shelved")
+        assert host.told("Alarms/rig/rotor-fault/Active", historical=False) == [True]
 
 
 async def test_tck_id_operational_behavior_device_ddeath(broker, outbox, tmp_path) -> None:

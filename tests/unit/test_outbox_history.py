@@ -267,6 +267,6 @@ def test_a_damaged_version_number_costs_no_message_and_no_start(tmp_path, wall):
         damaged.execute("PRAGMA user_version = 258")
     damaged.close()
     journal = opened(path, wall)
-    assert [message.sequence for message in journal.pending(0, 10)] == numbers
     assert journal.quarantined == 1
     journal.close()
+    assert kept(path) == numbers

@@ -69,24 +69,32 @@ def alarm_metrics(payload: bytes) -> list[Metric]:
     """
     told = AlarmPayload.model_validate_json(payload)
     state, level = AlarmState(told.state), Level.of(told.level)
+    own = AlarmState(told.covered) if told.covered is not None else state
     words = (told.message, told.occurrence, told.id)
-    return _alarm(f"{told.machine}/{told.alarm}", state, level, words, told.wall_ns // NS_PER_MS)
+    return _alarm(f"{told.machine}/{told.alarm}", (state, own), level, words, told.wall_ns // NS_PER_MS)
 
 
 def quiet_alarm(machine: str, alarm: str) -> list[Metric]:
     """The metrics of an alarm that has never been raised."""
-    return _alarm(f"{machine}/{alarm}", AlarmState.NORMAL, Level.NORMAL, ("", None, None), None)
+    normal = (AlarmState.NORMAL, AlarmState.NORMAL)
+    return _alarm(f"{machine}/{alarm}", normal, Level.NORMAL, ("", None, None), None)
 
 
 def _alarm(
-    name: str, state: AlarmState, level: Level, words: tuple[str, str | None, str | None], at_ms: int | None
+    name: str,
+    states: tuple[AlarmState, AlarmState],
+    level: Level,
+    words: tuple[str, str | None, str | None],
+    at_ms: int | None,
 ) -> list[Metric]:
+    """The metrics; ``states`` are what is shown, and the alarm's own below what covers it."""
+    shown, own = states
     message, occurrence, event = words
     values: list[tuple[str, DataType, bool | int | str | None]] = [
-        ("State", DataType.STRING, state.value),
+        ("State", DataType.STRING, shown.value),
         ("Level", DataType.INT32, int(level)),
-        ("Active", DataType.BOOLEAN, state.is_active),
-        ("Acknowledged", DataType.BOOLEAN, state in _ACKNOWLEDGED),
+        ("Active", DataType.BOOLEAN, own.is_active),
+        ("Acknowledged", DataType.BOOLEAN, own in _ACKNOWLEDGED),
         ("Message", DataType.STRING, message),
         ("Occurrence", DataType.STRING, occurrence),
         ("Event", DataType.STRING, event),
