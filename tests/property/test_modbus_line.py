@@ -301,7 +301,7 @@ def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, ser
     rng = random.Random(seed)
     rate_hz = 200.0
     layout = Ring(1, "holding", Count(0, bits), 100, depth, SAMPLE, poll_ns=5_000_000)
-    faults = ["none"] * 12 + ["silent", "exception", "truncated", "oversized", "wrong unit"]
+    faults = ["none"] * 60 + ["silent", "exception", "truncated", "oversized", "wrong unit"]
 
     def plan(_unit, _pdu):
         return Answer(rng.choice(faults), rng.randrange(30_000_000))
