@@ -105,7 +105,7 @@ def test_what_one_view_does_not_see_does_not_count() -> None:
 
 def test_explained_lines_speak_for_nothing_else() -> None:
     evidence = LineEvidence(np.ones(2100), np.zeros(2100, dtype=bool), PER_ORDER)
-    rest = evidence.without([3.6])
+    rest = evidence.without(evidence.about([3.6]))
     assert rest.at(3.6) == 0.0
     assert rest.at(3.7) > 0.0
     assert evidence.at(3.6) > 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence
@@ -61,12 +61,14 @@ def decide(
             passed[part] = _against(evidence[part], before, rules, passed[part])
             if changed:
                 passed[part] = max(passed[part], _grown(part, evidence[part], before, rules))
+    _overshadow(passed, evidence, rules)
     sure = max(passed.values())
-    fault = sure**STEEPNESS / (1.0 + sure**STEEPNESS)
+    open_to = _belief_strength(passed, evidence, rules)
+    fault = max(_odds_share(max(open_to.values())), _regular(evidence, rules))
     candidates = tuple(part for part in PARTS if passed[part] >= 1.0)
     rest: RaceWord = "changed" if changed else "normal"
     if not candidates:
-        belief = {rest: 1.0 - fault} | _shares(passed, fault)
+        belief = {rest: 1.0 - fault} | _shares(open_to, fault)
         return Decision(rest, (rest,), belief, 1.0 / max(sure, LEAST_FACTOR))
     weight = {part: weight_of(part, evidence[part], rules) for part in candidates}
     belief = {rest: 1.0 - fault} | _shares(weight, fault)
@@ -79,6 +81,37 @@ def decide(
     group = tuple(part for part in candidates if weight[part] * rules.group_factor >= weight[best])
     open_race = all(race in group for race in RACES)
     return Decision("inner_or_outer" if open_race else best, group, belief, margin)
+
+
+def _belief_strength(
+    passed: Mapping[Part, float], evidence: Mapping[Part, PartEvidence], rules: RaceRules
+) -> dict[Part, float]:
+    """By which factor each part passes, or would at most be on the fence if it were testable."""
+    return {
+        part: passed[part] if e.testable else min(1.0, _passed(part, replace(e, testable=True), rules))
+        for part, e in evidence.items()
+    }
+
+
+def _odds_share(factor: float) -> float:
+    """Belief in a fault by the factor that its limits are passed by."""
+    odds = float(factor**STEEPNESS)
+    return odds / (1.0 + odds)
+
+
+def _regular(evidence: Mapping[Part, PartEvidence], rules: RaceRules) -> float:
+    """Least belief in a fault: lines that no noise makes are no good order, however small."""
+    return rules.regular_doubt if any(e.z >= rules.regular_z for e in evidence.values()) else 0.0
+
+
+def _overshadow(passed: dict[Part, float], evidence: Mapping[Part, PartEvidence], rules: RaceRules) -> None:
+    """Name no part beside a stronger one that cannot be named: what made its lines may have made these."""
+    weight = {part: weight_of(part, evidence[part], rules) for part in PARTS}
+    for part in PARTS:
+        for other in PARTS:
+            strong = evidence[other].z >= rules.strong_z and weight[other] > weight[part]
+            if strong and passed[other] < 1.0 <= passed[part]:
+                passed[part] = max(passed[other], weight[part] / weight[other])
 
 
 def weight_of(part: Part, e: PartEvidence, rules: RaceRules) -> float:

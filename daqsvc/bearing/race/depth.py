@@ -34,9 +34,19 @@ class ModulationDepth:
 
     def __init__(self, power: Real, notched: NDArray[np.bool_], bins_per_order: float) -> None:
         self.floor = noise_floor(power, bins_per_order)
+        self._power = power
+        self._notched = notched
         self._bins_per_order = bins_per_order
         above = np.where(notched, 0.0, power - self.floor)
         self._summed = np.concatenate(([0.0], np.cumsum(above)))
+
+    def without(self, explained: NDArray[np.bool_]) -> ModulationDepth:
+        """The same with nothing in some bins.
+
+        Args:
+            explained: ``[bins]``.
+        """
+        return ModulationDepth(self._power, self._notched | explained, self._bins_per_order)
 
     def line(self, order: Real) -> Real:
         """Squared modulation indices of the lines at some orders, 0 where nothing is above the noise.

@@ -26,6 +26,7 @@ from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.speed import shaft_rate
 from daqsvc.bearing.race.verdict import (
     PARTS,
+    PLACES,
     EnvelopeSpectrum,
     Part,
     PartEvidence,
@@ -122,6 +123,13 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     evidence = features.evidence
     notes = [*features.notes, *features.repairs]
     notes += [f"{part} not testable here: {e.reason}" for part, e in evidence.items() if not e.testable]
+    if decision.verdict == "normal":
+        notes += [
+            f"lines of the {PLACES[part]} stand out (z {e.z:.1f}), too small for damage (size {e.depth:.2f}, "
+            f"severity {e.severity:.1f} of {e.limit:.1f})"
+            for part, e in evidence.items()
+            if e.testable and e.z >= rules.regular_z and e.severity < e.limit
+        ]
     if decision.both:
         z = " and ".join(f"{evidence[part].z:.1f}" for part in RACES)
         notes.append(f"inner and outer race both stand out (z {z}): both may be damaged")

@@ -44,14 +44,18 @@ class LineEvidence:
     notched: NDArray[np.bool_]
     bins_per_order: float
 
-    def without(self, orders: Iterable[float]) -> LineEvidence:
-        """The same with no evidence about some orders: what is explained by another part's lines."""
-        left = self.log_ratio.copy()
+    def about(self, orders: Iterable[float]) -> NDArray[np.bool_]:
+        """Bins whose evidence lines at some orders explain, ``[bins]``."""
+        explained = np.zeros(len(self.log_ratio), dtype=np.bool_)
         for order in orders:
             reach = max(EXPLAINED_SHARE * order * self.bins_per_order, EXPLAINED_BINS)
             centre = order * self.bins_per_order
-            left[max(int(centre - reach), 0) : int(centre + reach) + 2] = 0.0
-        return replace(self, log_ratio=left)
+            explained[max(int(centre - reach), 0) : int(centre + reach) + 2] = True
+        return explained
+
+    def without(self, explained: NDArray[np.bool_]) -> LineEvidence:
+        """The same with no evidence in some bins: what another part's lines explain."""
+        return replace(self, log_ratio=np.where(explained, 0.0, self.log_ratio))
 
     def at(self, order: float) -> float:
         """Log-likelihood ratio in nats for a line at an order; 0 beyond the spectrum."""

@@ -17,6 +17,9 @@ class RaceRules:
         slip: how far the fault orders may be from the stated ones, as a share.
         z_limit: significance from which a part may be named.
         z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
+        strong_z: significance from which a part that cannot be named keeps a weaker one from being named.
+        regular_z: significance that no noise has, from which lines too small for damage are told.
+        regular_doubt: least belief in damage with such lines.
         severity_limit: of a race; ``z`` times ``depth``.
         ball_severity_limit: of a ball.
         unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
@@ -48,6 +51,9 @@ class RaceRules:
     slip: float = 0.015
     z_limit: float = 5.0
     z_unresolved: float = 1.5
+    strong_z: float = 8.0
+    regular_z: float = 9.0
+    regular_doubt: float = 0.1
     severity_limit: float = 3.0
     ball_severity_limit: float = 2.2
     unseen_caution: float = 2.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,8 @@ from daqsvc.bearing.race.null import REVOLUTIONS, false_alarm_probability, signi
 from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 
 SHARPEN_SHARE = 0.01
 """How far the deepest lines may be from the most significant comb, as a share."""
+LEAST_KEPT = 0.25
+"""Share of its weight that a part keeps at least when it is asked which part explains the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +46,11 @@ class EnvelopeView:
     lines: LineEvidence
     depth: ModulationDepth
     power: Real
+
+    def without(self, orders: Iterable[float]) -> EnvelopeView:
+        """The same with nothing at some orders."""
+        explained = self.lines.about(orders)
+        return EnvelopeView(self.lines.without(explained), self.depth.without(explained), self.power)
 
 
 def view_of(phases: Real, sizes: Real, revolutions: float) -> EnvelopeView:
@@ -89,25 +99,37 @@ class Scales:
 
     def weigh(self) -> dict[Part, PartEvidence]:
         """Evidence for all parts; lines that the foremost part explains do not speak for another one."""
-        views = (self._square.lines, self._log.lines)
-        evidence = {part: self._part(part, views) for part in PARTS}
-        first = max(PARTS, key=lambda part: weight_of(part, evidence[part], self._rules))
-        explained = part_lines(first, evidence[first].order, self._bearing)
-        rest = tuple(view.without(explained) for view in views)
-        for part, e in evidence.items():
-            if part != first and e.z >= e.z_limit:
-                evidence[part] = self._part(part, rest)
-        return evidence
+        evidence = {part: self._part(part) for part in PARTS}
+        significant = [part for part in PARTS if evidence[part].z >= evidence[part].z_limit]
+        if len(significant) < 2:
+            return evidence
+        lines = {p: part_lines(p, evidence[p].order, self._bearing) for p in significant}
+        apart = {p: {q: self._part(p, lines[q]) for q in significant if q != p} for p in significant}
 
-    def _part(self, part: Part, views: tuple[LineEvidence, ...]) -> PartEvidence:
+        def foremost(one: Part, other: Part) -> Part:
+            """Of two parts the one that has more left where the other one keeps its lines."""
+            # A sideband of one part may lie where another is looked for. Where both explain each other, none
+            # has anything left, and what they were before decides.
+            own = {
+                p: weight_of(p, evidence[p], self._rules) * max(LEAST_KEPT, apart[p][q].z / evidence[p].z)
+                for p, q in ((one, other), (other, one))
+            }
+            return max(own, key=own.__getitem__)
+
+        first = reduce(foremost, significant)
+        return evidence | {p: apart[p][first] for p in significant if p != first}
+
+    def _part(self, part: Part, explained: Sequence[float] = ()) -> PartEvidence:
+        """Evidence for a part without the lines at some orders."""
         rules = self._rules
+        looks = [view.without(explained) if explained else view for view in (self._square, self._log)]
         order = fundamental(self._bearing, part)
         gap = abs(order - round(order))
-        comb = best_comb(views, self._bearing, part, self._slip)
+        comb = best_comb([look.lines for look in looks], self._bearing, part, self._slip)
         z = significance(comb.score, part, self._revolutions, self._slip)
         # Never across a harmonic of the shaft: what lies beyond it is not this part.
         reach = min(SHARPEN_SHARE, 0.5 * gap / order)
-        depths = (self._square.depth, self._log.depth)
+        depths = [look.depth for look in looks]
         found = sharpest(depths, comb.order, reach, self._revolutions)
         by_square, by_log = (float(depth.comb(np.array([found]))[0]) for depth in depths)
         steady_z = rules.steady_z * math.sqrt(self._revolutions / REVOLUTIONS)
