@@ -51,6 +51,7 @@ COMMIT_S = 5.0
 """How long an answer waits for the disk before it says that the disk has not got it yet."""
 MOST_COMMANDS = 64
 """Commands that may wait at a time; further ones are refused."""
+FORGOTTEN = "the journal was damaged and no longer knows how it stood; it begins anew"
 STOPPING = "the service is stopping; ask again when it runs"
 
 
@@ -145,6 +146,10 @@ class AlarmDesk:
         told = recall(await self.outbox.latest(), self.topics)
         for event in self.manager.resume(told, speakers):
             self._post(event)
+        if self.outbox.counters.quarantined or self.outbox.counters.vanished:
+            # The broker still shows how the forgotten alarms stood.
+            for event in self.manager.begin_anew(told, speakers, FORGOTTEN):
+                self._post(event)
 
     async def run(self) -> None:
         """Publish until `stop`; returns at once without a broker."""

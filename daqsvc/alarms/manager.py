@@ -206,11 +206,34 @@ class AlarmManager:
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
 
+    def begin_anew(
+        self, told: Iterable[AlarmEvent], speakers: Mapping[str, Sequence[str]], reason: str
+    ) -> list[AlarmEvent]:
+        """Say of every alarm that the journal does not know that it is normal, whatever was told before.
+
+        Args:
+            told: what the journal knows, as of `resume`.
+            speakers: as of `resume`.
+            reason: why the journal does not know more.
+        """
+        known = {event.alarm for event in told if event.identity == self._identity}
+        names = [ruled.alarm.name for ruled in self._ruled]
+        names += [quality_alarm(detector, sensors) for detector, sensors in speakers.items()]
+        now = self._now()
+        cause = no_statement(self._identity.machine, now)
+        return [
+            Alarm(self._identity, name, latching=False, new_occurrence=self._new_occurrence).withdraw(
+                reason, cause, now
+            )
+            for name in dict.fromkeys(names)
+            if name not in known
+        ]
+
     def _tell(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
         """Mark and count events as they come about, and say if they are a flood."""
         told = [self._marked(event) for event in events]
         now = self._now()
-        sentence = self._flood.sentence(now.t_ns)
+        sentence = self._flood.sentence(now.t_ns, self._first_out.marked)
         if sentence is not None:
             level = Level.ALERT if self._flood.flooding else Level.NORMAL
             told += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]

@@ -1,4 +1,4 @@
-"""The desk when the outbox refuses events: how each alarm stands is on disk as soon as the disk takes it."""
+"""The desk when the outbox refuses events or has lost them: disk and broker get to know how things stand."""
 
 from __future__ import annotations
 
@@ -71,3 +71,34 @@ async def test_a_newer_event_makes_the_refused_one_needless(tmp_path, monkeypatc
         assert await states(desk) == ["returned_unacknowledged"]
     finally:
         await desk.close(1.0)
+
+
+async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path) -> None:
+    """Else the broker would show them as active for ever."""
+    rules = [DiagnosisRule("fault", "bank"), DiagnosisRule("other", "bank")]
+    speakers = {"bank": ("x",)}
+    desk = AlarmDesk(IDENTITY, rules, tmp_path, CLOCK, None)
+    await desk.open()
+    desk.take(said("F1"))
+    await states(desk)
+    await desk.close(1.0)
+    journal = tmp_path / "outbox.sqlite"
+    journal.write_bytes(b"garbage!" * 8 + journal.read_bytes()[64:])
+
+    desk = AlarmDesk(IDENTITY, rules, tmp_path, CLOCK, None)
+    await desk.open()
+    await desk.resume(speakers)
+    await desk.settle(5.0)
+    told = {}
+    for message in await desk.outbox.latest():
+        payload = json.loads(message.payload)
+        told[payload["alarm"]] = (payload["kind"], payload["state"], payload["occurrence"])
+    assert told == dict.fromkeys(("fault", "other", "sensor-ok/x"), ("returned", "normal", None))
+    await desk.close(1.0)
+
+    desk = AlarmDesk(IDENTITY, rules, tmp_path, CLOCK, None)
+    await desk.open()
+    before = len(await states(desk))
+    await desk.resume(speakers)
+    assert len(await states(desk)) == before, "once"
+    await desk.close(1.0)
