@@ -65,6 +65,11 @@ class FirstOut:
             self._first.pop(group, None)
         return self.is_first(event.alarm)
 
+    @property
+    def marked(self) -> tuple[str, ...]:
+        """The alarms that hold the mark of their group, by name."""
+        return tuple(sorted(self._first.values()))
+
     def is_first(self, alarm: str) -> bool:
         """Whether ``alarm`` holds the mark of its group."""
         group = self._groups.get(alarm)

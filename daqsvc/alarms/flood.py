@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +58,13 @@ class FloodWatch:
         if self._limit is not None:
             self._called_ns.append(now_ns)
 
-    def sentence(self, now_ns: int) -> str | None:
-        """What has changed by ``now_ns``, in words for a person; None if nothing has."""
+    def sentence(self, now_ns: int, first_out: Sequence[str] = ()) -> str | None:
+        """What has changed by ``now_ns``, in words for a person; None if nothing has.
+
+        Args:
+            now_ns: monotonic time.
+            first_out: the alarms that hold the first-out mark of their group, if any does.
+        """
         limit = self._limit
         if limit is None:
             return None
@@ -65,9 +74,10 @@ class FloodWatch:
         if not self.flooding and count > limit.events:
             self.flooding = True
             self.floods += 1
+            begin = f"look at {' and '.join(first_out)} first (first out), " if first_out else ""
             return (
                 f"{count} alarms within {minutes:g} min are more than a person can attend to (limit "
-                f"{limit.events}); look at the first-out alarm first, shelve what is known"
+                f"{limit.events}); {begin}shelve what is known"
             )
         if self.flooding and 2 * count < limit.events:
             self.flooding = False

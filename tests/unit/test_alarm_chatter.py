@@ -117,6 +117,21 @@ def test_a_flood_is_an_alarm_of_its_own_counted_and_nothing_is_dropped():
     assert "only 2 alarms in the last 10 min" in over.message
 
 
+def test_a_flood_points_to_the_alarm_that_is_first_out():
+    rig = flooded()
+    flood = rig.rms(50.0, sensor="p5")[-1]
+    assert flood.message.endswith("(limit 5); look at v0 first (first out), shelve what is known")
+    assert rig.status("v0").first_out
+
+
+def test_a_flood_of_sensor_alarms_points_to_no_first_out_for_there_is_none():
+    rig = AlarmRig(LEVEL, handling=AlarmHandling(flood=FloodLimit(5, 600 * SECOND_NS)))
+    flood = [rig.rms(0.0, "missing", sensor=f"p{i}")[-1] for i in range(6)][-1]
+    assert (flood.alarm, flood.kind.value) == ("alarm-flood", "raised")
+    assert flood.message.endswith("(limit 5); shelve what is known")
+    assert not any(status.first_out for status in rig.manager.alarms.values())
+
+
 def test_a_flood_outlives_a_restart_until_a_whole_window_shows_that_it_is_over():
     rig = flooded()
     rig.rms(50.0, sensor="p5")
