@@ -31,6 +31,13 @@ _CLASSES = {"mm/s": "speed", "V": "voltage"}
 """Device classes of Home Assistant that know the unit; it has none for micrometres or g."""
 
 
+_DIGITS = {"um": 1, "mil": 2, "mm": 4, "g": 3, "m/s2": 2, "mm/s": 2, "V": 2, "rpm": 1, "deg": 1}
+"""Decimal places by unit, so that the levels of a smooth machine still show two figures or so."""
+
+_DIGITS_OF_A_NUMBER = 3
+"""Decimal places of a probability, and of what has no unit or an unknown one."""
+
+
 @dataclass(frozen=True, slots=True)
 class Discovery:
     """The discovery message of a machine.
@@ -150,7 +157,7 @@ class Discovery:
             "state_topic": self.topics.diagnosis(self.settings.machine, reading.detector),
             "value_template": _pick(reading.kind, reading.key),
             "expire_after": STALE_S,
-            "suggested_display_precision": 3 if reading.kind == "probabilities" else 1,
+            "suggested_display_precision": _DIGITS.get(reading.unit, _DIGITS_OF_A_NUMBER),
         }
         made |= _in_home_assistant(reading.unit)
         return made

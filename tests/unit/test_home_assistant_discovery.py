@@ -70,6 +70,17 @@ def test_units_are_written_as_home_assistant_writes_them():
     }
 
 
+@pytest.mark.parametrize(
+    ("unit", "small"),
+    [("g", 0.012), ("m/s2", 0.12), ("mm/s", 0.28), ("um", 1.7), ("mil", 0.07), ("mm", 0.0017), ("V", 0.25)],
+)
+def test_the_level_of_a_smooth_machine_is_not_shown_as_nothing(unit, small):
+    settings = HomeAssistantSettings("rig", readings=(Reading("d", "statistics", "rms", unit),))
+    components = Discovery(settings, Topics("daqsvc", "lab", "edge-1")).payload()["components"]
+    (digits,) = (entity["suggested_display_precision"] for entity in components.values())
+    assert round(small, digits) == small
+
+
 def test_names_that_differ_stay_apart():
     topics = Topics("daqsvc", "lab", "edge-1")
     told = {Discovery(HomeAssistantSettings(name), topics).topic for name in ("a.b", "a-b", "a_b", "a_2eb")}
