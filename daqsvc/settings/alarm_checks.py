@@ -6,7 +6,9 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm, SetpointAlarm, VotingAlarm
+from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
 from daqsvc.settings.rotor_checks import check_alarm_detector
 from daqsvc.settings.section import UnusableValueError
 
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 _TAKEN = ("alarm-flood", "trip-multiply")
 """Alarms that the service raises itself."""
 _START_UP: KeyPath = ("alarm_handling", "start_up")
+_START_UP_SIGNALS = {ROTOR_BANK: ("speed",), ROTOR_SYNCHRONOUS: ("speed", "1x.amplitude")}
+"""The detectors that go on stating their signal while the speed changes, and these signals."""
 
 
 def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
@@ -150,18 +154,39 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
         yield Finding(_START_UP, "has neither between nor change_per_s", "add one of the two, or both")
     if start_up.between is not None and not start_up.between[0] < start_up.between[1]:
         yield Finding((*_START_UP, "between"), "is no range", "write the lower end first")
-    if start_up.detector not in draft.detectors:
-        yield Finding(
-            (*_START_UP, "detector"),
-            "there is no such detector in [pipeline]",
-            choice(start_up.detector, draft.detectors),
-        )
+    yield from _start_up_signal(draft, start_up)
     if not any(isinstance(alarm, SetpointAlarm) and alarm.trip_multiply > 1 for alarm in draft.alarms):
         yield Finding(
             _START_UP,
             "has no effect: no alarm has a trip_multiply",
             "write e.g. trip_multiply = 2.0 in an alarm on a level, or remove it",
             fatal=False,
+        )
+
+
+def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
+    speaking = [name for name in draft.detectors if name in _START_UP_SIGNALS]
+    if not speaking:
+        yield Finding(
+            (*_START_UP, "detector"),
+            "no detector of this machine states a speed",
+            "write a table [pipeline.rotor_bank] or [pipeline.rotor_synchronous], or remove "
+            "[alarm_handling.start_up] and every trip_multiply",
+        )
+    elif start_up.detector not in speaking:
+        there = start_up.detector in draft.detectors or start_up.detector.startswith("levels/")
+        yield Finding(
+            (*_START_UP, "detector"),
+            "states no speed while the machine starts up"
+            if there
+            else "there is no such detector in [pipeline]",
+            choice(start_up.detector, speaking),
+        )
+    elif start_up.measure not in _START_UP_SIGNALS[start_up.detector]:
+        yield Finding(
+            (*_START_UP, "measure"),
+            f"is nothing that {start_up.detector} states while the machine starts up",
+            choice(start_up.measure, _START_UP_SIGNALS[start_up.detector]),
         )
 
 

@@ -93,7 +93,7 @@ Alarm: TypeAlias = Annotated[
 class StartUp(Section):
     """How a start-up is recognised, during which ``trip_multiply`` holds: a range, a rate, or either."""
 
-    detector: Annotated[Name, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
+    detector: Annotated[str, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
     measure: str = Field(default="speed", description="the signal among its statistics")
     between: Annotated[tuple[float, float], Field(strict=False)] | None = Field(
         default=None, description="the signal lies in this range", examples=[[300.0, 2700.0]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from machine_files import LAVAL, changed, only_problem
+from machine_files import LAVAL, MOTOR, changed, only_problem, problems_of
 
 from daqsvc import assembly
 from daqsvc.alarms.chatter import ChatterLimit
@@ -129,6 +129,18 @@ def test_evidence_and_group_reach_the_rules():
             "rotor-bank",
         ),
         (
+            [STARTS, ('detector = "rotor-bank"\nbetween', 'detector = "levels/probe-x"\nbetween')],
+            "alarm_handling.start_up.detector",
+            "states no speed while the machine starts up",
+            "take one of: rotor-bank",
+        ),
+        (
+            [STARTS, ("between = [100", 'measure = "sped"\nbetween = [100')],
+            "alarm_handling.start_up.measure",
+            "is nothing that rotor-bank states",
+            'did you mean "speed"',
+        ),
+        (
             [STARTS, ("[100.0, 500.0]", "[500.0, 100.0]")],
             "alarm_handling.start_up.between",
             "no range",
@@ -153,6 +165,14 @@ def test_what_cannot_be_is_named_with_a_remedy(replacements, key, message, remed
     assert problem.key == key
     assert message in problem.message
     assert remedy in problem.remedy
+
+
+def test_a_machine_without_a_speed_has_no_start_up():
+    start_up = '[alarm_handling.start_up]\ndetector = "levels/accel-de"\nchange_per_s = 20.0\n\n[mqtt]'
+    problem, *_ = problems_of(changed(MOTOR, ("[mqtt]", start_up))[0], MOTOR)
+    assert problem.key == "alarm_handling.start_up.detector"
+    assert problem.message == "no detector of this machine states a speed"
+    assert "[pipeline.rotor_bank] or [pipeline.rotor_synchronous]" in problem.remedy
 
 
 def test_a_start_up_without_effect_is_a_warning():
