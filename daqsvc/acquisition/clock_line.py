@@ -13,7 +13,6 @@ the 85th for others: tests/statistical/test_alignment_clocks.py draws them.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -35,6 +34,7 @@ _SUPPORT_ERROR = (2.5, 3.0)
 """The support's error in units of the gap, and of how far it lies above the least delay."""
 _MEAN_ERROR = (1.0, 2.5)
 _SIGMAS = 2.0
+_TOUCHES_NS = 1e-3
 
 
 class Bucket(NamedTuple):
@@ -69,25 +69,29 @@ class ClockLine(NamedTuple):
     error_ns: float
 
 
-def clock_line(buckets: Sequence[Bucket], nominal_ns: float, max_slope_ns: float) -> ClockLine:
+def clock_line(buckets: Sequence[Bucket] | Floats, nominal_ns: float, max_slope_ns: float) -> ClockLine:
     """The better of the two lines.
 
     Args:
-        buckets: at least two, with different sample counts.
+        buckets: at least two, with different sample counts; also as float64 ``[n, 5]``.
         nominal_ns: nominal time between samples.
         max_slope_ns: bound of the slope's magnitude.
     """
-    table = np.array(buckets, np.float64)
+    table = np.asarray(buckets, np.float64)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    x = table[:, 0]
-    late = table[:, 1] - x * nominal_ns
+    late = table[:, 1] - table[:, 0] * nominal_ns
+    # From the window's beginning on: a device may have counted for months.
+    begin = float(table[0, 0])
+    x, arrivals, mean_x, mean_late = table[:, 0] - begin, table[:, 2], table[:, 3] - begin, table[:, 4]
     slope = float(np.clip(_support_slope(x, late), -max_slope_ns, max_slope_ns))
     offset, gap, missed = _touching(x, late, slope)
-    mean_slope, spread_ns = _mean_slope(*table[:, 2:].T)
+    mean_slope, spread_ns = _mean_slope(arrivals, mean_x, mean_late)
     if spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
-        return ClockLine(slope, offset, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
+        return ClockLine(slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
     offset, gap, missed = _touching(x, late, mean_slope)
-    return ClockLine(mean_slope, offset, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed)
+    return ClockLine(
+        mean_slope, offset - mean_slope * begin, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed
+    )
 
 
 def _touching(x: Floats, late: Floats, slope: float) -> tuple[float, float, float]:
@@ -116,15 +120,16 @@ def _touching(x: Floats, late: Floats, slope: float) -> tuple[float, float, floa
 
 
 def _support_slope(x: Floats, late: Floats) -> float:
-    """Slope of the edge of the lower convex hull that spans the mean of ``x``."""
-    hull: list[tuple[float, float]] = []
-    for point in zip(x.tolist(), late.tolist(), strict=True):
-        while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
-            hull.pop()
-        hull.append(point)
-    middle = float(x.mean())
-    (x0, y0), (x1, y1) = next((a, b) for a, b in pairwise(hull) if a[0] <= middle <= b[0])
-    return (y1 - y0) / (x1 - x0)
+    """Slope of the edge of the lower convex hull that spans the mean of ``x``, which rises."""
+    split = int(np.searchsorted(x, x.mean(), side="right"))
+    left, right = 0, len(x) - 1
+    while True:
+        slope = float((late[right] - late[left]) / (x[right] - x[left]))
+        lowest = int(np.argmin(late - slope * x))
+        # Each step lowers the line where the sides meet, and there are only so many points.
+        if late[lowest] - late[left] >= slope * (x[lowest] - x[left]) - _TOUCHES_NS:
+            return slope
+        left, right = (lowest, right) if lowest < split else (left, lowest)
 
 
 def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float]:
@@ -143,8 +148,3 @@ def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float
     means = np.bincount(parts, weight * left, 2 * PARTS)[share > 0] / share[share > 0]
     deviation = float(np.sqrt((share[share > 0] * means**2).sum() / max(len(means) - 2, 1)))
     return slope, _SIGMAS * deviation * float(np.abs(centred).max() / np.sqrt(moment))
-
-
-def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    """Whether b lies on or above the line from a to c, so that it is no corner of the lower hull."""
-    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

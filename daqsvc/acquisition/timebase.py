@@ -28,6 +28,7 @@ WINDOW_BUCKETS = 600
 SETTLING_NS = 2 * NS_PER_S
 MAX_DRIFT = 0.05
 RECENT_DELAYS = 1024
+_NO_BUCKETS = np.empty((0, len(Bucket._fields)))
 
 
 class TimeBaseState(NamedTuple):
@@ -98,7 +99,7 @@ class TimeBase:
         self._last_in_frame = samples_per_frame - 1
         self._restarts = 0
         self._delays: deque[float] = deque(maxlen=RECENT_DELAYS)
-        self._buckets: deque[Bucket] = deque(maxlen=WINDOW_BUCKETS)
+        self._buckets = _NO_BUCKETS
         self._period_ns = self._nominal_ns
         self._origin: tuple[int, int] | None = None
         self._bucket_best: tuple[int, int] | None = None
@@ -168,14 +169,14 @@ class TimeBase:
         """
         if self._origin is None or not self._settled:
             return math.inf
-        first, last = self._buckets[0].x, self._buckets[-1].x
-        ahead = max(0, index - self._origin[0] - last)
+        first, last = float(self._buckets[0, 0]), float(self._buckets[-1, 0])
+        ahead = max(0.0, index - self._origin[0] - last)
         return self._error_ns * (1.0 + 2.0 * ahead / (last - first))
 
     def _forget(self) -> None:
         self._origin = self._bucket_best = None
         self._bucket_sums = (0, 0.0, 0.0)
-        self._buckets.clear()
+        self._buckets = _NO_BUCKETS
         self._delays.clear()
         self._period_ns, self._offset_ns = self._nominal_ns, 0.0
         self._error_ns = math.inf
@@ -207,7 +208,8 @@ class TimeBase:
         newest = int(y.max())
         if newest - self._bucket_start >= BUCKET_NS:
             count, sum_x, sum_late = self._bucket_sums
-            self._buckets.append(Bucket(*self._bucket_best, count, sum_x / count, sum_late / count))
+            bucket = Bucket(*self._bucket_best, count, sum_x / count, sum_late / count)
+            self._buckets = np.vstack([self._buckets[1 - WINDOW_BUCKETS :], bucket])
             self._bucket_best, self._bucket_sums = None, (0, 0.0, 0.0)
             self._bucket_start = newest
             self._support()
@@ -217,7 +219,7 @@ class TimeBase:
 
     def _support(self) -> None:
         """Lay the line under the window's arrivals."""
-        if self._buckets[-1].y_ns - self._buckets[0].y_ns < SETTLING_NS:
+        if self._buckets[-1, 1] - self._buckets[0, 1] < SETTLING_NS:
             return
         line = clock_line(self._buckets, self._nominal_ns, MAX_DRIFT * self._nominal_ns)
         self._period_ns = self._nominal_ns + line.slope_ns
