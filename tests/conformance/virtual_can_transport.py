@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import can
 import numpy as np
@@ -30,20 +31,30 @@ _serial = itertools.count()
 
 
 class PluggedBus(VirtualBus):
-    """python-can's virtual bus, as interface ``"plugged"``: lost while its channel is unplugged."""
+    """python-can's virtual bus, as interface ``"plugged"``: lost once its channel has been unplugged."""
 
-    unplugged: set[Any] = set()  # noqa: RUF012 - shared by all buses, like the cables of a rack
+    # Shared by all buses, like the cables of a rack.
+    unplugged: ClassVar[set[Any]] = set()
+    pulls: ClassVar[Counter[Any]] = Counter()
+
+    @classmethod
+    def unplug(cls, channel: Any) -> None:
+        cls.unplugged.add(channel)
+        cls.pulls[channel] += 1
+
+    @classmethod
+    def plug_in(cls, channel: Any) -> None:
+        cls.unplugged.discard(channel)
 
     def __init__(self, channel: Any = None, **options: Any) -> None:
         if channel in self.unplugged:
             raise can.CanInitializationError(f"{channel} is unplugged")
         super().__init__(channel, **options)
-        self._lost = False
+        self._pulls = self.pulls[channel]
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        # Once lost it stays lost: a cable that is back does not bring an open interface back.
-        self._lost = self._lost or self.channel_id in self.unplugged
-        if self._lost:
+        # A cable that is back, however soon, does not bring an open interface back.
+        if self.pulls[self.channel_id] != self._pulls:
             raise can.CanOperationError("Network is down", 100)
         return super()._recv_internal(min(timeout, 0.002) if timeout else timeout)
 
@@ -93,11 +104,11 @@ class CanDevice(FaultyDevice):
 
     def go_away(self) -> None:
         super().go_away()
-        PluggedBus.unplugged.add(self._channel)
+        PluggedBus.unplug(self._channel)
 
     def come_back(self) -> None:
         super().come_back()
-        PluggedBus.unplugged.discard(self._channel)
+        PluggedBus.plug_in(self._channel)
 
     def close(self) -> None:
         self.come_back()

@@ -198,5 +198,5 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
         assert sent[name] - ring.oldest_index == (
             counters[name].samples_received + counters[name].samples_lost
         ), name
-    assert min(losses.values()) >= OUTAGES
+    assert min(losses.values()) >= OUTAGES, losses
     assert sum(c.samples_lost for c in counters.values()) > 0
