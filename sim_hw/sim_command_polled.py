@@ -11,17 +11,17 @@ import numpy as np
 
 from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.modbus_node import Answer, ModbusNode, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.sim_command_nodes import NodeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from sim_hw.node_faults import NodeFaults, Window
+    from sim_hw.node_faults import Window
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.sim_command_nodes import NodeOrder
 
+LOOK_S = 0.01
 LINGER_S = 2.0
 """How long the units answer after the last sample, so that it is read."""
 
@@ -91,7 +91,7 @@ class ModbusNodes:
         address: str,
         server: ModbusTcpServer | ModbusRtuServer,
         nodes: dict[str, ModbusNode],
-        replies: ReplyFaults | None,
+        replies: ReplyFaults,
     ) -> None:
         self.address = address
         self._server = server
@@ -108,21 +108,23 @@ class ModbusNodes:
             s.stream: ModbusNode(units[layouts[s.stream].unit], layouts[s.stream], s.samples, s.rate_hz)
             for s in order.streams
         }
-        replies = None if order.faults is None else ReplyFaults(order.faults)
-        plan: Callable[[int, bytes], Answer] = _sound if replies is None else replies
+        replies = ReplyFaults(order.faults or NodeFaults())
         server: ModbusTcpServer | ModbusRtuServer
         if options["transport"] == "tcp":
             port = options["tcp_port"] if order.port is None else order.port
-            server = ModbusTcpServer(units, port=port, plan=plan)
+            server = ModbusTcpServer(units, port=port, plan=replies)
             where, remedy = f"TCP port {port} of 127.0.0.1", "--port N, and as tcp_port in the machine file"
         else:
             path = order.link or Path(options["serial_port"])
             if path.exists() and not path.is_symlink():
                 raise NodeError(f"{path} is a real port; put the simulated one elsewhere with --link PATH")
-            server = ModbusRtuServer(units, path, plan)
+            server = ModbusRtuServer(units, path, replies)
             where, remedy = str(path), "--link PATH, and as serial_port in the machine file"
         try:
-            await server.start()
+            if isinstance(server, ModbusTcpServer):
+                await server.start()
+            else:
+                server.start()
         except OSError as error:
             raise NodeError(
                 f"no Modbus server can be put at {where}: {error.strerror or error}; name another place with "
@@ -132,12 +134,13 @@ class ModbusNodes:
         return cls(address, server, nodes, replies)
 
     async def ready(self) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.ready`: units sample whether they are asked or not."""
+        """See `sim_hw.sim_command_nodes.SimNode.ready`: the first request tells."""
+        while not self._replies.injected["requests"]:  # noqa: ASYNC110 - counted where nothing waits
+            await asyncio.sleep(LOOK_S)
 
     async def play(self, pacer: Pacer) -> None:
         """See `sim_hw.sim_command_nodes.SimNode.play`; a client has time to read the last sample."""
-        if self._replies is not None:
-            self._replies.start()
+        self._replies.start()
         async with asyncio.TaskGroup() as group:
             for node in self._nodes.values():
                 group.create_task(node.play(pacer))
@@ -145,7 +148,7 @@ class ModbusNodes:
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `sim_hw.sim_command_nodes.SimNode.figures`; faults are those of the whole line."""
-        injected = {} if self._replies is None else dict(self._replies.injected)
+        injected = dict(self._replies.injected)
         return {
             name: {"samples_sent": node.samples_sent, "injected": injected}
             for name, node in self._nodes.items()
@@ -154,11 +157,6 @@ class ModbusNodes:
     async def close(self) -> None:
         """See `sim_hw.sim_command_nodes.SimNode.close`."""
         self._server.stop()
-
-
-def _sound(unit: int, pdu: bytes) -> Answer:
-    del unit, pdu
-    return Answer()
 
 
 def _holds(window: Window, t_s: float) -> bool:

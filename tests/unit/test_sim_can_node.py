@@ -1,0 +1,84 @@
+"""A simulated CAN device whose bus is lost, or is shared with a babbling node."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+
+import can
+import numpy as np
+
+from drivers.frames import FrameLayout
+from sim_hw.link_faults import FaultCounts
+from sim_hw.node_faults import Babble, NodeFaults, Window
+from sim_hw.nodes.can_node import CanNode
+
+LAYOUT = FrameLayout.plain(
+    frame_id=0x101,
+    length=64,
+    channels=[("x", 16, "signed", 0.01, 0.0)],
+    samples_per_frame=10,
+    counter_byte=0,
+    counter_bits=16,
+    first_byte=2,
+    crc_byte=62,
+)
+SAMPLES = np.random.default_rng(7).normal(0, 50, (2000, 1))
+
+
+class Wire:
+    """Stands in for the buses of one interface, which fails from one frame to another."""
+
+    channel_info = "a wire in a test"
+
+    def __init__(self, down=range(0)):
+        self.down = down
+        self.offered = 0
+        self.sent = []
+        self.opened = self.closed = 0
+
+    def open(self):
+        if self.offered in self.down:
+            raise can.CanInitializationError("no such device")
+        self.opened += 1
+        return self
+
+    def send(self, message, timeout=None):
+        self.offered += 1
+        if self.offered - 1 in self.down:
+            raise can.CanOperationError("Network is down", errno.ENETDOWN)
+        self.sent.append(message)
+
+    def shutdown(self):
+        self.closed += 1
+
+
+class AtOnce:
+    async def wait_until(self, t_ns):
+        await asyncio.sleep(0)
+
+
+async def test_frames_are_lost_and_counted_while_the_bus_is() -> None:
+    wire = Wire(down=range(50, 80))
+    node = CanNode(wire.open(), LAYOUT, SAMPLES, 640.0, reopen=wire.open)
+    await node.play(AtOnce())
+    assert (node.frames_unsent, node.frames_sent, node.samples_sent) == (30, 170, 2000)
+    counters = LAYOUT.decode(np.array([list(m.data) for m in wire.sent], np.uint8)).counter
+    assert (counters // 10).tolist() == [*range(50), *range(80, 200)]
+    node.close()
+    assert wire.opened == wire.closed
+
+
+async def test_a_babbling_node_s_frames_lie_between_the_device_s_own() -> None:
+    wire = Wire()
+    faults = NodeFaults(babble=[Babble(Window(0.5, 1.0), 100.0, 0x7)])
+    node = CanNode(wire.open(), LAYOUT, SAMPLES, 640.0, faults=faults)
+    await node.play(AtOnce())
+    ids = [message.arbitration_id for message in wire.sent]
+    assert ids.count(0x7) == 50
+    assert ids.count(0x101) == 200
+    first, last = ids.index(0x7), len(ids) - 1 - ids[::-1].index(0x7)
+    # 32 of the device's 64 frames a second pass in that half of a second.
+    assert ids[first:last].count(0x101) in {31, 32}
+    assert node.injected == FaultCounts(frames_in=200, babbled=50)
+    assert node.frames_sent == 200
