@@ -172,7 +172,8 @@ class DeviceTime:
 
     Each stamp is compared with the one expected after the stamp before it, so that a device whose rate is
     not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to a quarter
-    of a sampling period; where several samples share a stamp, have the device count. Time that goes back means that the device was restarted: the count begins at 0 again.
+    of a sampling period; where several samples share a stamp, have the device count. Time that goes back
+    means that the device was restarted: the count begins at 0 again.
 
     Args:
         rate_hz: nominal samples per second.

@@ -40,7 +40,8 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     assert [driver.name for driver in made] == list(machine.buses)
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
     detectors = assembly.detectors(machine)
-    assert any(isinstance(detector, LevelDetector) for detector in detectors)
+    watched = any(isinstance(detector, LevelDetector) for detector in detectors)
+    assert watched == (machine.pipeline.levels is not None)
     assert [rule.alarm for rule in alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
     for detector in detectors:
         detector.warm()

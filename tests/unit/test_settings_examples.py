@@ -193,8 +193,10 @@ def test_cantools_is_only_needed_for_dbc_files(monkeypatch):
 
 
 def test_secrets_and_options_are_not_described():
-    text = variant(
-        "bitrate = 500_000                #", 'bitrate = 500_000\noptions = { token = "hunter2" } #'
+    text, _ = changed(
+        TRIAXIAL,
+        ('interface = "socketcan"', 'interface = "slcan"'),
+        ("bitrate = 500_000                #", 'bitrate = 500_000\noptions = { token = "hunter2" } #'),
     )
     described = describe(parse_machine_file(text, TRIAXIAL))
     assert "hunter2" not in described
