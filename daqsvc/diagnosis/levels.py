@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.standstill import Standstill
 
 MIN_PRESENT = 0.5
 """Share of a window's samples that must be there for its levels to be given."""
@@ -154,7 +155,7 @@ class LevelDetector:
         statistics = self._measure(channel, samples)
         known = samples[present]
         still = self._standstills[channel.sensor].take(known)
-        reason = _beyond_gap(channel, statistics, known) or _dead(channel, len(known), *still)
+        reason = _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still)
         quality: DataQuality = "not_ok" if reason else "good"
         return self._statement(channel, statistics, first_index, end_index, t_ns, quality, reason)
 
@@ -251,18 +252,18 @@ def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: N
     )
 
 
-def _dead(channel: LevelChannel, count: int, still: int, at: float) -> str:
-    if still == 0:
+def _dead(channel: LevelChannel, count: int, still: Standstill | None) -> str:
+    if still is None:
         return ""
-    value = f"{round(at, 6) + 0.0:g} {channel.unit}"  # + 0.0: no "-0"
-    if still == count:
+    value = f"{round(still.value, 6) + 0.0:g} {channel.unit}"  # + 0.0: no "-0"
+    if still.samples == count:
         return (
             f"{channel.sensor} does not move at all ({value}): dead or disconnected; "
             "check sensor, cable and supply"
         )
     return (
-        f"{channel.sensor} stood still at {value} for {still} of {count} samples: dead or disconnected for a "
-        "part of the time; check sensor, cable and supply"
+        f"{channel.sensor} stood still at {value} for {still.samples} of {count} samples: dead or "
+        "disconnected for a part of the time; check sensor, cable and supply"
     )
 
 

@@ -1,4 +1,4 @@
-"""What the revolutions of two probes are worth: missing, standing still, dead, clipped.
+"""What the revolutions of two probes are worth: missing, standing still, dead (for a part too), clipped.
 
 A revolution that is worth nothing must not reach a bank or the synchronous vectors: a dead probe makes a
 straight orbit and a clipped one makes harmonics, and both look like a fault of the machine.
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.diagnosis.probe_checks import Verdict, clipped_at, stands_still
+from daqsvc.diagnosis.standstill import StandstillWatch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,12 +22,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.probe_checks import Probe
+    from daqsvc.diagnosis.standstill import Standstill
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
 POOLED_REVOLUTIONS = 4
 """So many revolutions together are searched for clipping."""
+_DROP_STEPS = 4.0
+"""A drop is more than so many of the signal's finest steps."""
 _MISSING = 0.25
 """Part of a revolution's samples that may be missing."""
 _DEAD = 0.05
@@ -110,7 +114,27 @@ class RevolutionJudge:
                         f"{probe.name}: clipped at {clipped:.6g} um; "
                         "check the gap and the range of the converter",
                     )
+            still = _dropped_to(known[:, column])
+            if still is not None:
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: stood still at {still.value:.6g} um for {still.samples} of {len(known)} "
+                    "samples of a revolution; check the probe, its cable and driver",
+                )
         return Verdict()
+
+
+def _dropped_to(signal: Floats) -> Standstill | None:
+    """The value that a signal dropped to, or came back from, for a part of a revolution; None if it did not.
+
+    A flat crest rests on one value of a coarse converter, too, but is reached in its finest steps.
+    """
+    still = StandstillWatch().take(signal)
+    if still is None:
+        return None
+    steps = np.abs(np.diff(signal))
+    ends = steps[[i for i in (still.first - 1, still.first + still.samples - 1) if 0 <= i < len(steps)]]
+    return still if ends.max(initial=0.0) > _DROP_STEPS * steps[steps > 0].min(initial=np.inf) else None
 
 
 def seen_by(vector: Complexes, axis_deg: float) -> float:

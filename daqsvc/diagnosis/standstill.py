@@ -26,6 +26,20 @@ _REMEMBERED = 8
 """Windows that the habit is taken from, besides the present one."""
 
 
+class Standstill(NamedTuple):
+    """A run of one value that a sensor was dead for.
+
+    Attributes:
+        first: its first sample, counted from the beginning of the window.
+        samples: how many of the window's samples it holds; all of them if the sensor never moved.
+        value: where the sensor stood, in the unit of the samples.
+    """
+
+    first: int
+    samples: int
+    value: float
+
+
 class _Habit(NamedTuple):
     """Runs of one value each: how many, over how many samples, and the longest."""
 
@@ -43,15 +57,11 @@ class StandstillWatch:
         self._open = 0
         self._dead = False
 
-    def take(self, samples: NDArray[np.float32]) -> tuple[int, float]:
-        """Take in the next window.
+    def take(self, samples: NDArray[np.float32] | NDArray[np.float64]) -> Standstill | None:
+        """Take in the next window; when the sensor was dead in it, None if it was alive all the time.
 
         Args:
-            samples: float32 ``[n]``, finite, n at least 1; missing samples are left out.
-
-        Returns:
-            For how many samples of the window the sensor was dead (n if it never moved, 0 if it is good), and
-            the value that it stood at, in the unit of the samples.
+            samples: float32 or float64 ``[n]``, finite, n at least 1; missing samples are left out.
         """
         starts = np.concatenate(([0], np.flatnonzero(samples[1:] != samples[:-1]) + 1))
         inside = np.diff(np.append(starts, len(samples)))
@@ -65,7 +75,9 @@ class StandstillWatch:
             closed = runs[:-1]
             self._habits.append(_Habit(len(closed), int(closed.sum()), int(closed.max())))
         self._last, self._open = float(samples[-1]), int(runs[-1])
-        return (0, math.nan) if at is None else (int(inside[at]), float(samples[starts[at]]))
+        return (
+            None if at is None else Standstill(int(starts[at]), int(inside[at]), float(samples[starts[at]]))
+        )
 
     def _standstill(self, runs: NDArray[np.intp], inside: NDArray[np.intp]) -> int | None:
         """Which run the sensor was dead for, if any."""
