@@ -94,7 +94,7 @@ def _soft(s: float, gain: float) -> float:
     return max(s - gain, 0.0) + min(s + gain, 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def slide(
     residual: Floats, normals: Floats, gains: Floats, decays: Floats, sigma: Floats, distance: Floats
 ) -> None:
@@ -113,10 +113,13 @@ def slide(
     # Both units in one pass: each waits for its own last step, and the other fills the time.
     inner, outer = sigma[0], sigma[1]
     inner_shrink, outer_shrink = 1.0 / (1.0 + decays[0]), 1.0 / (1.0 + decays[1])
+    # The shrinking is done before the threshold, which shrinks with it: one step less to wait for.
+    i1, i2, inner_gain = inner_shrink * normals[0, 0], inner_shrink * normals[0, 1], inner_shrink * gains[0]
+    o1, o2, outer_gain = outer_shrink * normals[1, 0], outer_shrink * normals[1, 1], outer_shrink * gains[1]
     for n in range(residual.shape[0]):
         r1, r2 = residual[n, 0], residual[n, 1]
-        inner = _soft(inner + normals[0, 0] * r1 + normals[0, 1] * r2, gains[0]) * inner_shrink
-        outer = _soft(outer + normals[1, 0] * r1 + normals[1, 1] * r2, gains[1]) * outer_shrink
+        inner = _soft(inner_shrink * inner + (i1 * r1 + i2 * r2), inner_gain)
+        outer = _soft(outer_shrink * outer + (o1 * r1 + o2 * r2), outer_gain)
         distance[n, 0], distance[n, 1] = inner, outer
         if np.isnan(r1 + r2):
             distance[n, 0] = distance[n, 1] = np.nan

@@ -100,7 +100,8 @@ class TwoSensorResidual:
             )
         inputs = np.empty((4 + len(y), 3))
         inputs[:4] = self._past
-        inputs[4:, :2] = y
+        # Column by column: rows of two would be copied two by two.
+        inputs[4:, 0], inputs[4:, 1] = y[:, 0], y[:, 1]
         inputs[4:, 2] = 0.0 if v is None else v
         residual = np.empty((len(y), 2))
         kernels.separate(inputs, self._design, self._memory, residual)
