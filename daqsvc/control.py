@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from daqsvc.alarms.asked import printable, refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 
 if TYPE_CHECKING:
@@ -52,20 +53,13 @@ class ControlError(Exception):
     """The control socket cannot be used; the text names it and the remedy."""
 
 
-def _printable(text: str) -> str:
-    """Text that does to a terminal nothing but stand there."""
-    if not text.isprintable():
-        raise ValueError("must be printable, in one line")
-    return text
-
-
 def _finite(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError("must be a finite number of seconds")
     return value
 
 
-_Words = Annotated[str, AfterValidator(_printable)]
+_Words = Annotated[str, AfterValidator(printable)]
 
 
 class Request(BaseModel):
@@ -234,6 +228,7 @@ def parse_request(line: bytes, machine: str) -> Request:
         request = Request.model_validate_json(line)
     except ValidationError as error:
         raise ValueError(f"the request is not valid, {_first_problem(error)}") from None
+    refuse_twice(line)
     if request.machine not in {None, machine}:
         raise ValueError(f"this service watches {machine!r}, not {request.machine!r}")
     return request

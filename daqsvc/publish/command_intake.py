@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING
 from pydantic import ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.asked import refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import stamp_now
+from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -52,7 +54,7 @@ class CommandCounters:
     Attributes:
         accepted: carried out.
         refused: refused by the alarms, e.g. a reset while the condition stands.
-        malformed: too large, not JSON, or not a command of a known version.
+        malformed: too large, not JSON, not a command of a known version, or on a topic without a verb.
         unauthorised: for a machine or a verb that the machine file does not allow.
         stale: too old, from the future, retained at the broker, here for the second time, or so many that
             a second time could not be told.
@@ -107,10 +109,10 @@ class CommandIntake:
         """Carry out the command of a message, or refuse it; the answer says which.
 
         Args:
-            message: on a topic that `Topics.commands` matches.
+            message: on a topic that `Topics.commands` or `Topics.below_commands` matches, but no answer.
         """
         topic = str(message.topic)
-        machine, _, verb = topic.removeprefix(f"{self._topics.base}/").split("/")
+        machine, _, verb = topic.removeprefix(f"{self._topics.base}/").split("/", 2)
         asked = bytes(message.payload)
         try:
             command = self._command(machine, verb, asked, retained=message.retain)
@@ -155,6 +157,11 @@ class CommandIntake:
                 f"this box takes no commands for machine {machine!r}; it watches "
                 f"{', '.join(self._settings.machines)}"
             )
+        if verb not in set(Verb):
+            self.counters.malformed += 1
+            raise CommandRefusedError(
+                f"there is no verb {verb!r}; the last part of a command's topic is one of {', '.join(Verb)}"
+            )
         if verb not in self._settings.allow:
             self.counters.unauthorised += 1
             raise CommandRefusedError(
@@ -186,13 +193,19 @@ class CommandIntake:
                 f"it has {len(asked)} bytes; a command has at most {self._settings.max_bytes}"
             )
         try:
-            return CommandPayload.model_validate_json(asked)
+            told = CommandPayload.model_validate_json(asked)
         except ValidationError as error:
             self.counters.malformed += 1
             found = [f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg']}" for e in error.errors()]
             # The names of unknown keys are the sender's: nothing of them may write a line into a log.
             shown = re.sub(r"[^ -~]", "?", "; ".join(found[:5]))[:_SHOWN_FAULTS]
             raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error
+        try:
+            refuse_twice(asked)
+        except ValueError as error:
+            self.counters.malformed += 1
+            raise CommandRefusedError(f"{error}") from error
+        return told
 
     def _check_age(self, told: CommandPayload) -> None:
         now_ns = self._clock.wall_ns()
@@ -230,7 +243,7 @@ class CommandIntake:
 
         The box may publish what the sender may not: an answer must not become an alarm, or an entity.
         """
-        own = f"{message.topic}/response"
+        own = f"{message.topic}/{ANSWER}"
         wanted = getattr(message.properties, "ResponseTopic", None)
         if not isinstance(wanted, str) or not wanted or len(wanted) > 256 or set(wanted) & set("+#\0"):
             return own

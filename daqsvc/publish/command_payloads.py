@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
+from daqsvc.alarms.asked import printable
 from daqsvc.publish.payloads import Stamped
 
-_Line = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$")]
-"""Text without line breaks or control characters: it is going to stand in logs."""
+_Line = Annotated[
+    str,
+    AfterValidator(printable),
+    Field(
+        json_schema_extra={
+            "pattern": r"^[^\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]*$"
+        }
+    ),
+]
+"""Printable text in one line; the pattern is what a schema can say of that."""
 
 
 class CommandPayload(BaseModel):
@@ -30,7 +39,7 @@ class CommandPayload(BaseModel):
     duration_s: Annotated[float, Field(gt=0)] | None = Field(
         default=None, description="how long to shelve; for shelve only"
     )
-    occurrence: Annotated[str, Field(min_length=1, max_length=64)] | None = Field(
+    occurrence: Annotated[_Line, Field(min_length=1, max_length=64)] | None = Field(
         default=None, description="refuse the command if another activation stands by now"
     )
     reason: Annotated[_Line, Field(max_length=500)] = Field(default="", description="why")

@@ -180,10 +180,13 @@ class Session:
                 self._settings.port,
                 self._topics.commands,
             )
+        if self._intake is not None:
+            # A broker that does not grant this only leaves mistakes unanswered.
+            await self._connection.watch(self._topics.below_commands, fresh_only=True)
         async for message in self._connection.incoming():
             if self._home_assistant is not None and self._home_assistant.take(message):
                 continue
-            if self._intake is None:
+            if self._intake is None or self._topics.is_answer(str(message.topic)):
                 continue
             answer = await self._intake.take(message)
             try:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+ANSWER = "response"
+"""The answer to a command goes to its topic with this below."""
+
 _NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 
 
@@ -59,6 +62,16 @@ class Topics:
     def commands(self) -> str:
         """Filter for the commands to every machine of the box."""
         return f"{self.base}/+/commands/+"
+
+    @property
+    def below_commands(self) -> str:
+        """Filter for what goes below a verb by mistake; answers lie there, too."""
+        return f"{self.base}/+/commands/+/+/#"
+
+    def is_answer(self, topic: str) -> bool:
+        """Whether a topic below a command is one of its answers, of whichever client."""
+        _, _, *below = topic.removeprefix(f"{self.base}/").split("/")
+        return any(part.startswith(ANSWER) for part in below[1:])
 
     def command(self, machine: str, verb: str) -> str:
         """Where a command to a machine is expected."""

@@ -127,6 +127,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
         (wish(duration_s="1800"), "duration_s"),
         (wish(colour="red"), "colour"),
         (wish(machine="pump"), "this service watches 'laval-rig', not 'pump'"),
+        (json.dumps(wish()).encode()[:-1] + b', "by": "eve"}\n', "key 'by' stands twice; say it once"),
         (b'{"a":' * 2000 + b"\n", "not valid"),
         (b"x" * 20_000 + b"\n", "longer than 16384 bytes"),
         (b"x" * 200_000, "longer than 16384 bytes"),

@@ -102,6 +102,31 @@ async def test_a_command_is_carried_out_and_answered(tmp_path, outbox, protocol)
     assert [(c.verb, c.alarm, c.by) for c in desk.asked] == [(Verb.ACKNOWLEDGE, "rotor-fault", "Ada")]
 
 
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_command_on_a_topic_below_a_verb_is_answered_and_its_answer_is_not(
+    tmp_path, outbox, protocol
+):
+    desk, deep = Desk(), f"{ACKNOWLEDGE}/rotor-fault"
+    with running_mosquitto(tmp_path) as mosquitto:
+        async with (
+            Consumer(mosquitto.port) as live,
+            publishing(outbox, mosquitto.port, protocol, handler=desk, commands=SETTINGS) as publisher,
+        ):
+            listens = "Sending SUBACK to daqsvc-test"
+            await eventually(lambda: mosquitto.log_text.count(listens) == 2, "the box listens")
+            await asyncio.to_thread(say, mosquitto.port, deep, command())
+            await eventually(lambda: live.on(f"{deep}/response"), "it is answered")
+            told = ResponsePayload.model_validate(live.on(f"{deep}/response")[0].payload)
+            assert "no verb 'acknowledge/rotor-fault'" in told.reason
+            await asyncio.to_thread(say, mosquitto.port, ACKNOWLEDGE, command("c2"))
+            await eventually(
+                lambda: publisher.figures()["commands"]["accepted"] == 1, "the next one is served"
+            )
+            assert publisher.figures()["commands"]["malformed"] == 1
+            await eventually(lambda: len(live.on("/response")) == 2, "one answer each")
+    assert [c.alarm for c in desk.asked] == ["rotor-fault"]
+
+
 async def test_an_mqtt5_sender_is_answered_on_its_own_topic(tmp_path, outbox):
     with running_mosquitto(tmp_path) as mosquitto:
         async with publishing(outbox, mosquitto.port, handler=Desk(), commands=SETTINGS):
@@ -140,12 +165,11 @@ async def test_a_retained_command_is_not_obeyed_at_every_reconnect(tmp_path, out
             TcpProxy(mosquitto.port) as wire,
             publishing(outbox, wire.port, protocol, handler=desk, commands=SETTINGS) as publisher,
         ):
-            await eventually(lambda: "Sending SUBACK to daqsvc-test" in mosquitto.log_text, "the box listens")
+            listens = "Sending SUBACK to daqsvc-test"
+            await eventually(lambda: mosquitto.log_text.count(listens) == 2, "the box listens")
             wire.cut()
             await eventually(lambda: publisher.counters.connections == 2, "connected again")
-            await eventually(
-                lambda: mosquitto.log_text.count("Sending SUBACK to daqsvc-test") == 2, "listening again"
-            )
+            await eventually(lambda: mosquitto.log_text.count(listens) == 4, "listening again")
             await asyncio.to_thread(say, mosquitto.port, ACKNOWLEDGE, command("new", by="Bea"))
             await eventually(
                 lambda: "new" in [m.payload["id"] for m in live.on("/response")], "the fresh one is answered"

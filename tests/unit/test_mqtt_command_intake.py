@@ -17,7 +17,7 @@ from paho.mqtt.properties import Properties
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.publish.command_intake import CommandIntake
-from daqsvc.publish.command_payloads import ResponsePayload
+from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.settings import CommandSettings
 from daqsvc.publish.topics import Topics
 
@@ -127,6 +127,16 @@ REFUSED = {
     "wrong type": ({"by": 7}, "malformed", "by: "),
     "nobody": ({"by": ""}, "malformed", "by: "),
     "line break": ({"by": "Ada\nalarm reset by root"}, "malformed", "by: "),
+    "a C1 control character": ({"by": "\u009b31mAda"}, "malformed", "by: Value error, must be printable"),
+    "a turned direction": ({"reason": "\u202eabc"}, "malformed", "reason: Value error, must be printable"),
+    "a line separator": ({"reason": "a\u2028b"}, "malformed", "reason: "),
+    "a paragraph separator": ({"occurrence": "a\u2029b"}, "malformed", "occurrence: "),
+    "a next line": ({"by": "Ada\u0085"}, "malformed", "by: "),
+    "a key twice": (
+        {"payload": json.dumps(COMMAND).encode()[:-1] + b', "by": "Eve"}'},
+        "malformed",
+        "key 'by' stands twice; say it once",
+    ),
     "no offset": ({"issued_at": "2026-11-21T12:00:00"}, "malformed", "issued_at: "),
     "a time as number": ({"issued_at": 1}, "malformed", "issued_at: "),
     "negative time": ({"duration_s": -1}, "malformed", "duration_s: "),
@@ -142,8 +152,13 @@ REFUSED = {
     ),
     "no verb": (
         {"topic": "daqsvc/lab/edge-1/rig/commands/reboot"},
-        "unauthorised",
-        "'reboot' is not allowed",
+        "malformed",
+        "no verb 'reboot'; the last part of a command's topic is one of acknowledge, reset",
+    ),
+    "a level below the verb": (
+        {"topic": "daqsvc/lab/edge-1/rig/commands/acknowledge/rotor-fault"},
+        "malformed",
+        "no verb 'acknowledge/rotor-fault'",
     ),
     "too old": ({"issued_at": LATE}, "stale", "61 s ago, with at most 60 s allowed"),
     "older than its sender wants": (
@@ -168,6 +183,28 @@ async def test_what_is_not_a_command_is_refused_counted_and_changes_nothing(
     counters = asdict(intake.counters)
     assert counters.pop(counted) == 1
     assert not any(counters.values())
+
+
+def test_the_words_of_a_name_may_have_any_letters():
+    told = CommandPayload.model_validate_json(
+        json.dumps(COMMAND | {"by": "Łukasz 李 Müller", "reason": "é µm"})
+    )
+    assert (told.by, told.reason) == ("Łukasz 李 Müller", "é µm")
+
+
+@pytest.mark.parametrize(
+    ("below", "answers"),
+    [
+        ("acknowledge", False),
+        ("acknowledge/response", True),
+        ("acknowledge/response/ada", True),
+        ("acknowledge/foo", False),
+        ("acknowledge/foo/response", True),
+        ("response", False),
+    ],
+)
+def test_an_answer_is_no_command(below, answers):
+    assert TOPICS.is_answer(f"daqsvc/lab/edge-1/rig/commands/{below}") is answers
 
 
 async def test_a_sender_may_not_allow_itself_more_time(intake, desk):
