@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import gzip
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import cantools.database
+import cantools.database.can
 import numpy as np
 import pytest
 
@@ -74,7 +74,8 @@ def played(log: Path, specs: list[StreamSpec[FrameLayout]]) -> list[Sorted]:
 @pytest.mark.parametrize("recording", RECORDINGS)
 def test_every_signal_of_every_frame_is_what_cantools_reads(data: Path, recording: str) -> None:
     log_path, dbc_path, frames = RECORDINGS[recording]
-    database = cantools.database.load_file(data / dbc_path)
+    database = cantools.database.can.Database()
+    database.add_dbc_file(str(data / dbc_path))
     messages = {f"{message.frame_id:03X}": message for message in database.messages}
     written = frames_of(data / log_path)
     assert len(written) == frames
@@ -95,8 +96,8 @@ def test_every_signal_of_every_frame_is_what_cantools_reads(data: Path, recordin
         payloads = [payload for name, payload in written if name == frame_id]
         first, *rest = (signal.name for signal in message.signals)
         counts = np.concatenate([part.decoded.counter for part in parts])
-        raw = [message.decode(p, decode_choices=False, scaling=False) for p in payloads]
-        physical = [message.decode(p, decode_choices=False) for p in payloads]
+        raw: list[Any] = [message.decode(p, decode_choices=False, scaling=False) for p in payloads]
+        physical: list[Any] = [message.decode(p, decode_choices=False) for p in payloads]
         assert counts.tolist() == [row[first] for row in raw]
         if rest:
             values = np.concatenate([part.decoded.samples[:, 0] for part in parts])
