@@ -57,7 +57,7 @@ class WhitenedBand:
     clipped: Band
 
 
-def running_median(values: Real, width: int) -> Real:
+def running_median(values: Real | NDArray[np.float32], width: int) -> Real:
     """Median over about ``width`` neighbours, from half-overlapping blocks with straight lines between.
 
     Args:
@@ -77,7 +77,7 @@ def running_median(values: Real, width: int) -> Real:
     return np.interp(np.arange(n), centres, row_medians(blocks))
 
 
-def row_medians(rows: Real) -> Real:
+def row_medians(rows: Real | NDArray[np.float32]) -> Real:
     """Median of each row, ``[rows]``: that of `numpy.median` five times as fast; NaN is not looked for.
 
     Args:
@@ -105,12 +105,12 @@ def whiten(
         median_hz: width of the local median amplitude.
     """
     per_hz = samples / rate_hz
-    part = spectrum[round(low_hz * per_hz) : round(high_hz * per_hz)]
-    amplitude = np.maximum(np.abs(part), np.finfo(np.float64).tiny)
-    median = running_median(amplitude, round(median_hz * per_hz))
+    part = spectrum[round(low_hz * per_hz) : round(high_hz * per_hz)].astype(np.complex64)
+    amplitude = np.maximum(np.abs(part), np.finfo(np.float32).tiny)
+    median = running_median(amplitude, round(median_hz * per_hz)).astype(np.float32)
     phase = part / amplitude
     clipped = phase * np.minimum(amplitude / median, CLIP_MEDIANS)
-    return WhitenedBand(phase.astype(np.complex64), clipped.astype(np.complex64))
+    return WhitenedBand(phase, clipped)
 
 
 def squared_envelope(band: Band, bins: int) -> Envelope:
@@ -153,8 +153,12 @@ def _thinned(envelope: Envelope) -> Envelope:
     """One sample of `THINNING`, after a low-pass, ``[samples / THINNING]``."""
     taps = _low_pass().astype(np.float32).reshape(-1, THINNING)
     # Each block of samples meets each block of taps once; the products are then shifted together.
-    products = envelope.reshape(-1, THINNING) @ taps.T
-    return np.asarray(np.sum([np.roll(products[:, i], -i) for i in range(len(taps))], axis=0))
+    products = taps @ envelope.reshape(-1, THINNING).T
+    thinned: Envelope = products[0]
+    for shift in range(1, len(taps)):
+        thinned[:-shift] += products[shift, shift:]
+        thinned[-shift:] += products[shift, :shift]
+    return thinned
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.fft
 from scipy.signal import oaconvolve
 
-from daqsvc.dsp.envelope import EXP_MEDIAN
+from daqsvc.dsp.envelope import EXP_MEDIAN, row_medians
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class RobustWhitening:
         segments = np.lib.stride_tricks.sliding_window_view(samples, length)[::hop]
         taper = np.hanning(length)
         centred = (segments - segments.mean(axis=1, keepdims=True)) * taper
-        amplitude = np.sqrt(np.median(np.abs(scipy.fft.rfft(centred, axis=1)) ** 2, axis=0))
+        amplitude = np.sqrt(row_medians(np.abs(scipy.fft.rfft(centred, axis=1)).T ** 2))
         frequency = scipy.fft.rfftfreq(length, 1.0 / rate_hz)
         band = (frequency >= low_hz) & (frequency <= high_hz) & (amplitude > 0.0)
         gain = np.where(band, 1.0 / np.where(band, amplitude, 1.0), 0.0)
