@@ -27,7 +27,7 @@ from daqsvc.publish.payloads import alarm_payload
 from daqsvc.publish.recall import recall
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.topics import Topics
-from daqsvc.self_check import SelfCheck, Vitals
+from daqsvc.self_check import SelfCheck, Vitals, conditions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -119,6 +119,7 @@ class AlarmDesk:
             else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock)
         )
         self._clock = clock
+        self._mqtt = mqtt
         self._self_check = SelfCheck(store, limits.reserve_bytes)
         self._free_bytes: int | None = None
         self._under_way: set[asyncio.Future[Any]] = set()
@@ -144,11 +145,11 @@ class AlarmDesk:
             speakers: the detectors that will make statements, with the sensors that these rest on.
         """
         told = recall(await self.outbox.latest(), self.topics)
-        for event in self.manager.resume(told, speakers):
+        for event in self.manager.resume(told, speakers, conditions(self._mqtt)):
             self._post(event)
         if self.outbox.counters.quarantined or self.outbox.counters.vanished:
             # The broker still shows how the forgotten alarms stood.
-            for event in self.manager.begin_anew(told, speakers, FORGOTTEN):
+            for event in self.manager.begin_anew(told, FORGOTTEN):
                 self._post(event)
 
     async def run(self) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, get_args
 
 from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.expected import handling_conditions
 from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings, MqttSettings, Reading
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
+from daqsvc.self_check import conditions
 from daqsvc.settings.broker_url import host_of, is_tls, port_of
 from daqsvc.settings.models import BEARING, ROTOR_BANK, ROTOR_SYNCHRONOUS, Keyphasor, ProximityProbe
 
@@ -27,7 +30,7 @@ def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
     def file(path: Path | None) -> Path | None:
         return None if path is None else machine.resolve(path)
 
-    return MqttSettings(
+    settings = MqttSettings(
         host=given.host,
         port=given.port,
         client_id=machine.mqtt_client_id,
@@ -44,8 +47,8 @@ def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
         protocol=given.protocol,
         telemetry_expiry_s=given.telemetry_expiry_s,
         commands=_commands(machine),
-        home_assistant=_home_assistant(machine),
     )
+    return replace(settings, home_assistant=_home_assistant(machine, settings))
 
 
 def sparkplug_settings(machine: MachineFile, store: Path) -> SparkplugSettings | None:
@@ -70,7 +73,7 @@ def sparkplug_settings(machine: MachineFile, store: Path) -> SparkplugSettings |
         client_id=given.client_id or f"{machine.mqtt_client_id}-sparkplug",
         memory=store / "sparkplug.json",
         primary_host=given.primary_host,
-        alarms=(*(alarm.name for alarm in machine.alarms), *_services(machine)),
+        alarms=(*(alarm.name for alarm in machine.alarms), *_services(machine, mqtt_settings(machine))),
         readings=tuple(_readings(machine)),
     )
 
@@ -87,7 +90,7 @@ def _commands(machine: MachineFile) -> CommandSettings | None:
     )
 
 
-def _home_assistant(machine: MachineFile) -> HomeAssistantSettings | None:
+def _home_assistant(machine: MachineFile, mqtt: MqttSettings) -> HomeAssistantSettings | None:
     given = None if machine.mqtt is None else machine.mqtt.home_assistant
     if given is None:
         return None
@@ -95,25 +98,21 @@ def _home_assistant(machine: MachineFile) -> HomeAssistantSettings | None:
         machine=machine.machine.name,
         description=machine.machine.description,
         alarms=tuple(alarm.name for alarm in machine.alarms),
-        services=tuple(_services(machine)),
+        services=tuple(_services(machine, mqtt)),
         readings=tuple(_readings(machine)),
         prefix=given.prefix,
         enabled=given.enabled,
     )
 
 
-def _services(machine: MachineFile) -> Iterator[str]:
-    """The alarms about sensors, detectors and the service itself (`AlarmManager`, `daqsvc.self_check`)."""
+def _services(machine: MachineFile, mqtt: MqttSettings | None) -> Iterator[str]:
+    """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
     if machine.pipeline.levels is not None:
         yield from (f"sensor-ok/{sensor.name}" for sensor in _measured(machine))
     yield from (f"detector-ok/{detector}" for detector in machine.detectors)
-    yield from ("store/disk", "store/journal", "store/telemetry", "store/audit-log")
-    if machine.mqtt is not None and machine.mqtt.tls:
-        yield "certificate/broker"
-        if machine.mqtt.ca_file is not None:
-            yield "certificate/ca"
-        if machine.mqtt.cert_file is not None:
-            yield "certificate/client"
+    handling = machine.alarm_handling
+    yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
+    yield from conditions(mqtt)
 
 
 def _readings(machine: MachineFile) -> Iterator[Reading]:

@@ -16,8 +16,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    from daqsvc.publish.settings import MqttSettings
+
 NS_PER_DAY = 86_400 * NS_PER_S
 MIB = 1024 * 1024
+
+STORE = ("store/disk", "store/journal", "store/damage", "store/telemetry", "store/audit-log")
+"""The conditions of the store."""
 
 CERTIFICATE = "certificate/"
 CERTIFICATE_DAYS = 14
@@ -72,6 +77,19 @@ class Vitals:
     damaged: int
     telemetry_dropped: int
     unwritten: int
+
+
+def conditions(mqtt: MqttSettings | None) -> list[str]:
+    """The names of all that can be said, so that people may act on it before it is.
+
+    Args:
+        mqtt: how to reach the broker; None without one.
+    """
+    found = list(STORE)
+    if mqtt is not None and mqtt.tls:
+        files = {"broker": True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
+        found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
+    return found
 
 
 class SelfCheck:

@@ -49,7 +49,7 @@ class AlarmRig:
         self.manager = AlarmManager(RIG, rules, self.clock, handling=self.handling)
         self.events = []
 
-    def restarted(self, speakers=None):
+    def restarted(self, speakers=None, conditions=()):
         """A service that knows nothing but the last payload of each alarm."""
         last = {}
         for event in self.events:
@@ -58,7 +58,7 @@ class AlarmRig:
         after = AlarmRig(*self.rules, handling=self.handling, clock=self.clock)
         after.events = list(self.events)
         told = [alarm_event(alarm_payload(event, 1).to_json()) for event in last.values()]
-        after.told(after.manager.resume(told, speakers or {}))
+        after.told(after.manager.resume(told, speakers or {}, conditions))
         return after
 
     def told(self, events):

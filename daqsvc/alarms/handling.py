@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.alarms.states import RefusedError
+
 if TYPE_CHECKING:
     from daqsvc.alarms.chatter import ChatterLimit
+    from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.alarms.flood import FloodLimit
     from daqsvc.alarms.start_up import StartUp
 
@@ -26,6 +30,20 @@ class AlarmHandling:
     flood: FloodLimit | None = None
     start_up: StartUp | None = None
     shelve_at_most_s: float = 86_400.0
+
+    def shelving_ns(self, command: AlarmCommand) -> int:
+        """How long a command shelves, in ns.
+
+        Raises:
+            RefusedError: it states no time, or a longer one than is allowed.
+        """
+        longest_s, duration_s = self.shelve_at_most_s, command.duration_s
+        if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
+            stated = "no time" if duration_s is None else f"{duration_s:g} s"
+            raise RefusedError(
+                f"cannot shelve {command.alarm} for {stated}; state a time above 0 and up to {longest_s:g} s"
+            )
+        return round(duration_s * 1e9)
 
 
 @dataclass(slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import uuid
 from dataclasses import replace
 from types import MappingProxyType
@@ -19,6 +18,7 @@ from daqsvc.alarms.conditions import (
     statement,
 )
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
+from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
 from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
@@ -88,6 +88,7 @@ class AlarmManager:
         self._clock = clock
         self._new_occurrence = new_occurrence
         self._handling = handling or AlarmHandling()
+        self._expected = Expected(self._handling)
         self._ruled: list[_Ruled] = []
         self._alarms: dict[str, Alarm] = {}
         self._conditions: set[str] = set()
@@ -108,7 +109,7 @@ class AlarmManager:
     def alarms(self) -> Mapping[str, AlarmStatus]:
         """How every alarm stands by now, by name.
 
-        A quality alarm or a condition of the service appears when it is first raised.
+        A quality alarm or a condition of the service appears when it is first raised, or acted on.
         """
         return MappingProxyType(
             {
@@ -119,7 +120,7 @@ class AlarmManager:
 
     @property
     def conditions(self) -> frozenset[str]:
-        """The conditions of the service that have ever been raised, also before a restart."""
+        """The conditions of the service that were ever raised or acted on, also before a restart."""
         return frozenset(self._conditions)
 
     @property
@@ -176,7 +177,12 @@ class AlarmManager:
         self.counters.commands += 1
         return self._tell([event])
 
-    def resume(self, told: Iterable[AlarmEvent], speakers: Mapping[str, Sequence[str]]) -> list[AlarmEvent]:
+    def resume(
+        self,
+        told: Iterable[AlarmEvent],
+        speakers: Mapping[str, Sequence[str]],
+        conditions: Iterable[str] = (),
+    ) -> list[AlarmEvent]:
         """Go on from where the alarms stood when the service ended; before the first diagnosis.
 
         Every alarm takes over its state, level, occurrence and holds, and holds them until a good diagnosis
@@ -187,12 +193,14 @@ class AlarmManager:
         Args:
             told: the last event of each alarm, in the order in which they were told.
             speakers: the detectors that will make statements, with the sensors that these rest on.
+            conditions: names of what the service will say of itself by `condition`.
 
         Returns:
             The events by which alarms return to normal that nobody will judge any more: the machine file
             no longer has them, or not what a quality alarm is about.
         """
         told = list(told)
+        self._expected.take(speakers, conditions)
         for ruled in self._ruled:
             named = {sensor for d in ruled.rule.detectors for sensor in speakers.get(d, ())}
             ruled.sensors = frozenset(named) or ruled.sensors
@@ -206,26 +214,22 @@ class AlarmManager:
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
 
-    def begin_anew(
-        self, told: Iterable[AlarmEvent], speakers: Mapping[str, Sequence[str]], reason: str
-    ) -> list[AlarmEvent]:
-        """Say of every alarm that the journal does not know that it is normal, whatever was told before.
+    def begin_anew(self, told: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
+        """Say of every alarm that the journal does not know that it is normal; after `resume`.
 
         Args:
             told: what the journal knows, as of `resume`.
-            speakers: as of `resume`.
             reason: why the journal does not know more.
         """
         known = {event.alarm for event in told if event.identity == self._identity}
-        names = [ruled.alarm.name for ruled in self._ruled]
-        names += [quality_alarm(detector, sensors) for detector, sensors in speakers.items()]
+        names = [*(ruled.alarm.name for ruled in self._ruled), *sorted(self._expected.names)]
         now = self._now()
         cause = no_statement(self._identity.machine, now)
         return [
             Alarm(self._identity, name, latching=False, new_occurrence=self._new_occurrence).withdraw(
                 reason, cause, now
             )
-            for name in dict.fromkeys(names)
+            for name in names
             if name not in known
         ]
 
@@ -292,7 +296,7 @@ class AlarmManager:
 
     def _timed(self, now: Instant) -> Iterator[AlarmEvent]:
         for alarm in self._alarms.values():
-            expired = alarm.expire(now, no_statement(self._identity.machine, now))
+            expired = alarm.expire(now, self._nothing(alarm.name, now))
             if expired is not None:
                 yield expired
         yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
@@ -309,10 +313,7 @@ class AlarmManager:
         return self._alarms[name].apply(Finding(level, "", sentence), cause, at)
 
     def _obeyed(self, command: AlarmCommand) -> AlarmEvent:
-        alarm = self._alarms.get(command.alarm)
-        if alarm is None:
-            known = ", ".join(sorted(self._alarms)) or "none"
-            raise RefusedError(f"no alarm is named {command.alarm!r}; there are: {known}")
+        alarm = self._named(command.alarm)
         standing = alarm.status.occurrence
         if command.occurrence is not None and command.occurrence != standing:
             stands = "it is normal" if standing is None else f"now {standing} stands"
@@ -320,17 +321,14 @@ class AlarmManager:
                 f"cannot {command.verb} {alarm.name}: occurrence {command.occurrence} is over, {stands}"
             )
         now = self._now()
-        request, nothing = (
-            Request(command.by, now, command.reason),
-            no_statement(self._identity.machine, now),
-        )
+        request, nothing = Request(command.by, now, command.reason), self._nothing(alarm.name, now)
         match command.verb:
             case Verb.ACKNOWLEDGE:
                 return alarm.acknowledge(request)
             case Verb.RESET:
                 return alarm.reset(request)
             case Verb.SHELVE:
-                return alarm.shelve(now.t_ns + self._shelving_ns(command), request, nothing)
+                return alarm.shelve(now.t_ns + self._handling.shelving_ns(command), request, nothing)
             case Verb.UNSHELVE:
                 return alarm.unshelve(request, nothing)
             case Verb.BYPASS:
@@ -338,14 +336,21 @@ class AlarmManager:
             case Verb.UNBYPASS:
                 return alarm.unbypass(request, nothing)
 
-    def _shelving_ns(self, command: AlarmCommand) -> int:
-        longest_s, duration_s = self._handling.shelve_at_most_s, command.duration_s
-        if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
-            stated = "no time" if duration_s is None else f"{duration_s:g} s"
-            raise RefusedError(
-                f"cannot shelve {command.alarm} for {stated}; state a time above 0 and up to {longest_s:g} s"
-            )
-        return round(duration_s * 1e9)
+    def _named(self, name: str) -> Alarm:
+        """The alarm of that name; one that can come by itself exists from the first command on."""
+        if name not in self._alarms and name in self._expected.names:
+            self._add(name, latching=False)
+            self._conditions.update({name} & self._expected.conditions)
+        if name not in self._alarms:
+            known = ", ".join(sorted({*self._alarms, *self._expected.names})) or "none"
+            raise RefusedError(f"no alarm is named {name!r}; there are: {known}")
+        return self._alarms[name]
+
+    def _nothing(self, name: str, at: Instant) -> Diagnosis:
+        """The cause of what people do with an alarm that nobody has judged yet."""
+        if name in self._conditions:
+            return statement(self._identity.machine, name, Level.NORMAL, at)
+        return no_statement(self._identity.machine, at)
 
     def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
         """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""

@@ -8,7 +8,7 @@ import pytest
 from machine_files import LAVAL, changed, only_problem
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -106,6 +106,25 @@ def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
     assert settings.alarms == tuple(alarm.name for alarm in told.alarms)
     assert {"sensor-ok/probe-x", "sensor-ok/probe-y", "detector-ok/rotor-bank"} <= set(settings.services)
     assert {"certificate/broker", "certificate/ca", "store/disk"} <= set(settings.services)
-    assert "certificate/client" not in settings.services
+    assert {"store/journal", "store/damage", "store/telemetry", "store/audit-log"} <= set(settings.services)
+    assert "alarm-flood" in settings.services
+    assert not {"certificate/client", "trip-multiply"} & set(settings.services)
     off = machine((ROOT, f"{ROOT}\n[mqtt.home_assistant]\nenabled = false"))
     assert not mqtt_settings(off).home_assistant.enabled
+
+
+START_UP = """[alarm_handling.start_up]
+detector = "rotor-bank"
+measure = "speed"
+between = [300.0, 2700.0]
+"""
+
+
+def test_home_assistant_and_sparkplug_are_told_of_what_the_machine_file_makes_possible(tmp_path):
+    asked = f"{ROOT}\n[mqtt.home_assistant]\n[mqtt.sparkplug]\n{START_UP}"
+    told = machine((ROOT, asked))
+    services = set(mqtt_settings(told).home_assistant.services)
+    assert {"alarm-flood", "trip-multiply"} <= services
+    assert services <= set(sparkplug_settings(told, tmp_path).alarms)
+    calm = machine((ROOT, asked.replace(START_UP, "")), ("flood_alarms = 10", "flood_alarms = 0"))
+    assert not {"alarm-flood", "trip-multiply"} & set(mqtt_settings(calm).home_assistant.services)

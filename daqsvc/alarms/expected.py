@@ -1,0 +1,51 @@
+"""The alarms that are there by themselves: people may act on them before they are first raised."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.alarms.conditions import ALARM_FLOOD, TRIP_MULTIPLY
+from daqsvc.alarms.quality import quality_alarm
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from daqsvc.alarms.handling import AlarmHandling
+
+
+class Expected:
+    """Names of the alarms that can come without a rule of the machine file.
+
+    Args:
+        handling: says whether there can be a flood, and a start-up that lasts too long.
+    """
+
+    def __init__(self, handling: AlarmHandling) -> None:
+        self.conditions = set(handling_conditions(flood=handling.flood, start_up=handling.start_up))
+        """Those of the service itself."""
+        self._quality: set[str] = set()
+
+    def take(self, speakers: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
+        """Learn more of them.
+
+        Args:
+            speakers: the detectors that will make statements, with the sensors that these rest on.
+            conditions: names of what the service will say of itself.
+        """
+        self._quality.update(quality_alarm(detector, sensors) for detector, sensors in speakers.items())
+        self.conditions.update(conditions)
+
+    @property
+    def names(self) -> set[str]:
+        """All of them."""
+        return self._quality | self.conditions
+
+
+def handling_conditions(*, flood: object | None, start_up: object | None) -> list[str]:
+    """The conditions that the alarms themselves may bring.
+
+    Args:
+        flood: from when on alarms are a flood; None never.
+        start_up: how a start-up is recognised; None: never.
+    """
+    return [name for name, of in ((ALARM_FLOOD, flood), (TRIP_MULTIPLY, start_up)) if of is not None]
