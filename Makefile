@@ -49,7 +49,8 @@ check: $(READY)
 	@$(BIN)/lint-imports
 
 bench: $(READY)
-	@for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || exit 1; done
+	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
+	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
 
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)

@@ -10,6 +10,7 @@ machine, however busy. At the end another process sends 50,000 frames a second f
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 import statistics
 import subprocess
@@ -22,6 +23,7 @@ import cantools
 import numpy as np
 from can.interfaces.socketcan.socketcan import SocketcanBus
 from can_standin import frames_bytes
+from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -214,8 +216,9 @@ async def at_rate() -> tuple[int, int, float]:
     return counters.samples_received // PER_FRAME, refused + counters.samples_lost // PER_FRAME, share
 
 
-def main() -> None:
+def main() -> int:
     """Measure and print."""
+    targets = Targets()
     sent = frames()
     ours, theirs, bare = (cost_us(way, sent) for way in (with_reader, with_notifier, with_bare_socket))
     print(
@@ -230,10 +233,14 @@ def main() -> None:
         f"{RATE_FRAMES} frames/s     {received} received and {lost} lost in {RATE_S:.0f} s, through driver "
         f"and time base into the ring, at {100 * share:.0f} % of one core"
     )
+    targets.ask("10 times Notifier and cantools", f"{theirs / ours:.1f} times", theirs / ours / 10.0)
+    targets.ask("0.8 of a bare recv_into", f"{bare / ours:.2f}", bare / ours / 0.8)
+    targets.ask("no frame lost", f"{lost} lost", math.inf if lost == 0 else 0.0)
+    return targets.exit_code
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--send"]:
         send_at_rate(int(sys.argv[2]))
     else:
-        main()
+        sys.exit(main())

@@ -19,6 +19,7 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+from targets import Targets
 
 from daqsvc.rotor import kernels
 from daqsvc.rotor.bank import ModelBank
@@ -142,12 +143,6 @@ def whole(subject: ModelBank, n: int, zeta: float = 0.18) -> float:
     return best_ns(lambda: subject.process(*block), n)
 
 
-def target(name: str, figure: str, ratio: float) -> None:
-    """One line for a target; the ratio is 1 or more if it is met."""
-    verdict = "met" if ratio >= 1.0 else "MISSED"
-    print(f"target        {name}: {figure}, {ratio:.2f} times what is asked, {verdict}")
-
-
 def start_seconds(cache: str) -> float:
     """CPU seconds of the first block in a new process, with the kernel cache in a directory."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -157,14 +152,15 @@ def start_seconds(cache: str) -> float:
     return float(run.stdout)
 
 
-def main() -> None:
+def main() -> int:
     """Measure and print."""
     if sys.argv[1:] == ["--start"]:
         subject = bank()
         begin = time.process_time()
         subject.process(*orbit(16))
         print(time.process_time() - begin)
-        return
+        return 0
+    targets = Targets()
     with tempfile.TemporaryDirectory() as cache:
         cold, cached = start_seconds(cache), start_seconds(cache)
     print(f"first block   {cold:6.2f} s CPU with compilation, {cached:.2f} s from the cache")
@@ -198,17 +194,18 @@ def main() -> None:
         )
     costs = {models: whole(bank_of(models - 1), PER_REV) for models in (8, 16, 32, 64)}
     print("whole bank    " + ", ".join(f"{m} models {cost:.0f} ns a sample" for m, cost in costs.items()))
-    target(
+    targets.ask(
         "ten models, both rules, 5 million samples/s", f"{slowest:.2f} in the slowest blocks", slowest / 5.0
     )
-    target("linear observers 1000 times FilterPy", f"{mmae / step:.0f} times", mmae / step / 1000.0)
+    targets.ask("linear observers 1000 times FilterPy", f"{mmae / step:.0f} times", mmae / step / 1000.0)
     # Linear or better: eight times the models cost no more than eight times as much.
-    target(
+    targets.ask(
         "cost linear in models",
         f"64 cost {costs[64] / costs[8]:.1f} times as much as 8",
         8.0 * costs[8] / costs[64],
     )
+    return targets.exit_code
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

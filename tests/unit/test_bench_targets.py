@@ -1,0 +1,32 @@
+"""A benchmark that misses what is asked of it fails."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pytest
+
+BENCH = Path(__file__).resolve().parents[1] / "bench"
+
+
+def test_one_missed_target_of_several_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    targets = runpy.run_path(str(BENCH / "targets.py"))["Targets"]()
+    targets.ask("at least 10", "11", 1.1)
+    assert targets.exit_code == 0
+    targets.ask("at most 50 ms", "60 ms", 50.0 / 60.0)
+    targets.ask("at least 1", "1", 1.0)
+    assert targets.exit_code == 1
+    assert targets.missed == ["at most 50 ms"]
+    told = capsys.readouterr().out.splitlines()
+    assert [line.rpartition(" ")[2] for line in told] == ["met", "MISSED", "met"]
+
+
+def test_every_benchmark_that_asks_for_something_ends_with_what_came_of_it() -> None:
+    asking = {path.name: path.read_text() for path in BENCH.glob("bench_*.py") if ".ask(" in path.read_text()}
+    assert {"bench_bearing.py", "bench_race.py", "bench_rotor.py", "bench_can.py"} <= asking.keys()
+    for name, text in asking.items():
+        assert "sys.exit(main())" in text, name
+        assert "targets.exit_code" in text, name
