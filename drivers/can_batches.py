@@ -147,7 +147,7 @@ class FrameSorter:
     """Sorts batches to streams and decodes them, each stream's frames at once.
 
     Args:
-        specs: the streams on the bus; several may take the same id.
+        specs: the streams on the bus; several may take the same id, as with the pages of a multiplexer.
     """
 
     def __init__(self, specs: Sequence[StreamSpec[FrameLayout]]) -> None:
@@ -184,12 +184,26 @@ class FrameSorter:
             if not takers:
                 found.note("frames_unknown", len(rows))
                 found.unknown[_id_in_words(frame_id)] = len(rows)
+            elif pageless := self._on_no_page(takers, batch, rows):
+                found.note("frames_unknown", pageless)
+                found.unknown[f"{_id_in_words(frame_id)}, a page of no stream"] = pageless
             for k in takers:
                 chosen.setdefault(k, []).append(rows)
         for k, groups in chosen.items():
             rows = groups[0] if len(groups) == 1 else np.sort(np.concatenate(groups))
             self._decode(self._specs[k], batch, rows, found)
         return found
+
+    def _on_no_page(self, takers: Sequence[int], batch: CanBatch, rows: NDArray[np.intp]) -> int:
+        """How many of the frames no stream has, though they have the streams' id: pages of a multiplexer."""
+        left = rows
+        for k in takers:
+            layout = self._specs[k].layout
+            if not layout.selectors:
+                return 0
+            left = left[batch.lengths[left] == layout.length]
+            left = left[~layout.selects(batch.data[left, : layout.length])]
+        return len(left)
 
     def _decode(
         self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], found: Sorted
@@ -200,6 +214,8 @@ class FrameSorter:
             wrong = lengths[~right]
             found.wrong_length[spec.name] = (len(wrong), int(wrong[-1]))
             rows = rows[right]
+        if spec.layout.selectors:
+            rows = rows[spec.layout.selects(batch.data[rows, : spec.layout.length])]
         if len(rows):
             payloads = batch.data[rows, : spec.layout.length]
             found.frames.append(StreamFrames(spec.name, spec.layout.decode(payloads), batch.arrival_ns[rows]))

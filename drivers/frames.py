@@ -10,9 +10,11 @@ from __future__ import annotations
 import binascii
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+
+from drivers.field_group import FieldGroup
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -98,74 +100,19 @@ class Field:
         return 0.0, float(2**self.bits - 1)
 
 
-class _FieldGroup:
-    """Fields of one width and kind, moved between payloads and numbers in one gather.
+@dataclass(frozen=True, slots=True)
+class Selector:
+    """A multiplexer: which values of it the frames of a layout have.
 
-    Each field is copied left-aligned into a container of 1, 2, 4 or 8 bytes; one shift to the right
-    then extends the sign of any width. Whole bytes are gathered as bytes, anything else as bits.
+    Attributes:
+        name: of the signal.
+        field: where it lies.
+        values: raw values with which all fields of the layout are in the frame; encoded is the least.
     """
 
-    def __init__(self, fields: Sequence[Field], columns: Sequence[int], length: int) -> None:
-        bits, kind = fields[0].bits, fields[0].kind
-        self.columns = np.asarray(columns, np.intp)
-        width = next(w for w in (1, 2, 4, 8) if 8 * w >= bits)
-        self._shift = 8 * width - bits
-        code = "f" if kind == "float" else "i" if kind == "signed" else "u"
-        self._dtype = np.dtype(f">{code}{width}")
-        self._kind = kind
-        spare = 8 * length  # one position past the payload: a zero
-        rows = [[*field.positions, *[spare] * self._shift] for field in fields]
-        self._by_byte = bits % 8 == 0 and all(
-            row[i] % 8 == 0 and row[i : i + 8] == list(range(row[i], row[i] + 8))
-            for row in rows
-            for i in range(0, bits, 8)
-        )
-        picks = [row[::8] for row in rows] if self._by_byte else rows
-        self._index = np.asarray(picks, np.intp) // (8 if self._by_byte else 1)
-        self._used = self._index.shape[1] - self._shift // (8 if self._by_byte else 1)
-        self._run, self._run_dtype = self._find_run(width) if self._by_byte else (None, self._dtype)
-
-    def _find_run(self, width: int) -> tuple[slice | None, np.dtype[Any]]:
-        """The bytes of fields that lie side by side in machine words, and the dtype of the words."""
-        side_by_side = np.arange(self._index.size).reshape(-1, width)
-        for dtype, ordered in (
-            (self._dtype, self._index),
-            (self._dtype.newbyteorder("<"), self._index[:, ::-1]),
-        ):
-            start = int(ordered[0, 0])
-            if self._shift == 0 and (ordered - start == side_by_side).all():
-                return slice(start, start + ordered.size), dtype
-        return None, self._dtype
-
-    def read(self, payloads: Payloads) -> NDArray[Any]:
-        """Raw numbers ``[n, fields]`` of payloads ``[n, length]``, as wide as the fields' containers."""
-        n = len(payloads)
-        if self._run is not None:
-            return np.ascontiguousarray(payloads[:, self._run]).view(self._run_dtype)
-        cells = payloads if self._by_byte else np.unpackbits(payloads, axis=1)
-        padded = np.concatenate([cells, np.zeros((n, 1), np.uint8)], axis=1)
-        gathered = padded[:, self._index]
-        if not self._by_byte:
-            gathered = np.packbits(gathered, axis=2)
-        values = np.ascontiguousarray(gathered).view(self._dtype)[:, :, 0]
-        if self._kind == "float":
-            return values
-        native = values.astype(self._dtype.newbyteorder("="))
-        raw: NDArray[Any] = native >> native.dtype.type(self._shift)
-        return raw
-
-    def write(self, payloads: Payloads, values: NDArray[np.float64] | NDArray[np.int64]) -> None:
-        """Put raw numbers ``[n, fields]`` into payloads ``[n, length]``."""
-        native = values.astype(self._dtype.newbyteorder("="))
-        if self._shift:
-            native <<= native.dtype.type(self._shift)
-        cells = np.ascontiguousarray(native.astype(self._dtype)[:, :, None]).view(np.uint8)
-        if self._by_byte:
-            payloads[:, self._index[:, : self._used]] = cells[:, :, : self._used]
-            return
-        spread = np.unpackbits(payloads, axis=1)
-        spread[:, self._index[:, : self._used]] = np.unpackbits(cells, axis=2)[:, :, : self._used]
-        payloads[:] = np.packbits(spread, axis=1)
+    name: str
+    field: Field
+    values: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -183,6 +130,7 @@ class FrameLayout:
         counter: where the counter lies.
         counts: whether the counter counts samples or frames.
         crc_byte: where a CRC-16/IBM-3740 (big endian) over all other bytes lies; None without one.
+        selectors: which frames of the id have this layout, where not all of them do.
     """
 
     frame_id: int
@@ -195,12 +143,14 @@ class FrameLayout:
     counter: Field
     counts: Counts
     crc_byte: int | None = None
+    selectors: tuple[Selector, ...] = ()
 
     def __post_init__(self) -> None:
         taken: dict[int, str] = {}
         named = [("counter", self.counter)]
         for i, row in enumerate(self.fields):
             named += [(f"sample {i} of {name}", cell) for name, cell in zip(self.channels, row, strict=True)]
+        named += [(selector.name, selector.field) for selector in self.selectors]
         if self.crc_byte is not None:
             named.append(("crc", Field.at_byte(self.crc_byte, 8 * CRC_BYTES, order="big")))
         for what, cell in named:
@@ -301,21 +251,42 @@ class FrameLayout:
         return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
 
     @cached_property
-    def _counter_group(self) -> _FieldGroup:
-        return _FieldGroup([self.counter], [0], self.length)
+    def _counter_group(self) -> FieldGroup:
+        return FieldGroup([self.counter], [0], self.length)
 
     @cached_property
-    def _sample_groups(self) -> list[_FieldGroup]:
+    def _sample_groups(self) -> list[FieldGroup]:
         flat = [cell for row in self.fields for cell in row]
         kinds = dict.fromkeys((cell.bits, cell.kind) for cell in flat)
         return [
-            _FieldGroup(
+            FieldGroup(
                 [cell for cell in flat if (cell.bits, cell.kind) == kind],
                 [i for i, cell in enumerate(flat) if (cell.bits, cell.kind) == kind],
                 self.length,
             )
             for kind in kinds
         ]
+
+    @cached_property
+    def _selector_groups(self) -> list[tuple[FieldGroup, NDArray[np.int64]]]:
+        return [
+            (FieldGroup([selector.field], [0], self.length), np.array(sorted(selector.values), np.int64))
+            for selector in self.selectors
+        ]
+
+    def selects(self, payloads: Payloads) -> NDArray[np.bool_]:
+        """Which frames have this layout, by their multiplexers.
+
+        Args:
+            payloads: uint8 ``[n, length]``.
+
+        Returns:
+            bool ``[n]``.
+        """
+        chosen = np.ones(len(payloads), np.bool_)
+        for group, values in self._selector_groups:
+            chosen &= np.isin(group.read(payloads)[:, 0], values)
+        return chosen
 
     def _crc(self, payloads: Payloads) -> NDArray[np.uint16]:
         assert self.crc_byte is not None  # noqa: S101 - callers ask only where there is one
@@ -387,6 +358,8 @@ class FrameLayout:
                     f"{cell.kind} field of frame {self.frame_id:#x}; choose a larger scale"
                 )
             group.write(payloads, np.clip(rounded, low, high))
+        for multiplexer, pages in self._selector_groups:
+            multiplexer.write(payloads, np.full((n, 1), pages[0]))
         counts = first_index if self.counts == "samples" else first_index // self.samples_per_frame
         self._counter_group.write(payloads, (counts % 2**self.counter_bits).astype(np.int64)[:, None])
         if self.crc_byte is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.problems import Finding, choice
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from cantools.database.can import Message
@@ -27,6 +27,7 @@ class DbcMessage:
         length: payload bytes.
         signal_bits: width of each signal in bits, by name.
         signal_units: unit of each signal, by name; empty if the DBC gives none.
+        pages: which values of which multiplexers the frames have that hold the layout's signals.
     """
 
     frame_id: int
@@ -34,6 +35,7 @@ class DbcMessage:
     length: int
     signal_bits: Mapping[str, int]
     signal_units: Mapping[str, str]
+    pages: Mapping[str, frozenset[int]]
 
 
 def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | None, list[Finding]]:
@@ -91,26 +93,48 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         length=message.length,
         signal_bits={signal.name: signal.length for signal in message.signals},
         signal_units={signal.name: signal.unit or "" for signal in message.signals},
+        pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))
 
 
-def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterator[Finding]:
-    signals = {signal.name: signal for signal in message.signals}
+def _asked(layout: DbcLayout, at: KeyPath) -> list[tuple[KeyPath, str]]:
+    """The signals that a layout names, and where."""
     asked: list[tuple[KeyPath, str]] = [((*at, "counter", "signal"), layout.counter.signal)]
     for index, channel in enumerate(layout.channels):
         asked += [
             ((*at, "channels", index, "signals", place), name) for place, name in enumerate(channel.signals)
         ]
+    return asked
+
+
+def _pages(message: Message, names: Iterable[str]) -> dict[str, frozenset[int]]:
+    """As the driver reads the signals; no values of a multiplexer where no frame holds them all."""
+    signals = {signal.name: signal for signal in message.signals}
+    pages: dict[str, frozenset[int]] = {}
+    for name in names:
+        signal = signals.get(name)
+        while signal is not None and signal.multiplexer_signal is not None:
+            ids = frozenset(signal.multiplexer_ids or ())
+            pages[signal.multiplexer_signal] = pages.get(signal.multiplexer_signal, ids) & ids
+            signal = signals.get(signal.multiplexer_signal)
+    return pages
+
+
+def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterator[Finding]:
+    signals = {signal.name: signal for signal in message.signals}
+    asked = _asked(layout, at)
     for path, name in asked:
         if name not in signals:
             yield Finding(path, f'message "{message.name}" has no such signal', choice(name, signals))
-        elif signals[name].multiplexer_ids is not None:
-            yield Finding(
-                path,
-                f'is multiplexed in message "{message.name}", so it is not in every frame',
-                "have the device send it in a message without multiplexing",
-            )
+    names = [name for _, name in asked]
+    if not all(_pages(message, names).values()):
+        yield Finding(
+            (*at, "channels"),
+            f'no frame of message "{message.name}" holds all of {", ".join(names)}: they are on different '
+            "pages of its multiplexer",
+            "make a stream for each page, with a counter that is on it",
+        )
     counter = signals.get(layout.counter.signal)
     if counter is not None and (counter.is_signed or counter.is_float):
         yield Finding(

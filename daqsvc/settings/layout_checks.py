@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import combinations
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.settings.buses import CanBus, DbcLayout, PlainLayout, Stream
@@ -34,6 +35,7 @@ class FrameFacts(NamedTuple):
     counter_bits: int
     counts_samples: bool
     samples_per_frame: int
+    pages: Mapping[str, frozenset[int]] = MappingProxyType({})
 
 
 def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None:
@@ -63,6 +65,7 @@ def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None
         message.signal_bits[layout.counter.signal],
         counts_samples,
         layout.samples_per_frame,
+        message.pages,
     )
 
 
@@ -232,21 +235,27 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
 
 
 def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
-    """No two streams of one bus share an id."""
-    owners: dict[tuple[str, bool, int], str] = {}
+    """No two streams of one bus share an id, but for those on different pages of a multiplexer."""
+    owners: dict[tuple[str, bool, int], list[tuple[str, FrameFacts]]] = {}
     for name, stream in draft.streams.items():
         with suppress(UnusableValueError):
             facts = frame_facts(stream, messages.get(name))
             if facts is None:
                 continue
-            owner = owners.setdefault((stream.bus, facts.extended, facts.frame_id), name)
-            if owner != name:
+            same_id = owners.setdefault((stream.bus, facts.extended, facts.frame_id), [])
+            owner = next((other for other, theirs in same_id if not _on_other_pages(facts, theirs)), None)
+            same_id.append((name, facts))
+            if owner is not None:
                 key = "id" if isinstance(stream.layout, PlainLayout) else "message"
                 yield Finding(
                     ("streams", name, "layout", key),
                     f'id {facts.frame_id:#x} on bus "{stream.bus}" belongs to stream "{owner}" already',
                     "give each stream of a bus an id of its own, as the devices send it",
                 )
+
+
+def _on_other_pages(a: FrameFacts, b: FrameFacts) -> bool:
+    return any(a.pages[name].isdisjoint(b.pages[name]) for name in a.pages.keys() & b.pages.keys())
 
 
 def check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:

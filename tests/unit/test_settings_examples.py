@@ -157,19 +157,40 @@ def test_a_sensor_of_no_type_beside_a_dbc_file():
     assert problem.key == "sensors[0].type"
 
 
-def test_a_signed_counter_and_multiplexed_samples(tmp_path):
+def test_a_signed_counter_and_samples_on_different_pages(tmp_path):
     dbc = (CONFIG / "devices" / "triaxial-accelerometer.dbc").read_text(encoding="utf-8")
-    dbc = dbc.replace("Sequence : 0|8@1+", "Sequence : 0|8@1-")
+    dbc = dbc.replace("Sequence : 0|8@1+", "Sequence : 0|8@1-").replace("AccelY : 24", "AccelY m2 : 24")
     dbc = dbc.replace("Status : 56", "Status M : 56").replace("AccelZ : 40", "AccelZ m1 : 40")
     (tmp_path / "x.dbc").write_text(dbc, encoding="utf-8")
     text = variant("../devices/triaxial-accelerometer.dbc", "x.dbc")
     found = {item.key: item.message for item in problems_of(text, tmp_path / "m.toml")}
     assert set(found) == {
         "streams.housing.layout.counter.signal",
-        "streams.housing.layout.channels[2].signals[0]",
+        "streams.housing.layout.channels",
     }
     assert "signed" in found["streams.housing.layout.counter.signal"]
-    assert "multiplexed" in found["streams.housing.layout.channels[2].signals[0]"]
+    assert "different pages" in found["streams.housing.layout.channels"]
+
+
+@pytest.mark.parametrize("page", ["m1", "m2"])
+def test_two_streams_share_an_id_only_on_different_pages(tmp_path, page):
+    dbc = (CONFIG / "devices" / "triaxial-accelerometer.dbc").read_text(encoding="utf-8")
+    dbc = dbc.replace("Status : 56", "Status M : 56").replace("AccelY : 24", "AccelY m1 : 24")
+    dbc = dbc.replace("AccelX : 8", "AccelX m1 : 8").replace("AccelZ : 40", f"AccelZ {page} : 40")
+    (tmp_path / "x.dbc").write_text(dbc, encoding="utf-8")
+    text = variant("../devices/triaxial-accelerometer.dbc", "x.dbc")
+    z = '  { name = "z", signals = ["AccelZ"] },\n'
+    begin, end = text.index("[streams.housing]"), text.index("[[sensors]]")
+    one = text[begin:end].replace(z, "")
+    x_and_y = [f'  {{ name = "{axis}", signals = ["Accel{axis.upper()}"] }},\n' for axis in "xy"]
+    other = text[begin:end].replace("housing", "vertical").replace(x_and_y[0], "").replace(x_and_y[1], "")
+    sensors = text[end:].replace('stream = "housing"\nchannel = "z"', 'stream = "vertical"\nchannel = "z"')
+    text = text[:begin] + one + other + sensors
+    if page == "m2":
+        assert set(parse_machine_file(text, tmp_path / "m.toml").streams) == {"housing", "vertical"}
+        return
+    (problem,) = problems_of(text, tmp_path / "m.toml")
+    assert problem.key == "streams.vertical.layout.message"
 
 
 def test_a_dbc_message_too_long_for_classic_can(tmp_path):
