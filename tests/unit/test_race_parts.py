@@ -13,10 +13,11 @@ from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import best_comb, fundamental, highest_order
 from daqsvc.bearing.race.decision import decide
 from daqsvc.bearing.race.depth import ModulationDepth, sharpest
+from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.lines import LineEvidence, line_evidence
 from daqsvc.bearing.race.null import false_alarm_probability, significance
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.speed import shaft_rate
+from daqsvc.bearing.race.speed import ShaftRate, shaft_rate
 from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence, RaceInputError
 from daqsvc.dsp.envelope import line_power, running_median, squared_envelope, whiten
 
@@ -131,16 +132,23 @@ def tones(orders: list[float], shaft_hz: float, seconds: float = 4.0, seed: int 
     return spectrum, 1.0 / seconds, random.standard_exponential(len(spectrum))
 
 
+def found(tones: tuple, stated_hz: float, cage: float = 0.398) -> ShaftRate:
+    """The shaft as found in such tones."""
+    spectrum, step_hz, envelope = tones
+    slow = slow_series(spectrum, step_hz, stated_hz)
+    return shaft_rate(*slow, envelope, 1.0 / step_hz, stated_hz, 0.012, cage)
+
+
 @pytest.mark.parametrize("error", [-0.01, -0.004, 0.0, 0.01])
 def test_the_speed_is_taken_from_the_shafts_lines(error: float) -> None:
-    shaft = shaft_rate(*tones([1, 2, 3], 30.0), 30.0 * (1.0 + error), 0.012, 0.398)
+    shaft = found(tones([1, 2, 3], 30.0), 30.0 * (1.0 + error))
     assert shaft.rate_hz == pytest.approx(30.0, rel=3e-4)
     assert shaft.seen
     assert shaft.sharp
 
 
 def test_without_harmonics_the_stated_speed_stays() -> None:
-    shaft = shaft_rate(*tones([], 30.0), 30.0, 0.012, 0.398)
+    shaft = found(tones([], 30.0), 30.0)
     assert not shaft.seen
     assert not shaft.sharp
     assert shaft.rate_hz == pytest.approx(30.0, rel=0.012)
@@ -148,12 +156,12 @@ def test_without_harmonics_the_stated_speed_stays() -> None:
 
 def test_a_wholly_other_speed_is_refused_and_named() -> None:
     with pytest.raises(RaceInputError, match=r"at about 14\d\d rpm.*sampled"):
-        shaft_rate(*tones([1, 2, 3], 24.0), 30.0, 0.012, 0.398)
+        found(tones([1, 2, 3], 24.0), 30.0)
 
 
 def test_a_damaged_balls_line_is_not_taken_for_another_speed() -> None:
     cage_side = [h * (1.0 - BEARING.cage) for h in (1, 2, 3)]
-    shaft = shaft_rate(*tones(cage_side, 30.0), 30.0, 0.012, BEARING.cage)
+    shaft = found(tones(cage_side, 30.0), 30.0, BEARING.cage)
     assert shaft.rate_hz == pytest.approx(30.0, rel=0.012)
 
 

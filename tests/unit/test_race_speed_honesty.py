@@ -8,6 +8,7 @@ import scipy.fft
 from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import RaceInputError, race_test
+from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.speed import ShaftRate, shaft_rate
 from daqsvc.bearing.race.verdict import PartEvidence
@@ -23,7 +24,8 @@ def shaft_of(lines_hz: list[float], stated_hz: float, seed: int = 0) -> ShaftRat
     random = np.random.default_rng(seed)
     series = random.standard_normal(len(t)) + sum(np.cos(2 * np.pi * hz * t + hz) for hz in lines_hz)
     envelope = random.standard_exponential(len(t) // 2)
-    return shaft_rate(scipy.fft.rfft(series), BINS_HZ, envelope, stated_hz, 0.012, BEARING.cage)
+    slow = slow_series(scipy.fft.rfft(series), BINS_HZ, stated_hz)
+    return shaft_rate(*slow, envelope, SECONDS, stated_hz, 0.012, BEARING.cage)
 
 
 def harmonics(shaft_hz: float, orders: range = range(1, 7)) -> list[float]:

@@ -20,6 +20,8 @@ HARMONICS = (1, 2, 3, 4)
 HALF_WIDTH = 0.006
 """Half width of a line as a share of its frequency: slip smears it."""
 
+SMEAR = 0.01
+"""How far a harmonic of the shaft is smeared at least that is taken for a line of a bearing, as a share."""
 FLAT_TOP = 0.98
 
 
@@ -61,6 +63,25 @@ class ModulationDepth:
         above = self._summed[np.minimum(last, last_bin)] - self._summed[np.minimum(first, last_bin)]
         kept = np.where(last <= last_bin, np.maximum(above, 0.0), 0.0)
         return np.asarray(kept / HANN_NOISE_BANDWIDTH, dtype=np.float64)
+
+    def mirrored(self, order: float) -> float:
+        """What stands on the far side of the nearest harmonic of the shaft over what stands on the near one.
+
+        Args:
+            order: of a line; compared is what is within twice its distance from that harmonic, or `SMEAR`.
+
+        Returns:
+            About 1 where the harmonic itself is smeared, as speed that wanders smears it to either side;
+            about 0 beside a line of its own.
+        """
+        harmonic = round(order)
+        gap = float(np.copysign(max(2.0 * abs(order - harmonic), SMEAR * order), order - harmonic))
+        middle, near, far = (
+            min(round(at * self._bins_per_order), len(self._summed) - 1)
+            for at in (harmonic, harmonic + gap, harmonic - gap)
+        )
+        own, other = (abs(float(self._summed[at] - self._summed[middle])) for at in (near, far))
+        return other / max(own, 1e-300)
 
     def comb(self, order: Real) -> Real:
         """Root sums of squares of the modulation indices of some orders' harmonics, ``[n]``."""

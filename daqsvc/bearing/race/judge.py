@@ -17,6 +17,7 @@ from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, ba
 from daqsvc.bearing.race.combs import TEETH, highest_order
 from daqsvc.bearing.race.decision import RACES, decide
 from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
+from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.knocks import levelled
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
@@ -24,6 +25,7 @@ from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.speed import shaft_rate
+from daqsvc.bearing.race.track import shaft_track
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
+    from daqsvc.bearing.race.track import ShaftTrack
 
 
 LOG_OFFSET = np.float32(1e-3)
@@ -169,8 +172,16 @@ def race_features(
     bins = min(int(top_order * stated_hz / step_hz) + 10, len(band.phase) // 2)
     phases, sizes = squared_envelope(band.phase, bins), squared_envelope(band.clipped, bins)
     holes = np.array(sound.stretches, dtype=np.float64).reshape(-1, 2) / length
+    series, series_hz = slow_series(spectrum, step_hz, stated_hz)
+    track = shaft_track(series, levelled(phases, holes), stated_hz / step_hz)
+    if track is not None:
+        series = track.even(series)
+        phases, sizes = track.even(phases), track.even(sizes)
+        holes = track.places(holes)
     power = line_power(levelled(phases, holes), bins)
-    shaft = shaft_rate(spectrum, step_hz, power, stated_hz, rules.speed_tolerance, bearing.cage)
+    shaft = shaft_rate(
+        series, series_hz, power, 1.0 / step_hz, stated_hz, rules.speed_tolerance, bearing.cage
+    )
     revolutions = shaft.rate_hz / step_hz
     square = view_of(power, line_power(levelled(sizes, holes), bins), revolutions)
     log_phases, log_sizes = (
@@ -186,7 +197,7 @@ def race_features(
         speed_rpm=60.0 * shaft.rate_hz,
         speed_doubt=shaft.doubt,
         revolutions=revolutions,
-        notes=sound.notes,
+        notes=sound.notes if track is None else (*sound.notes, _wander_note(track)),
         repairs=sound.repairs,
         lost=float(np.diff(holes, axis=1).sum()),
         spectrum=EnvelopeSpectrum(
@@ -194,6 +205,13 @@ def race_features(
             amplitude=np.sqrt(square.power),
             floor=np.sqrt(square.depth.floor),
         ),
+    )
+
+
+def _wander_note(track: ShaftTrack) -> str:
+    return (
+        f"the speed wanders by {track.wander:.1%} within the record: followed by the harmonics of the shaft; "
+        "record at a steady speed for a surer word"
     )
 
 

@@ -35,6 +35,9 @@ class RaceRules:
             explain, for both to be called damaged.
         unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
         ball_testable_bins: the same for a ball, below which it is not tested at all.
+        smear_share: distance of a line from a harmonic of the shaft, as a share of its order, up to which
+            that harmonic may be smeared as far.
+        smear_mirrored: power beyond that harmonic over the line's, from which on it is such a smear.
         changed_db: change of the whole level that makes a record "changed" against a baseline.
         changed_band_db: the same of one octave band.
         changed_ease: share of the limit of severity that suffices where the level has changed and the part's
@@ -67,6 +70,8 @@ class RaceRules:
     both_factor: float = 1.2
     unresolved_bins: float = 4.0
     ball_testable_bins: float = 2.5
+    smear_share: float = 0.02
+    smear_mirrored: float = 0.25
     changed_db: float = 2.0
     changed_band_db: float = 3.0
     changed_ease: float = 0.5

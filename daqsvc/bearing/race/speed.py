@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.race.harmonics import shaft_harmonics, slow_series
+from daqsvc.bearing.race.harmonics import shaft_harmonics
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.dsp.order_speed import find_speed
 
@@ -84,7 +84,13 @@ class ShaftRate:
 
 
 def shaft_rate(
-    spectrum: Complex, step_hz: float, envelope_power: Real, stated_hz: float, tolerance: float, cage: float
+    series: Real,
+    series_hz: float,
+    envelope_power: Real,
+    per_hz: float,
+    stated_hz: float,
+    tolerance: float,
+    cage: float,
 ) -> ShaftRate:
     """Refine a stated shaft rate by the harmonics of the shaft in a signal and in its envelope.
 
@@ -93,9 +99,10 @@ def shaft_rate(
     any other from half to twice the stated one.
 
     Args:
-        spectrum: one-sided spectrum of the signal, unwindowed.
-        step_hz: between its bins.
-        envelope_power: power spectrum of the band's envelope, its bins as far apart.
+        series: ``[n]``, the low part of the signal, by `slow_series`.
+        series_hz: its samples per second.
+        envelope_power: power spectrum of the band's envelope.
+        per_hz: bins of it per Hz.
         stated_hz: stated revolutions per second.
         tolerance: how far to search, as a share.
         cage: order of the bearing's cage.
@@ -103,8 +110,7 @@ def shaft_rate(
     Raises:
         RaceInputError: the harmonics of a wholly different speed are there, and none of this one.
     """
-    series, series_hz = slow_series(spectrum, step_hz, stated_hz)
-    harmonics = shaft_harmonics(series, series_hz, envelope_power, 1.0 / step_hz, stated_hz)
+    harmonics = shaft_harmonics(series, series_hz, envelope_power, per_hz, stated_hz)
     scan = SpeedScan.of(harmonics, stated_hz, cage)
     wrong: ValueError | None = None
     enough = series[: int(LINE_REVOLUTIONS * series_hz / stated_hz)]

@@ -14,7 +14,7 @@ from daqsvc.bearing.race.decision import weight_of
 from daqsvc.bearing.race.depth import ModulationDepth, sharpest
 from daqsvc.bearing.race.lines import LineEvidence, line_evidence
 from daqsvc.bearing.race.null import REVOLUTIONS, false_alarm_probability, significance
-from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
+from daqsvc.bearing.race.verdict import PARTS, PLACES, Part, PartEvidence
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -147,6 +147,11 @@ class Scales:
         away = gap * self._revolutions
         if away < rules.unresolved_bins:
             e = replace(e, z_limit=rules.z_limit + rules.z_unresolved)
+        harmonic = round(found)
+        if abs(found - harmonic) <= rules.smear_share * found:
+            mirrored = min(depth.mirrored(found) for depth in depths)
+            if mirrored >= rules.smear_mirrored and z >= rules.z_limit:
+                e = replace(e, testable=False, reason=_smeared(part, found))
         if part == "ball":
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
@@ -155,6 +160,14 @@ class Scales:
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(order, gap, rules))
         return e
+
+
+def _smeared(part: Part, order: float) -> str:
+    """Why a part is not testable beside a smeared harmonic of the shaft."""
+    return (
+        f"its lines at order {order:.3f} stand on both sides of {round(order)}X, as the shaft makes them "
+        f"where its speed wanders; record at a steady speed to test the {PLACES[part]}"
+    )
 
 
 def _why_not(order: float, gap: float, rules: RaceRules) -> str:
