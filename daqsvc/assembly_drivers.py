@@ -171,6 +171,7 @@ def _plain_layout(given: PlainLayout) -> FrameLayout:
     return FrameLayout.plain(
         frame_id=given.id,
         extended=given.extended,
+        any_priority=given.any_priority,
         length=given.length,
         channels=_packed(given.channels),
         samples_per_frame=given.samples_per_frame,

@@ -26,6 +26,9 @@ REMOTE = 0x4000_0000
 ERROR = 0x2000_0000
 EXTENDED_ID = 0x1FFF_FFFF
 STANDARD_ID = 0x7FF
+PRIORITY = 0x1C00_0000
+"""Bits of a 29-bit id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
+
 LONGEST = 64
 
 
@@ -133,10 +136,11 @@ class IdMatch:
 
     @classmethod
     def of(cls, layout: FrameLayout) -> IdMatch:
-        """The ids of a layout: one id of 11 or 29 bits, in frames that carry data."""
+        """The ids of a layout: one of 11 or 29 bits, of any priority if it has one, in frames with data."""
         # Not `ERROR`: in a filter of the kernel this bit asks for error frames.
         if layout.extended:
-            return cls(layout.frame_id | EXTENDED, EXTENDED_ID | EXTENDED | REMOTE)
+            told_apart = EXTENDED_ID & ~PRIORITY if layout.any_priority else EXTENDED_ID
+            return cls(layout.frame_id | EXTENDED, told_apart | EXTENDED | REMOTE)
         return cls(layout.frame_id, STANDARD_ID | EXTENDED | REMOTE)
 
     def __contains__(self, frame_id: int) -> bool:

@@ -83,6 +83,7 @@ def layout_from_dbc(
         offset=np.array([[float(signals[name].offset) for name in row] for row in rows]),
         counter=cells[counter],
         counts=counts,
+        any_priority=described.protocol == "j1939",
         selectors=tuple(Selector(name, field(name), values) for name, values in pages.items()),
     )
 

@@ -131,6 +131,7 @@ class FrameLayout:
         counts: whether the counter counts samples or frames.
         crc_byte: where a CRC-16/IBM-3740 (big endian) over all other bytes lies; None without one.
         selectors: which frames of the id have this layout, where not all of them do.
+        any_priority: whether the id is one of SAE J1939, whose three highest bits are only a priority.
     """
 
     frame_id: int
@@ -144,6 +145,7 @@ class FrameLayout:
     counts: Counts
     crc_byte: int | None = None
     selectors: tuple[Selector, ...] = ()
+    any_priority: bool = False
 
     def __post_init__(self) -> None:
         taken: dict[int, str] = {}
@@ -179,6 +181,7 @@ class FrameLayout:
         crc_byte: int | None = None,
         byte_order: ByteOrder = "little",
         extended: bool = False,
+        any_priority: bool = False,
     ) -> FrameLayout:
         """Samples packed one after another: all channels of sample 0, all of sample 1, and so on.
 
@@ -194,6 +197,7 @@ class FrameLayout:
             crc_byte: first byte of the CRC, or None.
             byte_order: of the counter and of the samples.
             extended: whether the id has 29 bits.
+            any_priority: whether the three highest of them are a priority, as in SAE J1939.
 
         Raises:
             LayoutError: something does not fit into ``length`` or overlaps.
@@ -217,6 +221,7 @@ class FrameLayout:
             counter=Field.at_byte(counter_byte, counter_bits, "unsigned", byte_order),
             counts=counts,
             crc_byte=crc_byte,
+            any_priority=any_priority,
         )
 
     @property

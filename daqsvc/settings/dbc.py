@@ -27,6 +27,7 @@ class DbcMessage:
         length: payload bytes.
         signal_bits: width of each signal in bits, by name.
         signal_units: unit of each signal, by name; empty if the DBC gives none.
+        any_priority: whether it is one of SAE J1939, whatever the priority in its id.
         pages: which values of which multiplexers the frames have that hold the layout's signals.
     """
 
@@ -35,6 +36,7 @@ class DbcMessage:
     length: int
     signal_bits: Mapping[str, int]
     signal_units: Mapping[str, str]
+    any_priority: bool
     pages: Mapping[str, frozenset[int]]
 
 
@@ -93,6 +95,7 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         length=message.length,
         signal_bits={signal.name: signal.length for signal in message.signals},
         signal_units={signal.name: signal.unit or "" for signal in message.signals},
+        any_priority=message.protocol == "j1939",
         pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 SHORTEST_WRAP_S = 0.040
 """A counter that wraps sooner cannot tell a long gap from a short one."""
 
+PRIORITY = 0x1C00_0000
+"""Bits of a J1939 id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
+
 
 class FrameFacts(NamedTuple):
     """What the wire shows of a stream, wherever its layout comes from."""
@@ -35,7 +38,13 @@ class FrameFacts(NamedTuple):
     counter_bits: int
     counts_samples: bool
     samples_per_frame: int
+    any_priority: bool
     pages: Mapping[str, frozenset[int]] = MappingProxyType({})
+
+    @property
+    def told_apart(self) -> tuple[bool, int]:
+        """What no other frames on the bus have: the id, less its priority where that does not count."""
+        return self.extended, self.frame_id & ~PRIORITY if self.any_priority else self.frame_id
 
 
 def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None:
@@ -55,6 +64,7 @@ def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None
             layout.counter.bits,
             counts_samples,
             layout.samples_per_frame,
+            layout.any_priority,
         )
     if message is None or layout.counter.signal not in message.signal_bits:
         return None
@@ -65,6 +75,7 @@ def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None
         message.signal_bits[layout.counter.signal],
         counts_samples,
         layout.samples_per_frame,
+        message.any_priority,
         message.pages,
     )
 
@@ -93,6 +104,12 @@ def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
             (*at, "id"),
             "does not fit into 11 bits (0x7ff)",
             "write extended = true if the device sends 29-bit ids, else correct the id",
+        )
+    if layout.any_priority and not layout.extended:
+        yield Finding(
+            (*at, "any_priority"),
+            "cannot be with an id of 11 bits: it has no priority to leave out",
+            "write extended = true, since all ids of SAE J1939 have 29 bits; else leave any_priority out",
         )
     fields = [
         ("counter", "the counter", layout.counter.byte, layout.counter.end_byte),
@@ -236,15 +253,15 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
 
 def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
     """No two streams of one bus share an id, but for those on different pages of a multiplexer."""
-    owners: dict[tuple[str, bool, int], list[tuple[str, FrameFacts]]] = {}
+    owners: dict[str, list[tuple[str, FrameFacts]]] = {}
     for name, stream in draft.streams.items():
         with suppress(UnusableValueError):
             facts = frame_facts(stream, messages.get(name))
             if facts is None:
                 continue
-            same_id = owners.setdefault((stream.bus, facts.extended, facts.frame_id), [])
-            owner = next((other for other, theirs in same_id if not _on_other_pages(facts, theirs)), None)
-            same_id.append((name, facts))
+            others = owners.setdefault(stream.bus, [])
+            owner = next((other for other, theirs in others if _clash(facts, theirs)), None)
+            others.append((name, facts))
             if owner is not None:
                 key = "id" if isinstance(stream.layout, PlainLayout) else "message"
                 yield Finding(
@@ -254,8 +271,13 @@ def check_ids(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterato
                 )
 
 
-def _on_other_pages(a: FrameFacts, b: FrameFacts) -> bool:
-    return any(a.pages[name].isdisjoint(b.pages[name]) for name in a.pages.keys() & b.pages.keys())
+def _clash(a: FrameFacts, b: FrameFacts) -> bool:
+    """Whether some frame would be one of both streams."""
+    if a.any_priority != b.any_priority:
+        a, b = a._replace(any_priority=True), b._replace(any_priority=True)
+    if a.told_apart != b.told_apart:
+        return False
+    return not any(a.pages[name].isdisjoint(b.pages[name]) for name in a.pages.keys() & b.pages.keys())
 
 
 def check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
