@@ -286,6 +286,7 @@ class AlarmDesk:
             now_ns=self._clock.monotonic_ns(),
             wall_ns=self._clock.wall_ns(),
             certificates_end_ns={} if publisher is None else publisher.certificate_expiry,
+            broker_has_expired=publisher is not None and publisher.broker_has_expired,
             conditions_told=self.manager.conditions,
             connected=publisher is None or publisher.counters.connected,
             free_bytes=self._free_bytes,

@@ -25,6 +25,7 @@ STORE = ("store/disk", "store/journal", "store/damage", "store/telemetry", "stor
 """The conditions of the store."""
 
 CERTIFICATE = "certificate/"
+BROKER = "broker"
 CERTIFICATE_DAYS = 14
 CERTIFICATE_DEADBAND_NS = NS_PER_DAY
 """A clock that is set by an hour, and back, makes no alarm come and go."""
@@ -54,6 +55,7 @@ class Vitals:
         now_ns: monotonic clock.
         wall_ns: wall clock, ns since the Unix epoch.
         certificates_end_ns: by certificate, when it ends, wall clock.
+        broker_has_expired: whether the broker is refused because its certificate has expired.
         conditions_told: conditions of the service that were ever told of, also before a restart.
         connected: whether all certificates in use have been seen: there is a connection, or no broker.
         free_bytes: free space on the store's disk; None if nobody has looked.
@@ -68,6 +70,7 @@ class Vitals:
     now_ns: int
     wall_ns: int
     certificates_end_ns: Mapping[str, int]
+    broker_has_expired: bool
     conditions_told: frozenset[str]
     connected: bool
     free_bytes: int | None
@@ -87,7 +90,7 @@ def conditions(mqtt: MqttSettings | None) -> list[str]:
     """
     found = list(STORE)
     if mqtt is not None and mqtt.tls:
-        files = {"broker": True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
+        files = {BROKER: True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
         found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
     return found
 
@@ -122,7 +125,12 @@ class SelfCheck:
     def look(self, vitals: Vitals) -> Iterator[Condition]:
         """How everything stands, whether that is new or not."""
         for name, end_ns in sorted(vitals.certificates_end_ns.items()):
-            yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
+            if not (name == BROKER and vitals.broker_has_expired):
+                yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
+        if vitals.broker_has_expired:
+            # What it showed when it was last verified says nothing of what it shows now.
+            sentence = "the broker is refused: its certificate, or one behind it, has expired; renew it there"
+            yield Condition(f"{CERTIFICATE}{BROKER}", Level.DANGER, sentence)
         if vitals.connected:
             seen = {f"{CERTIFICATE}{name}" for name in vitals.certificates_end_ns}
             for name in sorted(vitals.conditions_told - seen):

@@ -15,6 +15,8 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from daqsvc.publish.outage import in_words
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
@@ -277,7 +279,9 @@ class Connection(aiomqtt.Client):
         error = self._disconnected.exception() if self._disconnected.done() else None
         if _value(getattr(error, "rc", None)) == _SESSION_TAKEN_OVER:
             return TakenOverError("another client has connected with the same client_id")
-        return aiomqtt.MqttError(f"connection lost: {error or 'closed'}")
+        return aiomqtt.MqttError(
+            f"connection lost: {in_words(error if isinstance(error, Exception) else None)}"
+        )
 
     def _give_up(self, _disconnected: object) -> None:
         """Nothing that is under way will be acknowledged any more."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import ssl
 from dataclasses import asdict
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -26,6 +27,7 @@ from daqsvc.publish.counters import PublishCounters
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
 from daqsvc.publish.home_assistant_link import HomeAssistantLink
+from daqsvc.publish.outage import Outage, has_expired, in_words
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.session import CredentialsReplacedError, Session
 from daqsvc.publish.settings import MqttSettings
@@ -107,7 +109,8 @@ class MqttPublisher:
         self._expiry: dict[str, int] = {}
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._quick_losses = 0
-        self._outage_reported = False
+        self._outage = Outage(log)
+        self._has_expired = False
         self._protocol = (
             aiomqtt.ProtocolVersion.V311 if settings.protocol == "3.1.1" else aiomqtt.ProtocolVersion.V5
         )
@@ -123,6 +126,11 @@ class MqttPublisher:
         broker, ``broker`` what the broker has shown.
         """
         return MappingProxyType(self._expiry)
+
+    @property
+    def broker_has_expired(self) -> bool:
+        """Whether the broker was last refused because what it shows has expired, rather than verified."""
+        return self._has_expired
 
     def figures(self) -> dict[str, Any]:
         """What the publisher has done, in numbers, for the status; without TLS or commands none of these."""
@@ -203,17 +211,20 @@ class MqttPublisher:
                 connection.abandon()
                 raise
         except (aiomqtt.MqttError, OSError) as error:
+            if isinstance(error, ssl.SSLCertVerificationError):
+                self._has_expired = has_expired(error)
             if not self._falls_back(error):
-                self._report_outage(str(error))
+                self._report_outage(error)
             return None
+        self._has_expired = False
         self.counters.connections += 1
         self.counters.connected = True
         if self._quick_losses >= SUSPICIOUS_LOSSES:
             log.info(
                 "connected to MQTT broker %s once more", self._name
             )  # it has been said that this goes on
-        elif self._outage_reported:
-            self._outage_reported = False
+        elif self._outage.is_told:
+            self._outage.end()
             log.warning("MQTT broker %s is back", self._name)
         else:
             log.info("connected to MQTT broker %s", self._name)
@@ -278,8 +289,8 @@ class MqttPublisher:
         except CredentialsReplacedError:
             log.info("connecting to MQTT broker %s again, to use and see the certificates of now", self._name)
             await connection.close(GOODBYE_S)
-        except TakenOverError:
-            self._report_rival("this connection was ended by another client")
+        except TakenOverError as error:
+            self._report_rival("this connection was ended by another client", error)
             await self._wait(TAKEN_OVER_S + self._backoff.next_ns() / NS_PER_S)
         except (aiomqtt.MqttError, OSError) as error:
             of_use_s = asyncio.get_running_loop().time() - since_s
@@ -302,11 +313,11 @@ class MqttPublisher:
         refused = isinstance(error, PublishRefusedError | SilentBrokerError)
         self._quick_losses = self._quick_losses + 1 if of_use_s < STABLE_S and not refused else 0
         if of_use_s > STABLE_S:
-            self._outage_reported = False
+            self._outage.end()
         if self._quick_losses == SUSPICIOUS_LOSSES:
             how = f"{SUSPICIOUS_LOSSES} connections have broken at once, perhaps because of another client"
-            self._report_rival(how)
-        self._report_outage(str(error))
+            self._report_rival(how, error)
+        self._report_outage(error)
 
     async def _say_goodbye(self, connection: Connection) -> None:
         """Publish that the box goes offline; if that fails, the last will says so."""
@@ -361,13 +372,11 @@ class MqttPublisher:
     def _name(self) -> str:
         return f"{self._settings.host}:{self._settings.port}"
 
-    def _report_outage(self, reason: str) -> None:
-        if not self._outage_reported:
-            self._outage_reported = True
-            log.warning("MQTT broker %s is away: %s; trying again until it is back", self._name, reason)
+    def _report_outage(self, error: Exception) -> None:
+        self._outage.tell(f"MQTT broker {self._name}", error, "trying again until it is back")
 
-    def _report_rival(self, how: str) -> None:
-        self._outage_reported = True
+    def _report_rival(self, how: str, error: Exception) -> None:
+        self._outage.note(f"MQTT broker {self._name}", in_words(error))
         log.error(
             "MQTT broker %s: %s with client_id %r; give each box its own box name or mqtt.client_id",
             self._name,

@@ -245,8 +245,10 @@ async def test_a_broker_that_forgets_everything_costs_nothing(tmp_path, outbox, 
             async with Consumer(mosquitto.port) as later:
                 await eventually(lambda: len(later.on("/alarms/")) == 2, "both retained states are back")
                 assert sorted(ids(later.on("/alarms/"))) == sorted([quiet.ids[-1], service.ids[-1]])
-    lost, back = (r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING)
+    lost, *still, back = (r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING)
     assert "is away" in lost
+    assert all("is still away" in reason for reason in still)
+    assert len({lost, *still}) == 1 + len(still), "each reason once"
     assert "is back" in back
 
 

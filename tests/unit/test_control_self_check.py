@@ -18,6 +18,7 @@ FINE: dict[str, Any] = {
     "now_ns": 0,
     "wall_ns": NOW_NS,
     "certificates_end_ns": {},
+    "broker_has_expired": False,
     "conditions_told": frozenset(),
     "connected": True,
     "free_bytes": None,
@@ -61,6 +62,16 @@ def test_a_certificate_that_ends_is_told_a_fortnight_before(days: float, level: 
     found = look(self_check(), certificates_end_ns={"client": NOW_NS + round(days * NS_PER_DAY)})
     assert found["certificate/client"][0] is level
     assert words in found["certificate/client"][1]
+
+
+def test_a_broker_that_is_refused_as_expired_is_dangerous_whatever_it_showed_before() -> None:
+    check, before = self_check(), {"broker": NOW_NS + 90 * NS_PER_DAY}
+    for known in ({}, before):
+        found = look(check, certificates_end_ns=known, connected=False, broker_has_expired=True)
+        level, sentence = found["certificate/broker"]
+        assert level is Level.DANGER
+        assert "has expired; renew it" in sentence
+    assert look(check, certificates_end_ns=before)["certificate/broker"][0] is Level.NORMAL
 
 
 def test_a_clock_that_is_set_by_an_hour_makes_no_certificate_alarm_come_and_go() -> None:

@@ -20,6 +20,7 @@ from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.publish.connection import Connection, NoConsentError
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
+from daqsvc.publish.outage import Outage
 from daqsvc.publish.sparkplug.memory import Memory
 from daqsvc.publish.sparkplug.metrics import (
     NS_PER_MS,
@@ -90,7 +91,7 @@ class SparkplugEdge:
         self._server = 0
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._older = mqtt.protocol == "3.1.1"
-        self._outage_reported = False
+        self._outage = Outage(log)
         self._stopping = asyncio.Event()
         self._running: asyncio.Future[None] | None = None
 
@@ -128,7 +129,7 @@ class SparkplugEdge:
         except (aiomqtt.MqttError, OSError, ValueError) as error:
             if self._falls_back(error):
                 return
-            self._report_outage(server, str(error))
+            self._report_outage(server, error)
             self._walk()
             await self._wait()
             return
@@ -144,7 +145,7 @@ class SparkplugEdge:
             self._walk()
             await self._wait()
         except (aiomqtt.MqttError, OSError) as error:
-            self._report_outage(server, str(error))
+            self._report_outage(server, error)
             if session.was_born:
                 self._backoff.reset()
             self._walk()
@@ -182,7 +183,7 @@ class SparkplugEdge:
             raise
         self.counters.connections += 1
         self.counters.connected = True
-        self._outage_reported = False
+        self._outage.end()
         session = EdgeSession(
             connection,
             bd_seq,
@@ -213,12 +214,6 @@ class SparkplugEdge:
         self._older = True
         return True
 
-    def _report_outage(self, server: Server, reason: str) -> None:
-        if not self._outage_reported:
-            self._outage_reported = True
-            log.warning(
-                "Sparkplug broker %s:%d is away: %s; trying again until one is there",
-                server.host,
-                server.port,
-                reason,
-            )
+    def _report_outage(self, server: Server, error: Exception) -> None:
+        broker = f"Sparkplug broker {server.host}:{server.port}"
+        self._outage.tell(broker, error, "trying again until one is there")

@@ -1,0 +1,116 @@
+"""Why a broker is away, in words for a person, and each reason once while that lasts."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from typing import TYPE_CHECKING
+
+import aiomqtt
+from paho.mqtt.client import error_string
+
+if TYPE_CHECKING:
+    import logging
+
+MOST_REASONS = 8
+"""Reasons that are told of in one outage: one that has a number in it must not fill the log."""
+
+_EXPIRED = 10
+_VERIFICATION = {
+    9: "its certificate is not valid yet; look at the clock of the box",
+    _EXPIRED: "its certificate, or one that vouches for it, has expired; renew it there, or set the clock of "
+    "the box",
+}
+_OTHER_HOST = {62, 64}
+_UNKNOWN_AUTHORITY = {18, 19, 20, 21}
+"""Verification results of OpenSSL (X509_V_ERR_...)."""
+
+_CODES = {
+    128: "the broker gave no reason",
+    134: "it refuses the user name or the password",
+    135: "this client is not authorised; look at its user name and certificate and the broker's list",
+    141: "nothing was heard for longer than the keep-alive",
+}
+"""Reason codes of MQTT 5 (2.4) that have better words than their name; paho makes them of those of 3.1.1."""
+
+
+class Outage:
+    """What has been said of a broker that is away.
+
+    Args:
+        log: where it is said.
+    """
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._told: list[tuple[str, str]] = []
+
+    @property
+    def is_told(self) -> bool:
+        """Whether it has been said that the broker is away."""
+        return bool(self._told)
+
+    def tell(self, broker: str, error: Exception, until: str) -> None:
+        """Say why a broker is away, unless that has been said.
+
+        Args:
+            broker: which one, e.g. ``"MQTT broker 10.0.0.1:8883"``.
+            error: the reason.
+            until: what is going on about it.
+        """
+        reason = in_words(error)
+        still = "still " if self.is_told else ""
+        if self.note(broker, reason):
+            self._log.warning("%s is %saway: %s; %s", broker, still, reason, until)
+
+    def note(self, broker: str, reason: str) -> bool:
+        """Take a reason as told; whether it is a new one that may be said."""
+        if (broker, reason) in self._told or len(self._told) >= MOST_REASONS:
+            return False
+        self._told.append((broker, reason))
+        return True
+
+    def end(self) -> None:
+        """The broker is there: what comes next is another outage."""
+        self._told.clear()
+
+
+def has_expired(error: Exception) -> bool:
+    """Whether the broker was refused because a certificate that it shows has expired."""
+    return isinstance(error, ssl.SSLCertVerificationError) and error.verify_code == _EXPIRED
+
+
+def in_words(error: Exception | None) -> str:
+    """A failure to connect, or the end of a connection, in words."""
+    words = str(error or "closed")
+    match error:
+        case ssl.SSLCertVerificationError():
+            words = _unverified(error)
+        case ssl.SSLError():
+            words = f"TLS failed: {(getattr(error, 'reason', None) or words).lower().replace('_', ' ')}"
+        case ConnectionRefusedError():
+            words = "nothing listens there"
+        case socket.gaierror():
+            words = f"its name is not known: {error.strerror}"
+        case TimeoutError():
+            words = "it does not answer"
+        case aiomqtt.MqttCodeError():
+            words = _coded(error)
+        case OSError() if error.strerror is not None:
+            words = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+    return words
+
+
+def _unverified(error: ssl.SSLCertVerificationError) -> str:
+    found = error.verify_message.rstrip(".")
+    if error.verify_code in _OTHER_HOST:
+        return f"its certificate is for another host: {found}"
+    if error.verify_code in _UNKNOWN_AUTHORITY:
+        return f"nobody in ca_file vouches for its certificate: {found}"
+    return _VERIFICATION.get(error.verify_code, f"its certificate is refused: {found}")
+
+
+def _coded(error: aiomqtt.MqttCodeError) -> str:
+    if isinstance(error.rc, int):
+        return error_string(error.rc).rstrip(".")  # a number of the library's, not of the standard
+    return _CODES.get(getattr(error.rc, "value", 0), str(error.rc))
