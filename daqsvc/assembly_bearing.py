@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_SAME_RATE = 1e-3
+SAME_RATE = 1e-3
+"""How far two sampling rates may differ that count as one, as a share."""
 _M_S2_PER_UNIT = {"g": STANDARD_GRAVITY, "m/s2": 1.0}
 
 
@@ -204,7 +205,7 @@ def _fitting(
             f"{path}: holds nothing of {', '.join(lacking)}, but of {known}; calibrate with all of them"
         )
     for what, value, wanted, tolerance in (
-        ("sampled at {:g} Hz", found.rate_hz, rate_hz, _SAME_RATE),
+        ("sampled at {:g} Hz", found.rate_hz, rate_hz, SAME_RATE),
         ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm or found.speed_rpm), SAME_SPEED),
     ):
         if abs(value / wanted - 1.0) > tolerance:

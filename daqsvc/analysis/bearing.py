@@ -148,8 +148,7 @@ class BearingAnalyst:
         del progress  # a recording takes a tenth of a second
         try:
             loaded = self.setup.load(recording)
-            baseline = None if self.healthy is None else self.healthy.at(loaded.rate_hz)
-        except (RecordingError, NotIdentifiableError) as error:
+        except RecordingError as error:
             analysis = BearingAnalysis(
                 recording=recording,
                 baseline=None if self.healthy is None else str(self.healthy.recording.source),
@@ -158,14 +157,14 @@ class BearingAnalyst:
                 refused=str(error),
             )
         else:
-            analysis = self._analyse(loaded, baseline)
+            analysis = self._analyse(loaded)
             if figures is not None and analysis.races:
                 from daqsvc.analysis.bearing_plots import draw_envelopes  # noqa: PLC0415 - brings matplotlib
 
                 draw_envelopes(analysis, figures)
         return Outcome(analysis.as_json(), analysis.describe(), analysis.refused is not None)
 
-    def _analyse(self, recording: Recording, baseline: BearingBaseline | None) -> BearingAnalysis:
+    def _analyse(self, recording: Recording) -> BearingAnalysis:
         """Judge against the healthy run, unless that is none: it must not hide anything."""
         if self.healthy is None:
             return analyse_bearings(recording, self.setup)
@@ -176,6 +175,11 @@ class BearingAnalyst:
             return alone.with_problem(
                 f"the healthy run {source} is not used: {damage}; give one of the machine in good order"
             )
+        try:
+            baseline = self.healthy.at(recording.rate_hz)
+        except NotIdentifiableError as error:
+            alone = analyse_bearings(recording, self.setup)
+            return alone.with_problem(f"the healthy run {source} is not used: {error}")
         analysis = analyse_bearings(recording, self.setup, baseline)
         if not doubt:
             return analysis

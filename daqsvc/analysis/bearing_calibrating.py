@@ -9,8 +9,8 @@ import numpy as np
 from daqsvc.analysis.bearing_machine import present
 from daqsvc.analysis.machine import MachineAnalyst
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.assembly_bearing import orders_of, pair_models
-from daqsvc.bearing.identify_baseline import learn_baseline
+from daqsvc.assembly_bearing import SAME_RATE, orders_of, pair_models
+from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
@@ -48,13 +48,13 @@ def learn_by_machine(
         machine: the machine file.
         path: the recording.
         channels: which variable of it is which sensor or channel.
-        rate_hz: its sampling rate; None: what it says.
+        rate_hz: its sampling rate; None: what it says. What is faster than the machine is learnt at its rate.
 
     Raises:
         ValueError: the map names what is no sensor, or a bearing is not known.
         RecordingError: the recording cannot be read.
         RefusedError: it lacks an accelerometer, or shows a fault.
-        NotIdentifiableError: it cannot be the healthy machine's.
+        NotIdentifiableError: it cannot be the healthy machine's, or is slower than the machine.
     """
     analyst = MachineAnalyst(machine=str(machine.path), channels=channels, rate_hz=rate_hz)
     analyst.check_map(machine)
@@ -72,14 +72,19 @@ def learn_by_machine(
     bearings = {bearing.sensor: orders_of(bearing, i) for i, bearing in enumerate(watched.bearings)}
     speed_rpm = abs(machine.machine.speed_rpm)
     _refuse_faults(recording, bearings, speed_rpm)
-    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    # What is learnt is compared with the machine's own samples.
+    watched_hz = machine.streams[machine.sensor(watched.bearings[0].sensor).stream].rate_hz
+    rate_hz = recording.rate_hz if abs(recording.rate_hz / watched_hz - 1.0) <= SAME_RATE else watched_hz
+    samples, highest = resampled(recording.samples, recording.rate_hz, rate_hz)
+    samples = np.where(np.isfinite(samples), samples, np.nan)
     return learn_baseline(
         dict(zip(recording.names, samples.T, strict=True)),
-        recording.rate_hz,
+        rate_hz,
         speed_rpm,
         bearings,
         [bearing.sensors for bearing in watched.bearings],
         pairs=pair_models(machine, watched),
+        highest=highest,
         source=str(recording.source),
     )
 

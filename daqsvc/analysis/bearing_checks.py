@@ -8,6 +8,7 @@ import numpy as np
 
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.quality import count_bad
+from daqsvc.bearing.race.quality import OFFSET_NOTE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,8 +40,8 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
         if not len(signal):
             continue
         rms = float(signal.std())
-        if rms == 0.0:
-            continue  # dead: the race test says so
+        if np.ptp(signal) == 0.0:
+            continue  # dead: the race test says so; the rounding of its mean is no vibration
         m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
         if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
             quality = quality.with_problem(
@@ -60,4 +61,18 @@ def with_repairs(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> Data
     for name, race in races.items():
         for repair in race.repairs:
             quality = quality.with_problem(f"{name}: {repair}")
+    return with_offsets(quality, races)
+
+
+def with_offsets(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> DataQuality:
+    """The same with the offsets that the race test met.
+
+    Args:
+        quality: what is known so far.
+        races: what each channel shows, of those that could be judged.
+    """
+    for name, race in races.items():
+        for note in race.notes:
+            if note.startswith(OFFSET_NOTE):
+                quality = quality.with_problem(f"{name}: {note}; check the sensor's supply")
     return quality

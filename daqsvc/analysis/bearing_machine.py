@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.analysis.bearing_checks import accelerometer_quality
+from daqsvc.analysis.bearing_checks import accelerometer_quality, with_offsets
 from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.bearing_setup import BearingSetup
+from daqsvc.analysis.quality import DataQuality
 from daqsvc.analysis.statements import Statements
 from daqsvc.assembly_bearing import bearing_detector, orders_of
 from daqsvc.bearing.identify_change import ChangeRules
@@ -149,7 +150,7 @@ def _analysis(
     looks: list[Look],
 ) -> BearingAnalysis:
     """What the detector stands by at the end, with the figures of the look that shows it most."""
-    setup = _setup(machine, detector)
+    setup = _setup(machine)
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
     quality = accelerometer_quality(setup.channels, recording.samples[:, columns], setup.unit)
     good = [one for one in said if one.quality == "good"]
@@ -191,6 +192,7 @@ def _analysis(
             probabilities=finding.probabilities,
             severity=finding.severity,
         ),
+        quality=with_offsets(quality, look.races),
         races=look.races,
         healthy=healthy,
         change=look.change,
@@ -212,15 +214,28 @@ def _decisive(looks: list[Look], standing: Standing) -> Look | None:
     return max(same, key=lambda look: 0.0 if look.finding is None else look.finding.severity)
 
 
-def _setup(machine: MachineFile, detector: BearingDetector) -> BearingSetup:
+def bearings_not_judged(machine: MachineFile, recording: str, why: str) -> BearingAnalysis:
+    """The verdict about a recording that cannot be judged.
+
+    Args:
+        machine: the machine file with ``[pipeline.bearing]``.
+        recording: its path.
+        why: it cannot.
+    """
+    return BearingAnalysis(
+        recording=recording, baseline=None, setup=_setup(machine), quality=DataQuality(0), refused=why
+    )
+
+
+def _setup(machine: MachineFile) -> BearingSetup:
     """What the machine file says, in the words of an analysis; its channels are the bearings."""
     given = machine.pipeline.bearing
     assert given is not None  # noqa: S101 - the caller has looked
     unit = machine.sensor(given.bearings[0].sensor).unit
     return BearingSetup(
-        channels=tuple(bearing.name for bearing in detector.bearings),
+        channels=tuple(bearing.name for bearing in given.bearings),
         speed_rpm=abs(machine.machine.speed_rpm),
-        bearings={bearing.name: bearing.orders for bearing in detector.bearings},
+        bearings={bearing.name: orders_of(bearing, i) for i, bearing in enumerate(given.bearings)},
         designations={bearing.name: bearing.type for bearing in given.bearings if bearing.type is not None},
         unit=cast("AccelerationUnit", unit),
         change=ChangeRules(

@@ -180,7 +180,8 @@ class BearingAnalysis:
         seen = "by its harmonics" if race.speed_seen else "not confirmed by its harmonics"
         lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
         lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
-        lines += [note for note in race.notes if note not in race.repairs]  # those are problems of the data
+        # Those about the samples are problems of the data.
+        lines += [note for note in race.notes if not any(note in told for told in self.quality.problems)]
         return "\n  ".join([*lines, *self.quality.problems])
 
     @staticmethod
@@ -199,7 +200,8 @@ class BearingAnalysis:
             told = "and perhaps" if race.both else "or"
             said += f" {told} {' or '.join(others)}"
         if finding.verdict in {"normal", "changed"}:
-            return said
+            blind = [part for part in PARTS if not race.evidence[part].testable]
+            return f"{said} as far as it can be tested ({', '.join(blind)} not testable)" if blind else said
         return f"{said} at {finding.where}, severity {finding.severity:.1f}"
 
 

@@ -10,7 +10,12 @@ import numpy as np
 
 from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
-from daqsvc.analysis.bearing_machine import analyse_machine_bearings, check_bearings, present
+from daqsvc.analysis.bearing_machine import (
+    analyse_machine_bearings,
+    bearings_not_judged,
+    check_bearings,
+    present,
+)
 from daqsvc.analysis.bearing_setup import matching
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
@@ -31,6 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.analysis.bearing_machine import MachineBearings
+    from daqsvc.analysis.bearing_result import BearingAnalysis
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
@@ -104,9 +110,9 @@ class MachineAnalyst:
             columns = self.columns(machine, recording)
             loaded = load_recording(recording, columns, self.rate_hz)
         except (RecordingError, RefusedError) as error:
-            return _outcome(RotorAnalysis.not_judged(recording, str(error)), ())
+            return _outcome(_not_judged(machine, recording, str(error)), ())
         machine = _as_recorded(machine, loaded)
-        analysis: RotorAnalysis | None = None
+        analysis: RotorAnalysis | BearingAnalysis | None = None
         if machine.pipeline.rotor_synchronous is not None:
             setup = self.setup(machine, machine.pipeline.rotor_synchronous)
             analysis = analyse(loaded, setup, progress)
@@ -128,7 +134,7 @@ class MachineAnalyst:
         try:
             bearings = self._bearings(machine, loaded, figures)
         except ValueError as error:
-            analysis, bearings = RotorAnalysis.not_judged(recording, str(error)), None
+            analysis, bearings = _not_judged(machine, recording, str(error)), None
         return _outcome(analysis, tuple(statements.values()), bearings)
 
     def columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
@@ -275,8 +281,16 @@ def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
     )
 
 
+def _not_judged(machine: MachineFile, recording: str, why: str) -> RotorAnalysis | BearingAnalysis:
+    """The verdict about a recording that cannot be judged, with the keys that one about it would have."""
+    pipeline = machine.pipeline
+    if pipeline.bearing is None or pipeline.rotor_synchronous is not None or pipeline.rotor_bank is not None:
+        return RotorAnalysis.not_judged(recording, why)
+    return bearings_not_judged(machine, recording, why)
+
+
 def _outcome(
-    analysis: RotorAnalysis | None,
+    analysis: RotorAnalysis | BearingAnalysis | None,
     statements: tuple[Statements, ...],
     bearings: MachineBearings | None = None,
 ) -> Outcome:

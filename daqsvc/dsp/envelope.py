@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Real = NDArray[np.float64]
+    Floating = NDArray[np.floating]
     Complex = NDArray[np.complex128]
     # Whitened, there is no range of amplitudes left that would need more than single precision.
     Envelope = NDArray[np.float32]
@@ -57,7 +58,7 @@ class WhitenedBand:
     clipped: Band
 
 
-def running_median(values: Real | NDArray[np.float32], width: int) -> Real:
+def running_median(values: Floating, width: int) -> Real:
     """Median over about ``width`` neighbours, from half-overlapping blocks with straight lines between.
 
     Args:
@@ -72,12 +73,12 @@ def running_median(values: Real | NDArray[np.float32], width: int) -> Real:
     width = 2 * hop
     if n <= 2 * width:
         return np.full(n, float(np.median(values)))
-    blocks = np.lib.stride_tricks.sliding_window_view(values, width)[::hop]
+    blocks: Floating = np.lib.stride_tricks.sliding_window_view(values, width)[::hop]
     centres = hop * np.arange(len(blocks)) + 0.5 * (width - 1)
     return np.interp(np.arange(n), centres, row_medians(blocks))
 
 
-def row_medians(rows: Real | NDArray[np.float32]) -> Real:
+def row_medians(rows: Floating) -> Real:
     """Median of each row, ``[rows]``: that of `numpy.median` five times as fast; NaN is not looked for.
 
     Args:
@@ -87,8 +88,10 @@ def row_medians(rows: Real | NDArray[np.float32]) -> Real:
     parted = np.array(rows, order="C")
     # One place at a time is what the partition is fast at; the one below it is the largest of its side.
     parted.partition(half, axis=1)
-    middle: Real = parted[:, half]
-    return middle if rows.shape[1] % 2 else 0.5 * (parted[:, :half].max(axis=1) + middle)
+    middle = parted[:, half]
+    if rows.shape[1] % 2 == 0:
+        middle = 0.5 * (parted[:, :half].max(axis=1) + middle)
+    return np.asarray(middle, dtype=np.float64)
 
 
 def whiten(
@@ -110,7 +113,7 @@ def whiten(
     median = running_median(amplitude, round(median_hz * per_hz)).astype(np.float32)
     phase = part / amplitude
     clipped = phase * np.minimum(amplitude / median, CLIP_MEDIANS)
-    return WhitenedBand(phase, clipped)
+    return WhitenedBand(np.asarray(phase, np.complex64), np.asarray(clipped, np.complex64))
 
 
 def squared_envelope(band: Band, bins: int) -> Envelope:

@@ -107,6 +107,78 @@ def test_a_healthy_run_at_a_wrong_rate_is_not_used(verb: Run, tmp_path: Path) ->
     assert found["residual"]["changed"]
 
 
+def test_a_healthy_run_slower_than_the_recording_is_not_used(verb: Run, tmp_path: Path) -> None:
+    path = damaged(tmp_path / "rig.npz")
+    slow = tmp_path / "healthy.npz"
+    np.savez(slow, de=healthy(10.0, 1, rate_hz=0.5 * RATE_HZ))
+    _, alone, _ = verb("analyze", path, *OPTIONS)
+    code, found, _ = verb("analyze", path, *OPTIONS, "--baseline", slow, "--baseline-fs", 6000)
+    assert (code, found["verdict"], found["baseline"]) == (0, "inner", None)
+    assert found["evidence"] == alone["evidence"]
+    told = f"the healthy run {slow} is not used: the healthy machine was sampled at 6000 Hz"
+    assert told in problems(found)
+
+
+def test_a_pure_tone_is_not_called_wrong_samples(verb: Run, tmp_path: Path) -> None:
+    path = tmp_path / "rig.npz"
+    np.savez(path, de=np.sin(2.0 * np.pi * 50.0 * np.arange(120_000) / RATE_HZ))
+    code, found, _ = verb("analyze", path, *OPTIONS)
+    assert (code, found["verdict"]) == (3, None)
+    assert "nothing but rounding from 400 to 5760 Hz beside its 50 Hz" in found["refused"]
+
+
+def test_a_constant_channel_is_dead_and_does_not_vibrate(verb: Run, tmp_path: Path) -> None:
+    path = tmp_path / "rig.npz"
+    np.savez(path, de=np.full(120_000, 2.7))
+    code, found, _ = verb("analyze", path, *OPTIONS)
+    assert code == 3
+    assert "is dead" in found["refused"]
+    assert problems(found) == ""
+
+
+def test_a_large_offset_is_a_problem_of_the_data_and_told_once(
+    verb: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.npz"
+    np.savez(path, de=healthy(10.0, 2) + 1000.0)
+    code, found, _ = verb("analyze", path, *OPTIONS)
+    assert code == 0
+    assert "de: the channel has an offset of 1000, " in problems(found)
+    assert main(["analyze", str(path), *OPTIONS]) == 0
+    assert capsys.readouterr().out.count("offset of 1000") == 1
+
+
+@pytest.mark.parametrize("rate_hz", [51_200.0, 38_400.0])
+def test_a_faster_recording_is_learnt_at_the_rate_of_the_machine(
+    verb: Run, tmp_path: Path, rate_hz: float
+) -> None:
+    machine = tmp_path / "machine.toml"
+    text = EXAMPLE.read_text(encoding="utf-8").replace("speed_rpm = 1772.0", "speed_rpm = 1797.0")
+    machine.write_text(text, encoding="utf-8")
+    path, out = tmp_path / "good.npz", tmp_path / "motor.toml"
+    np.savez(path, **{f"accel-{end}": healthy(10.0, 6, rate_hz=rate_hz) for end in ("de", "fe")})
+    code, made, err = verb("calibrate", machine, path, "--fs", rate_hz, "--out", out)
+    assert (code, made.get("refused"), made.get("rate_hz")) == (0, None, 25_600.0), err or made
+    code, made, _ = verb("calibrate", machine, path, "--fs", 12_000, "--out", tmp_path / "no.toml")
+    assert code == 3
+    assert made["refused"]
+    assert not (tmp_path / "no.toml").exists()
+
+
+def test_what_is_refused_with_a_machine_file_has_the_keys_of_a_bearing(verb: Run, tmp_path: Path) -> None:
+    machine, path, out = tmp_path / "machine.toml", tmp_path / "good.npz", tmp_path / "motor.toml"
+    text = EXAMPLE.read_text(encoding="utf-8").replace("speed_rpm = 1772.0", "speed_rpm = 1797.0")
+    machine.write_text(text.replace("rate_hz = 25_600.0", "rate_hz = 12_000.0"), encoding="utf-8")
+    np.savez(path, **{"accel-de": healthy(10.0, 6), "accel-fe": healthy(10.0, 7)})
+    assert verb("calibrate", machine, path, "--fs", 12_000, "--out", out)[0] == 0
+    _, judged, _ = verb("analyze", machine, path, "--fs", 12_000, "--calibration", out)
+    code, found, _ = verb("analyze", machine, path, "--fs", 10_000, "--calibration", out)
+    assert code == 3
+    assert "sampled at 12000 Hz, not sampled at 10000 Hz" in found["refused"]
+    assert found.keys() == judged.keys()
+    assert found["channels"]["drive-end"]["refused"] == found["refused"]
+
+
 @pytest.mark.parametrize(("factor", "how"), [(1e-3, "little"), (1e3, "much")])
 def test_a_unit_that_was_assumed_is_told(verb: Run, tmp_path: Path, factor: float, how: str) -> None:
     path = tmp_path / "rig.npz"

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
-from daqsvc.bearing.race.combs import TEETH, highest_order
+from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
 from daqsvc.bearing.race.decision import RACES, decide
 from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
 from daqsvc.bearing.race.harmonics import slow_series
@@ -218,12 +218,17 @@ def _wander_note(track: ShaftTrack) -> str:
 def _found(
     evidence: Mapping[Part, PartEvidence], view: EnvelopeView, bearing: BearingOrders, shaft_hz: float
 ) -> tuple[RaceLine, ...]:
+    """The lines of all parts; one that the foremost part explains is no other part's."""
     lines = []
+    first = max(PARTS, key=lambda part: evidence[part].severity)
+    leads = evidence[first].z >= evidence[first].z_limit
+    unexplained = view.without(part_lines(first, evidence[first].order, bearing)) if leads else view
     for part, e in evidence.items():
+        left = view if part == first else unexplained
         modulation = bearing.cage if part == "ball" else 1.0
         for tooth in TEETH[part]:
             order = tooth.harmonic * e.order + tooth.sideband * modulation
-            nats = view.lines.at(order)
+            nats = left.lines.at(order)
             if nats >= LEAST_LINE_NATS:
                 depth = float(np.sqrt(view.depth.line(np.array([order]))[0]))
                 line = (order * shaft_hz, order, tooth.harmonic, tooth.sideband, nats, depth)

@@ -29,6 +29,7 @@ PILED_UP = 1.5
 """Samples at the extreme value over those within 2.5 % of the range of it, beyond which it is a limit."""
 DEAD_SHARE = 0.5
 OFFSET_DEVIATIONS = 5.0
+OFFSET_NOTE = "the channel has an offset"
 GAP_TAPER_S = 2e-3
 """A channel that breaks off makes noise of its own: it fades out before, and in behind."""
 BRIDGED = 4
@@ -104,9 +105,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
         notes.append(f"{clipped:.2%} of the samples are clipped: sizes are too small")
     offset, deviation = float(x.mean()), float(x.std())
     if abs(offset) > OFFSET_DEVIATIONS * deviation:
-        notes.append(
-            f"the channel has an offset of {offset:.4g}, {abs(offset) / deviation:.0f} times what it measures"
-        )
+        notes.append(f"{OFFSET_NOTE} of {offset:.4g}, {abs(offset) / deviation:.0f} times what it measures")
     return CheckedSamples(
         x - offset,
         tuple(notes),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.fft
 from scipy.ndimage import median_filter
 
 from daqsvc.bearing.race.knocks import blanked, knocks, merged
@@ -35,6 +36,8 @@ STEADY_REVOLUTIONS = 5
 MIDDLE_OF = 50
 """One sample of so many gives the spread of all."""
 TOLD = 3
+EMPTY_SHARE = 1e-8
+"""Share of a channel's power in the analysed band below which it holds nothing: that of 14 bits rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         stretches = merged([*stretches, *found])
         lost = sum(last - first for first, last in stretches) / len(samples)
         if lost > MOST_BLANKED:
+            _refuse_empty_band(samples, rate_hz, band_hz)
             raise RaceInputError(
                 "channel",
                 f"is much louder for {lost:.0%} of its time, first at {stretches[0][0] / rate_hz:.2f} s, "
@@ -93,6 +97,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
             )
         values = blanked(values, found, rate_hz)
     if len(spikes) > MOST_SPIKES * len(samples):
+        _refuse_empty_band(samples, rate_hz, band_hz)
         raise RaceInputError(
             "channel", f"has {len(spikes)} wrong samples of {len(samples)}", "check cable and converter"
         )
@@ -106,6 +111,24 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
     if stretches:
         repairs.append(_told_knocks(stretches, rate_hz))
     return Repaired(values, tuple(repairs), tuple(stretches))
+
+
+def _refuse_empty_band(samples: Real, rate_hz: float, band_hz: tuple[float, float]) -> None:
+    """Refuse a channel whose band holds nothing but rounding, which looks like wrong samples once whitened.
+
+    Raises:
+        RaceInputError: it is such a channel.
+    """
+    power = np.abs(scipy.fft.rfft((samples - samples.mean()) * np.hanning(len(samples)))) ** 2
+    frequency = scipy.fft.rfftfreq(len(samples), 1.0 / rate_hz)
+    inside = float(power[(frequency >= band_hz[0]) & (frequency <= band_hz[1])].sum())
+    if inside < EMPTY_SHARE * power.sum():
+        raise RaceInputError(
+            "channel",
+            f"holds nothing but rounding from {band_hz[0]:g} to {band_hz[1]:g} Hz beside its "
+            f"{frequency[power.argmax()]:.0f} Hz",
+            "this is no accelerometer on a running machine: check channel, sensor and filter",
+        )
 
 
 def _steadied(samples: Real, revolution: int) -> tuple[Real, str]:
