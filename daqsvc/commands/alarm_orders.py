@@ -8,7 +8,7 @@ import pwd
 import sys
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.option_types import duration, one_line
+from daqsvc.commands.option_types import alarm_id, duration, one_line
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
 if TYPE_CHECKING:
@@ -50,7 +50,10 @@ class OrderCommand:
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
         parser.add_argument(
-            "alarm", metavar="ID", help="name of the alarm, or how its id begins in daqsvc alarms"
+            "alarm",
+            type=alarm_id,
+            metavar="ID",
+            help="name of the alarm, or how its id begins in daqsvc alarms",
         )
         add_store(parser)
         if self._verb == "shelve":

@@ -109,6 +109,15 @@ def one_line(text: str) -> str:
     return text
 
 
+def alarm_id(text: str) -> str:
+    """Name of an alarm, or the beginning of an id."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(
+            f"{text!r} names no alarm; write its name, or how its id begins in daqsvc alarms"
+        )
+    return text
+
+
 def calibration_length(text: str) -> int:
     """Revolutions that make a baseline."""
     from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy

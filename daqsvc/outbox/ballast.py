@@ -6,7 +6,7 @@ import logging
 import os
 from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import free_bytes
+from daqsvc.outbox.files import free_bytes, restrict
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,11 +33,13 @@ class Ballast:
     def take(self) -> None:
         """Have it on board, if the disk has room enough; without it, everything works all the same."""
         try:
+            restrict(self._path)
             if not self._size or self._path.exists():
                 return
             if free_bytes(self._path.parent) < self._reserve_bytes + 2 * self._size:
                 return
             with self._path.open("wb") as file:
+                restrict(self._path)
                 os.posix_fallocate(file.fileno(), 0, self._size)
         except OSError as error:
             log.info("outbox ballast %s cannot be taken: %s", self._path, error)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import logging
 import os
 import sqlite3
+import stat
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.outbox.messages import OutboxError
 
 if TYPE_CHECKING:
-    from pathlib import Path
     from typing import BinaryIO
+
+log = logging.getLogger(__name__)
 
 FileError = (sqlite3.Error, OSError, UnicodeDecodeError)
 """What goes wrong with a file. Names out of a damaged one are no text, which comes as the last of these."""
@@ -29,6 +33,9 @@ WAL_MAX_BYTES = 8 * 1024 * 1024
 ASIDE_KEPT = 3
 """Corrupt files that are kept; a failing disk must not fill itself with them."""
 
+MODE = 0o640
+"""Most that the files of a store allow, whatever the umask: alarms are nobody's business but the group's."""
+
 _DAMAGED = {
     sqlite3.SQLITE_CORRUPT,
     sqlite3.SQLITE_NOTADB,
@@ -43,6 +50,21 @@ _DAMAGED = {
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 
 NS_PER_MS = 1_000_000
+
+
+def restrict(path: Path) -> None:
+    """Take from a file whatever it allows beyond `MODE`, if the file system knows modes.
+
+    By name: closing a handle of a database would undo this process's locks on it.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode) and stat.S_IMODE(status.st_mode) & ~MODE:
+            path.chmod(status.st_mode & MODE)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        log.info("%s stays as readable as it is: %s", path, error)
 
 
 def sync_directory(directory: Path) -> None:
@@ -67,6 +89,7 @@ def replace_durably(path: Path, content: bytes) -> None:
     """Give ``path`` a new content: after a power cut it has either the old or the new one, whole."""
     draft = path.with_name(path.name + ".new")
     with draft.open("wb") as file:
+        restrict(draft)
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -87,6 +110,7 @@ def take_possession(path: Path) -> BinaryIO:
     """
     lock = path.open("ab")
     try:
+        restrict(path)
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         lock.close()
@@ -109,7 +133,14 @@ def connect(path: Path | str, *, synchronous: str, wal_pages: int = WAL_PAGES) -
 
     Raises:
         sqlite3.Error: the file is corrupt (see `is_corrupt`) or cannot be used.
+        OSError: it cannot be made.
     """
+    if isinstance(path, Path):
+        if not path.exists():
+            # SQLite would ask the umask; the files beside a database get the mode of the database.
+            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, MODE))
+        for suffix in SIDE_FILES:
+            restrict(path.with_name(path.name + suffix))
     connection = sqlite3.connect(path, isolation_level=None, timeout=5.0)
     try:
         # Before anything is written: it decides how a new file is laid out.

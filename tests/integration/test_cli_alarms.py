@@ -145,7 +145,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             await stands(store, "peak", "out_of_service")
             code, _, err = await daqsvc("ack", "shakin", file, "--by", "Ann")
             assert code == 1
-            assert "no alarm is named 'shakin'; there are: peak" in err
+            assert "no alarm is named 'shakin'; there are: alarm-flood, peak" in err
 
         kinds = ["raised", "acknowledged", "shelved", "unshelved", "latched", "reset"]
         assert [
@@ -367,3 +367,16 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
         assert code == 1, "0 says that it is on disk"
     finally:
         await server.close()
+
+
+@pytest.mark.parametrize("nothing", ["", "  "])
+async def test_an_id_that_names_nothing_is_refused_in_words(tmp_path: Path, nothing: str) -> None:
+    code, _, err = await daqsvc("ack", nothing, "--store", tmp_path)
+    assert code == 2
+    assert f"{nothing!r} names no alarm; write its name, or how its id begins in daqsvc alarms" in err
+
+
+async def test_a_machine_file_and_a_store_exclude_each_other(tmp_path: Path) -> None:
+    code, _, err = await daqsvc("ack", "rotor-fault", "machine.toml", "--store", tmp_path)
+    assert code == 2
+    assert "not allowed with argument" in err

@@ -1,0 +1,56 @@
+"""Who may read the files of a store, whatever the umask and however they were left before."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+import pytest
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.outbox.store import Outbox
+
+TOPIC = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
+
+
+def modes(directory):
+    return {path.name: stat.S_IMODE(path.stat().st_mode) for path in directory.iterdir()}
+
+
+@pytest.fixture(params=[0o000, 0o022, 0o077], ids=oct)
+def umask(request):
+    before = os.umask(request.param)
+    yield request.param
+    os.umask(before)
+
+
+async def use(path):
+    """A store with alarms and telemetry; the modes of its files while it runs."""
+    outbox = Outbox(path, SystemClock(), OutboxLimits(reserve_bytes=0))
+    await outbox.open()
+    await outbox.append(TOPIC, lambda _: b"{}", retain=True)
+    outbox.telemetry("daqsvc/lab/edge-1/status", b"{}", expiry_s=60.0)
+    await outbox.append(TOPIC, lambda _: b"{}", retain=True)
+    found = modes(path.parent)
+    await outbox.close()
+    return found
+
+
+async def test_nobody_else_reads_a_file_of_the_store(tmp_path, umask):
+    found = await use(tmp_path / "outbox.sqlite")
+    assert {"outbox.sqlite", "outbox.sqlite-wal", "outbox.sqlite.sequence"} <= set(found)
+    assert set(found.values()) == {0o640 & ~umask}
+
+
+async def test_files_that_an_earlier_version_left_open_are_closed_to_others(tmp_path):
+    await use(tmp_path / "outbox.sqlite")
+    for path in tmp_path.iterdir():
+        path.chmod(0o644)
+    assert set((await use(tmp_path / "outbox.sqlite")).values()) == {0o640}
+
+
+async def test_what_somebody_has_closed_further_stays_closed(tmp_path):
+    await use(tmp_path / "outbox.sqlite")
+    (tmp_path / "outbox.sqlite").chmod(0o600)
+    assert (await use(tmp_path / "outbox.sqlite"))["outbox.sqlite"] == 0o600
