@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.analysis.bearing_checks import accelerometer_quality, with_repairs
+from daqsvc.analysis.bearing_checks import (
+    accelerometer_quality,
+    ball_order_problem,
+    refuse_no_machine,
+    with_repairs,
+)
 from daqsvc.analysis.bearing_inputs import meant_in_hz, stated_speed_problem, unit_problems
 from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.many import Outcome
@@ -49,9 +54,7 @@ def analyse_bearings(
         baseline: the healthy machine at the recording's rate, learnt by the same setup.
     """
     samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    quality = accelerometer_quality(recording.names, recording.samples, setup.unit)
-    for problem in (stated_speed_problem(recording, setup.speed_rpm), *unit_problems(recording, setup.unit)):
-        quality = quality.with_problem(problem) if problem else quality
+    quality = _quality(recording, setup)
     source = None if baseline is None else baseline.source
     races: dict[str, RaceVerdict] = {}
     unfit: dict[str, str] = {}
@@ -59,14 +62,17 @@ def analyse_bearings(
         before = None if baseline is None else baseline.races[name]
         try:
             refuse_clipped(column)
-            races[name] = race_test(
+            race = race_test(
                 column, recording.rate_hz, setup.speed_rpm, setup.bearings[name], setup.race, before
             )
+            refuse_no_machine(column, setup.unit, race)
         except ClippedError as error:
             unfit[name] = str(error)
             quality = replace(quality, clipped={**quality.clipped, name: error.samples})
         except RaceInputError as error:
             unfit[name] = str(error)
+        else:
+            races[name] = race
 
     def refuse(why: str) -> BearingAnalysis:
         return BearingAnalysis(
@@ -100,6 +106,16 @@ def analyse_bearings(
         healthy=healthy,
         change=change,
     )
+
+
+def _quality(recording: Recording, setup: BearingSetup) -> DataQuality:
+    """What is known against a recording before it is judged."""
+    quality = accelerometer_quality(recording.names, recording.samples, setup.unit)
+    orders = dict.fromkeys(ball_order_problem(setup.bearings[name]) for name in recording.names)
+    speed = stated_speed_problem(recording, setup.speed_rpm)
+    for problem in (speed, *unit_problems(recording, setup.unit), *orders):
+        quality = quality.with_problem(problem) if problem else quality
+    return quality
 
 
 def _change(

@@ -9,6 +9,7 @@ import numpy as np
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.quality import count_bad
 from daqsvc.bearing.race.quality import OFFSET_NOTE
+from daqsvc.bearing.race.verdict import RaceInputError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.analysis.quality import DataQuality
+    from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import RaceVerdict
 
     Floats = NDArray[np.float64]
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 _LEAST_M_S2 = 1e-4
 _MOST_M_S2 = 10_000.0
 """No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""
+_LEAST_MACHINE_M_S2 = 1e-3
+"""A tenth of a milli-g: what a good accelerometer shows by itself where nothing turns."""
+_TWICE_TOLERANCE = 0.1
 
 
 def accelerometer_quality(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> DataQuality:
@@ -49,6 +54,47 @@ def accelerometer_quality(names: Sequence[str], samples: Floats, unit: Accelerat
                 "wrong; correct --unit (g, m/s2 or V)"
             )
     return quality
+
+
+def refuse_no_machine(samples: Floats, unit: AccelerationUnit, race: RaceVerdict) -> None:
+    """Refuse a channel that shows no machine at all, as of a sensor that is unplugged.
+
+    Args:
+        samples: ``[n]``, as they were recorded.
+        unit: that they are said to be in.
+        race: what the race test says of them.
+
+    Raises:
+        RaceInputError: they are quieter than any machine, and no harmonics of a shaft stand out.
+    """
+    rms = float(np.nanstd(samples))
+    quiet = rms * M_S2_PER_UNIT.get(unit, float("nan")) < _LEAST_MACHINE_M_S2
+    if quiet and not race.speed_seen and race.verdict == "normal":
+        raise RaceInputError(
+            "channel",
+            f"shows no machine: {rms:.3g} {unit} r.m.s. and no speed that its harmonics confirm",
+            "check sensor, cable and --unit",
+        )
+
+
+def ball_order_problem(orders: BearingOrders) -> str:
+    """What is odd about a stated BSF; empty if nothing: BPFI and BPFO alone determine it.
+
+    Their sum is the number of balls, their difference over it the ratio of ball to pitch diameter, times the
+    cosine of the contact angle, which makes BSF smaller by itself; so only about twice the value is told.
+
+    Args:
+        orders: as stated.
+    """
+    balls = max(round(orders.inner + orders.outer), 1)
+    ratio = (orders.inner - orders.outer) / balls
+    expected = (1.0 - ratio**2) / (2.0 * ratio)
+    if abs(orders.ball / (2.0 * expected) - 1.0) > _TWICE_TOLERANCE:
+        return ""
+    return (
+        f"BSF {orders.ball:g} is twice what BPFI {orders.inner:g} and BPFO {orders.outer:g} make it "
+        f"({expected:.3f}): some data sheets state 2 BSF; give half of it"
+    )
 
 
 def with_repairs(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> DataQuality:

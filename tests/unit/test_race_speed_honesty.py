@@ -110,3 +110,16 @@ def test_a_part_is_not_named_where_its_lines_and_the_harmonics_agree_on_another_
     ):
         refuse_rivals(evidence, BEARING, shaft, 0.015)
     refuse_rivals(evidence | {"ball": nothing}, BEARING, shaft, 0.015)
+
+
+def test_a_speed_that_harmonics_speak_against_leaves_no_sure_normal() -> None:
+    t = np.arange(60_000) / RATE_HZ
+    shaft_hz = SPEED_RPM / 60.0
+    half = sum(np.cos(2 * np.pi * k * 0.5 * shaft_hz * t + k) for k in range(1, 16))
+    verdict = race_test(
+        np.random.default_rng(0).standard_normal(len(t)) + 0.3 * half, RATE_HZ, SPEED_RPM, BEARING
+    )
+    assert not verdict.speed_seen
+    assert any("half orders" in note for note in verdict.notes)
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] <= 0.5

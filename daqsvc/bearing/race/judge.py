@@ -16,7 +16,7 @@ import scipy.fft
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
 from daqsvc.bearing.race.decision import RACES, decide
-from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
+from daqsvc.bearing.race.doubt import MOST_DOUBT, MOST_MARGIN, doubted
 from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.knocks import levelled
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
@@ -62,6 +62,7 @@ class RaceFeatures:
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
         speed_doubt: why they do not confirm it; empty if they do.
+        other_speed: whether they speak for another one instead.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
         repairs: what was wrong with them and put right.
@@ -74,6 +75,7 @@ class RaceFeatures:
     levels: BandLevels
     speed_rpm: float
     speed_doubt: str
+    other_speed: bool
     revolutions: float
     notes: tuple[str, ...]
     repairs: tuple[str, ...]
@@ -143,7 +145,13 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
         verdict=decision.verdict,
         group=decision.group,
         evidence=features.evidence,
-        probability=doubted(decision.probability, len(notes) - repairs, repairs, features.lost),
+        probability=doubted(
+            decision.probability,
+            len(notes) - repairs,
+            repairs,
+            # At another speed the lines of all parts are elsewhere: nothing was looked for in their places.
+            lost=MOST_DOUBT if features.other_speed else features.lost,
+        ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
         speed_rpm=features.speed_rpm,
@@ -196,6 +204,7 @@ def race_features(
         levels=band_levels(spectrum, length, rate_hz),
         speed_rpm=60.0 * shaft.rate_hz,
         speed_doubt=shaft.doubt,
+        other_speed=shaft.elsewhere,
         revolutions=revolutions,
         notes=sound.notes if track is None else (*sound.notes, _wander_note(track)),
         repairs=sound.repairs,

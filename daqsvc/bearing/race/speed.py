@@ -61,6 +61,7 @@ class ShaftRate:
         seen: whether harmonics of the shaft stand out at that rate, and more so than at any other.
         sharp: whether it is known to a fraction of the search.
         doubt: why they do not confirm it; empty if they do.
+        elsewhere: whether they speak for another one instead.
         scan: votes for all speeds about the stated one.
     """
 
@@ -68,6 +69,7 @@ class ShaftRate:
     seen: bool
     sharp: bool = False
     doubt: str = ""
+    elsewhere: bool = False
     scan: SpeedScan | None = None
 
     def outvoted(self, rival_hz: float, slip: float) -> bool:
@@ -128,11 +130,11 @@ def shaft_rate(
     if scan.votes_about(beside) > scan.votes_about(rate_hz) + NEAR_NATS:
         rate_hz, sharp = beside, True
     scan.refuse_other(rate_hz)
-    doubt = scan.doubt(rate_hz)
+    doubt, elsewhere = scan.doubt(rate_hz)
     # A damaged ball makes lines at 1X less the cage's rate that can outweigh the shaft's own.
     if wrong is not None and doubt and not _cage_line(enough, series_hz, (1.0 - cage) * stated_hz):
         raise RaceInputError("shaft speed or sample rate", f"is wrong: {wrong}", REMEDY) from wrong
-    return ShaftRate(rate_hz, not doubt, sharp, doubt, scan)
+    return ShaftRate(rate_hz, not doubt, sharp, doubt, elsewhere, scan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,25 +184,25 @@ class SpeedScan:
         about = np.abs(self.rates_hz / rate_hz - 1.0) <= reach
         return float(self.votes[about].max(initial=-np.inf))
 
-    def doubt(self, rate_hz: float) -> str:
-        """Why the harmonics do not confirm a rate; empty if they do."""
+    def doubt(self, rate_hz: float) -> tuple[str, bool]:
+        """Why the harmonics do not confirm a rate, empty if they do, and whether they speak for another."""
         own = self.votes_about(rate_hz)
         if own < SEEN_NATS:
-            return "no harmonics of the shaft stand out"
+            return "no harmonics of the shaft stand out", False
         if own - self.harmonics.mains_votes(rate_hz) < NOT_MAINS_NATS:
-            return "only harmonics at multiples of the mains' frequency stand out"
+            return "only harmonics at multiples of the mains' frequency stand out", False
         other = self.best(self.others)
         if self.votes_about(other) > own + LEAD_NATS:
-            return f"more harmonics stand out at {60.0 * other:.0f} rpm"
+            return f"more harmonics stand out at {60.0 * other:.0f} rpm", True
         odd, even, half = (
             float(self.harmonics.voices(np.array([rate_hz]), orders).mean())
             for orders in (np.arange(1.0, 9.0, 2.0), np.arange(2.0, 9.0, 2.0), np.arange(0.5, 8.0))
         )
         if half > WHOLE_SHARE * max(odd, even):
-            return f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm"
+            return f"half orders stand out as well, as if the shaft turned at {30.0 * rate_hz:.0f} rpm", True
         if odd < WHOLE_SHARE * even:
-            return f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm"
-        return ""
+            return f"only even harmonics stand out, as if the shaft turned at {120.0 * rate_hz:.0f} rpm", True
+        return "", False
 
     def refuse_other(self, rate_hz: float) -> None:
         """Refuse the stated speed if far more harmonics speak for another one.
