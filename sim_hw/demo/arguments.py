@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 MOST_DB = 200.0
 """Signal to noise beyond this, either way, is noise or none in double precision."""
 
-OF_RECORDINGS = ("map", "fs", "unit", "baseline", "baseline_map", "baseline_fs")
+OF_RECORDINGS = ("map", "fs", "unit", "baseline", "baseline_map", "baseline_fs", "bearing", "speed_rpm")
 OF_SCENARIOS = ("scenario", "seed", "snr_db")
 OF_BASELINES = ("baseline_map", "baseline_fs")
 
@@ -27,6 +27,10 @@ def misuse(arguments: argparse.Namespace) -> str | None:
         return f"{given} goes with a scenario, and --recording plays a recording; leave one of the two out"
     if arguments.baseline is None and (given := _given(arguments, OF_BASELINES)):
         return f"{given} goes with a baseline; give that with --baseline, or leave {given} out"
+    if (arguments.bearing is None) != (arguments.speed_rpm is None):
+        return "--bearing and --speed-rpm go together: its lines lie at multiples of the speed; give both"
+    if arguments.bearing is not None and arguments.unit not in {None, "g", "m/s2"}:
+        return f"--bearing needs accelerometers, and --unit is {arguments.unit}; leave one of the two out"
     return None
 
 

@@ -84,6 +84,17 @@ class DemoCommand:
         what.add_argument(
             "--baseline-fs", type=sampling_rate_hz, metavar="HZ", help="as --fs (default: the same)"
         )
+        what.add_argument(
+            "--bearing",
+            metavar="NAME",
+            help="watch this bearing at every channel of the recording (catalogue name, e.g. 6205-2RS)",
+        )
+        what.add_argument(
+            "--speed-rpm",
+            type=arguments_of.positive,
+            metavar="N",
+            help="speed of the shaft in the recording, right to 1 %%; with --bearing",
+        )
         how = parser.add_argument_group("how to play it")
         how.add_argument(
             "--speed",
@@ -233,7 +244,7 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
 
 def _from_recording(arguments: argparse.Namespace) -> Script:
     from sim_hw.demo.baseline import setpoints  # noqa: PLC0415
-    from sim_hw.demo.machines import Setpoints, for_recording  # noqa: PLC0415
+    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
     from sim_hw.demo.playable import playable  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
@@ -252,11 +263,14 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
                 f"{', '.join(recording.names)}; give both the same sensor names with --map and --baseline-map"
             )
     unit = arguments.unit or UNIT
+    bearing = None
+    if arguments.bearing is not None:
+        bearing = PlayedBearing(arguments.bearing, arguments.speed_rpm)
     # Made once before anything is started: it says what is wrong with the recording.
-    for_recording(recording, unit, limits, "mqtt://127.0.0.1:1883")
+    for_recording(recording, unit, limits, "mqtt://127.0.0.1:1883", bearing)
     return Script(
         title=f"{recording.source.name}: {', '.join(recording.names)} at {recording.rate_hz:g} Hz",
-        machine=lambda url: for_recording(recording, unit, limits, url),
+        machine=lambda url: for_recording(recording, unit, limits, url, bearing),
         stream="recording",
         samples=recording.samples,
         rate_hz=recording.rate_hz,

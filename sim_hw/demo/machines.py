@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -42,6 +44,50 @@ SENSOR_TYPES: Mapping[str, str] = {
 
 class Setpoints(dict[str, tuple[float, float]]):
     """Alert and danger limit of the RMS, by channel."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedBearing:
+    """The bearing that every channel of a recording is watched for.
+
+    Attributes:
+        designation: its name in the catalogue.
+        speed_rpm: of the shaft.
+
+    Raises:
+        DemoError: the catalogue does not know it.
+    """
+
+    designation: str
+    speed_rpm: float
+
+    def __post_init__(self) -> None:
+        try:
+            bearing_orders(self.designation)
+        except KeyError as error:
+            raise DemoError(f"--bearing: {error.args[0]}") from None
+
+    def tables(self, sensors: Sequence[str]) -> str:
+        """Detector and alarm of a machine file."""
+        watched = [
+            f"""[[pipeline.bearing.bearings]]
+name = "{sensor}"
+sensor = "{sensor}"
+type = {json.dumps(self.designation)}
+"""
+            for sensor in sensors
+        ]
+        return "".join(
+            [
+                "[pipeline.bearing]\n",
+                *watched,
+                """[[alarms]]
+name = "bearing-damage"
+detector = "bearing"
+latching = true
+""",
+            ]
+        )
 
 
 def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
@@ -74,8 +120,21 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
     )
 
 
-def for_recording(recording: Recording, unit: str, setpoints: Setpoints, url: str) -> MachineFile:
+def for_recording(
+    recording: Recording,
+    unit: str,
+    setpoints: Setpoints,
+    url: str,
+    bearing: PlayedBearing | None = None,
+) -> MachineFile:
     """A machine with one sensor per channel of a recording, int16 samples over CAN FD.
+
+    Args:
+        recording: what its sensors show.
+        unit: of the channels.
+        setpoints: of the alarms, by channel.
+        url: of the broker.
+        bearing: what the channels are watched for; None: no bearing.
 
     Raises:
         DemoError: more channels than a frame has room for, or the service could not diagnose it; says so
@@ -95,7 +154,7 @@ box = "virtual"
 [machine]
 name = "recorded-machine"
 description = {json.dumps(str(recording.source).encode(errors="replace").decode())}
-speed_rpm = 1800.0
+speed_rpm = {1800.0 if bearing is None else bearing.speed_rpm!r}
 [buses.can0]
 driver = "can"
 interface = "virtual"
@@ -150,6 +209,8 @@ danger = {danger!r}
 deadband = {0.05 * alert!r}
 """
             )
+    if bearing is not None:
+        tables.append(bearing.tables(names))
     try:
         return parse_machine_file("".join(tables), Path("recorded-machine.toml"))
     except MachineFileError as error:
