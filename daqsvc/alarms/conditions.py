@@ -9,6 +9,8 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.record import Diagnosis
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.status import Instant
 
@@ -29,6 +31,14 @@ def statement(machine: str, condition: str, level: Level, at: Instant) -> Diagno
 def no_statement(machine: str, at: Instant) -> Diagnosis:
     """Stands in for the cause of an alarm that nobody has judged yet."""
     return _statement(machine, UNDETERMINED, Level.NORMAL, at)
+
+
+def unjudged(machine: str, name: str, conditions: Collection[str], at: Instant) -> Diagnosis:
+    """The cause of what people do with alarm ``name`` before anybody has judged it.
+
+    For one of the ``conditions`` of the service it names that, so that it is known again after a restart.
+    """
+    return statement(machine, name, Level.NORMAL, at) if name in conditions else no_statement(machine, at)
 
 
 def is_condition(event: AlarmEvent) -> bool:

@@ -16,6 +16,7 @@ from daqsvc.alarms.conditions import (
     is_condition,
     no_statement,
     statement,
+    unjudged,
 )
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
 from daqsvc.alarms.expected import Expected
@@ -170,10 +171,13 @@ class AlarmManager:
             RefusedError: there is no such alarm, or its state does not allow it; the text is the reason.
         """
         try:
-            event = self._obeyed(command)
+            alarm = self._named(command.alarm)
+            event = self._obeyed(command, alarm)
         except RefusedError:
             self.counters.refused += 1
             raise
+        self._alarms[alarm.name] = alarm
+        self._conditions.update({alarm.name} & self._expected.conditions)
         self.counters.commands += 1
         return self._tell([event])
 
@@ -296,7 +300,7 @@ class AlarmManager:
 
     def _timed(self, now: Instant) -> Iterator[AlarmEvent]:
         for alarm in self._alarms.values():
-            expired = alarm.expire(now, self._nothing(alarm.name, now))
+            expired = alarm.expire(now, self._unjudged(alarm.name, now))
             if expired is not None:
                 yield expired
         yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
@@ -312,8 +316,7 @@ class AlarmManager:
         cause = statement(self._identity.machine, name, level, at)
         return self._alarms[name].apply(Finding(level, "", sentence), cause, at)
 
-    def _obeyed(self, command: AlarmCommand) -> AlarmEvent:
-        alarm = self._named(command.alarm)
+    def _obeyed(self, command: AlarmCommand, alarm: Alarm) -> AlarmEvent:
         standing = alarm.status.occurrence
         if command.occurrence is not None and command.occurrence != standing:
             stands = "it is normal" if standing is None else f"now {standing} stands"
@@ -321,7 +324,10 @@ class AlarmManager:
                 f"cannot {command.verb} {alarm.name}: occurrence {command.occurrence} is over, {stands}"
             )
         now = self._now()
-        request, nothing = Request(command.by, now, command.reason), self._nothing(alarm.name, now)
+        request, nothing = (
+            Request(command.by, now, command.reason),
+            self._unjudged(alarm.name, now),
+        )
         match command.verb:
             case Verb.ACKNOWLEDGE:
                 return alarm.acknowledge(request)
@@ -336,21 +342,17 @@ class AlarmManager:
             case Verb.UNBYPASS:
                 return alarm.unbypass(request, nothing)
 
-    def _named(self, name: str) -> Alarm:
-        """The alarm of that name; one that can come by itself exists from the first command on."""
-        if name not in self._alarms and name in self._expected.names:
-            self._add(name, latching=False)
-            self._conditions.update({name} & self._expected.conditions)
-        if name not in self._alarms:
-            known = ", ".join(sorted({*self._alarms, *self._expected.names})) or "none"
-            raise RefusedError(f"no alarm is named {name!r}; there are: {known}")
-        return self._alarms[name]
+    def _unjudged(self, name: str, at: Instant) -> Diagnosis:
+        return unjudged(self._identity.machine, name, self._conditions | self._expected.conditions, at)
 
-    def _nothing(self, name: str, at: Instant) -> Diagnosis:
-        """The cause of what people do with an alarm that nobody has judged yet."""
-        if name in self._conditions:
-            return statement(self._identity.machine, name, Level.NORMAL, at)
-        return no_statement(self._identity.machine, at)
+    def _named(self, name: str) -> Alarm:
+        """The alarm of that name, or a new one if it can come by itself."""
+        if name in self._alarms:
+            return self._alarms[name]
+        if name in self._expected.names:
+            return self._made(name, latching=False)
+        known = ", ".join(sorted({*self._alarms, *self._expected.names})) or "none"
+        raise RefusedError(f"no alarm is named {name!r}; there are: {known}")
 
     def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
         """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
@@ -391,15 +393,14 @@ class AlarmManager:
         return Instant(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
 
     def _add(self, name: str, *, latching: bool) -> Alarm:
-        alarm = Alarm(
-            self._identity,
-            name,
-            latching=latching,
-            new_occurrence=self._new_occurrence,
-            chatter=self._handling.chatter,
-        )
-        self._alarms[name] = alarm
+        alarm = self._alarms[name] = self._made(name, latching=latching)
         return alarm
+
+    def _made(self, name: str, *, latching: bool) -> Alarm:
+        chatter = self._handling.chatter
+        return Alarm(
+            self._identity, name, latching=latching, new_occurrence=self._new_occurrence, chatter=chatter
+        )
 
     def _now(self) -> Instant:
         return self._instant(self._clock.monotonic_ns())

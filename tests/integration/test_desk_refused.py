@@ -13,6 +13,7 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.messages import OutboxError
+from daqsvc.self_check import conditions
 
 IDENTITY = Identity("lab", "edge-1", "rig")
 CLOCK = SystemClock()
@@ -93,7 +94,8 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path)
     for message in await desk.outbox.latest():
         payload = json.loads(message.payload)
         told[payload["alarm"]] = (payload["kind"], payload["state"], payload["occurrence"])
-    assert told == dict.fromkeys(("fault", "other", "sensor-ok/x"), ("returned", "normal", None))
+    names = ("fault", "other", "sensor-ok/x", *conditions(None))
+    assert told == dict.fromkeys(names, ("returned", "normal", None))
     await desk.close(1.0)
 
     desk = AlarmDesk(IDENTITY, rules, tmp_path, CLOCK, None)

@@ -69,6 +69,14 @@ def test_a_sensor_that_dies_behind_the_cover_is_told_of_as_covered(rig):
     assert ("sensor-ok/probe-x", AlarmState.OUT_OF_SERVICE) in [(e.alarm, e.to_state) for e in events]
 
 
+def test_a_command_that_is_refused_brings_no_alarm_into_being(rig):
+    for verb, duration_s in ((Verb.ACKNOWLEDGE, None), (Verb.SHELVE, 1e9), (Verb.UNBYPASS, None)):
+        with pytest.raises(RefusedError):
+            obey(rig, verb, "store/disk", duration_s)
+    assert set(rig.manager.alarms) == {"rotor-fault"}
+    assert not rig.manager.conditions
+
+
 def test_what_cannot_come_is_no_alarm_and_the_refusal_names_those_that_can(rig):
     with pytest.raises(
         RefusedError, match=r"no alarm is named 'sensor-ok/probe-z'; there are: alarm-flood, "
