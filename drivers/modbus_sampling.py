@@ -33,6 +33,9 @@ WORTH_A_BATCH_NS = 5_000_000
 EARLY_NS = 500_000
 """How early a poll may be: no event loop sleeps for less than a millisecond."""
 
+LATE_NS = 2_000_000
+"""How late it may be: no event loop wakes up to the millisecond, and what is overdue is soon asked for."""
+
 LARGEST_DRIFT = 0.05
 ID_MODULUS = 65_536
 
@@ -165,11 +168,11 @@ class TrendReader(_AssembledReader[Trend]):
         """The schedule itself is the pause."""
 
     async def _wait_for_slot(self) -> int:
-        """Wait for the next place in the schedule that has not passed."""
+        """Wait for the next place in the schedule that has not passed for good."""
         now_ns = self._clock.monotonic_ns()
         if self._start_ns is None:
             self._start_ns = now_ns
-        slot = max(self._done + 1, -int((self._start_ns - now_ns) // self._period_ns))
+        slot = max(self._done + 1, -int((self._start_ns + LATE_NS - now_ns) // self._period_ns))
         wait_ns = self._start_ns + round(slot * self._period_ns) - now_ns
         if wait_ns > WORTH_A_BATCH_NS:
             self._hand_on()

@@ -379,3 +379,23 @@ def test_a_ring_that_begins_again_is_followed_without_what_is_left_from_before()
     np.testing.assert_array_equal(np.diff(values[restart:]), 1)
     assert values[restart] <= 1, "the first samples after the restart are lost"
     assert values[-1] >= 397
+
+
+class DrowsyClock(LoopClock):
+    """Wakes up later than it should, as an event loop does that waits in whole milliseconds."""
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        await super().sleep_ns(duration_ns + 1_100_000)
+
+
+def test_a_schedule_finer_than_the_event_loop_sleeps_is_kept_without_loss():
+    rig = Rig(options_of(serial=False), {"s": (trend_of(1), 1500.0)}, clock=DrowsyClock())
+
+    async def main():
+        async with responding(marked_units([1]), lambda *_: Answer(), serial=False), rig.running():
+            await asyncio.sleep(2)
+
+    simulate(main)
+    rig.check_books("s")
+    assert rig.counters("s").samples_lost == 0
+    assert rig.counters("s").samples_received == pytest.approx(3000, abs=10)
