@@ -24,6 +24,7 @@ class RaceRules:
         ball_severity_limit: of a ball.
         unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
         unseen_ball_caution: the same for a ball: at a wrong speed it is a ball that races are most taken for.
+        elsewhere_ball_caution: the same where harmonics speak for another speed instead.
         depth_limit: least size of a race's lines.
         ball_depth_limit: least size of a ball's lines.
         steadiness_limit: least steadiness of a race's lines.
@@ -61,6 +62,7 @@ class RaceRules:
     ball_severity_limit: float = 2.2
     unseen_caution: float = 2.0
     unseen_ball_caution: float = 3.5
+    elsewhere_ball_caution: float = 4.5
     depth_limit: float = 0.12
     ball_depth_limit: float = 0.20
     steadiness_limit: float = 0.30

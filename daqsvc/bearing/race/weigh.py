@@ -95,6 +95,7 @@ class Scales:
         # A speed that is not known sharply shifts every line: the search grows by that, and is paid for.
         self._slip = rules.slip if shaft.sharp else rules.slip + rules.speed_tolerance
         self._seen = shaft.seen
+        self._elsewhere = shaft.elsewhere
         self._caution = 1.0 if shaft.seen else rules.unseen_caution
 
     def weigh(self) -> dict[Part, PartEvidence]:
@@ -156,6 +157,8 @@ class Scales:
             # A ball's marks come and go with its own tumbling: its lines are too weak for the logarithm.
             e = replace(e, depth=by_square, severity=max(z, 0.0) * by_square)
             caution = 1.0 if self._seen else rules.unseen_ball_caution
+            if self._elsewhere:
+                caution = rules.elsewhere_ball_caution
             e = replace(e, limit=caution * rules.ball_severity_limit, steadiness_limit=0.0)
             if away < rules.ball_testable_bins:
                 e = replace(e, testable=False, reason=_why_not(order, gap, rules))
