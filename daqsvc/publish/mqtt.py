@@ -7,7 +7,7 @@ import logging
 import ssl
 from dataclasses import asdict
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import aiomqtt
 
@@ -31,10 +31,11 @@ from daqsvc.publish.outage import Outage, has_expired, in_words
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.session import CredentialsReplacedError, Session
 from daqsvc.publish.settings import MqttSettings
+from daqsvc.publish.stopping import unless
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Mapping
+    from collections.abc import Mapping
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
@@ -44,8 +45,6 @@ if TYPE_CHECKING:
 __all__ = ["MqttPublisher", "MqttSettings", "PublishCounters"]
 
 log = logging.getLogger(__name__)
-
-_T = TypeVar("_T")
 
 STABLE_S = 10.0
 """A connection that was of use for this long has earned a quick first retry."""
@@ -170,7 +169,7 @@ class MqttPublisher:
         self._running = asyncio.get_running_loop().create_future()
         try:
             while not self._stopping.is_set():
-                made = await self._unless_stopping(self._connect())
+                made = await unless(self._stopping, self._connect())
                 if made is None:
                     await self._wait(self._backoff.next_ns() / NS_PER_S)
                     continue
@@ -333,19 +332,7 @@ class MqttPublisher:
             await connection.close(max(self._left_s(), GOODBYE_S / 2))
 
     async def _wait(self, wait_s: float) -> None:
-        await self._unless_stopping(asyncio.sleep(wait_s))
-
-    async def _unless_stopping(self, work: Coroutine[Any, Any, _T]) -> _T | None:
-        """The result of ``work``; None if the publisher is told to stop before."""
-        task = asyncio.ensure_future(work)
-        stopping = asyncio.ensure_future(self._stopping.wait())
-        try:
-            await asyncio.wait({task, stopping}, return_when=asyncio.FIRST_COMPLETED)
-            return task.result() if task.done() else None
-        finally:
-            for each in (task, stopping):
-                each.cancel()
-            await asyncio.gather(task, stopping, return_exceptions=True)
+        await unless(self._stopping, asyncio.sleep(wait_s))
 
     def _left_s(self) -> float:
         return max(self._stop_at_s - asyncio.get_running_loop().time(), 0.0)
