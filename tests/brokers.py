@@ -150,6 +150,15 @@ class Consumer:
         return [message for message in self.messages if part in message.topic]
 
 
+def listens(port: int) -> bool:
+    """Whether somebody takes connections there."""
+    try:
+        socket.create_connection((LOOPBACK, port), 1.0).close()
+    except OSError:
+        return False
+    return True
+
+
 async def eventually(condition: Callable[[], object], what: str) -> None:
     """Wait until ``condition`` holds; the event loop goes on."""
     until = time.monotonic() + PATIENCE_S

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 
 import pytest
-from brokers import Consumer, eventually, free_port, running_mosquitto
+from brokers import Consumer, eventually, free_port, listens, running_mosquitto
 from tls_files import authority, openssl, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
@@ -188,6 +188,7 @@ async def test_a_renewal_is_no_outage_to_anybody(tmp_path, outbox, monkeypatch):
     plain = free_port()
     config = f"{tls_config(broker, ca)}\nlistener {plain} 127.0.0.1\nallow_anonymous true"
     with running_mosquitto(tmp_path, config=config) as mosquitto:
+        await eventually(lambda: listens(plain), "the second listener is there too")
         async with (
             Consumer(plain) as live,
             publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher,
