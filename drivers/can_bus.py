@@ -13,12 +13,12 @@ import logging
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusPort, DeviceAbsentError
+from daqsvc.acquisition.supervisor import Link
 from drivers.can_adapter import open_adapter
 from drivers.can_batches import FrameSorter
 from drivers.can_errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can_reader import SHUTDOWN_S, CanReader, close_quietly, words
+from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.socketcan import open_socketcan
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
-    from drivers.base import StreamSpec
+    from drivers.base import BusPort, StreamSpec
     from drivers.can_batches import CanSource, Sorted
     from drivers.frames import FrameLayout
 
@@ -57,7 +57,6 @@ class CanDriver:
         self._sorter = FrameSorter(port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._open_source = open_source or _open_source
-        self._backoff = Backoff()
         self._said: set[str] = set()
 
     @property
@@ -67,43 +66,32 @@ class CanDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
-        first_try = True
         try:
-            while True:
-                source = await self._open()
-                if source is not None:
-                    self.link.up()
-                    self.counters.controller_state = "error-active"
-                    before = self._frames
-                    reason = await self._receive(source)
-                    self.link.down(reason)
-                    if self._frames > before:  # a bus that opens and fails at once is not back
-                        self._backoff.reset()
-                elif first_try and self._port.start == "error":
-                    raise DeviceAbsentError(f"{self.link.name} cannot be opened: {self.link.reason}")
-                elif first_try and self._port.start == "ignore":
-                    return
-                first_try = False
-                await self._port.clock.sleep_ns(self._backoff.next_ns())
+            await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
+
+    async def _attempt(self) -> Attempt:
+        source = await self._open()
+        if source is None:
+            return Attempt(present=False, useful=False, reason=self.link.reason)
+        self.link.up()
+        self.counters.controller_state = "error-active"
+        before = self._frames
+        reason = await self._receive(source)
+        return Attempt(present=True, useful=self._frames > before, reason=reason)
 
     @property
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
     async def _open(self) -> CanSource | None:
-        opening = asyncio.ensure_future(asyncio.to_thread(self._open_source, self._port, self._sorter))
         try:
-            return await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            # A bus that opens all the same must be closed again, or its next owner finds it taken.
-            await asyncio.wait({opening}, timeout=SHUTDOWN_S)
-            if opening.done() and opening.exception() is None:
-                await asyncio.to_thread(close_quietly, opening.result())
-            raise
+            return await in_thread(
+                self._open_source, self._port, self._sorter, undo=close_quietly, patience_s=SHUTDOWN_S
+            )
         except Exception as error:  # noqa: BLE001 - adapters raise what they like; the driver must live on
             self.counters.open_failures += 1
             self.link.down(f"it cannot be opened: {words(error)}")
@@ -116,13 +104,8 @@ class CanDriver:
         try:
             return await reader.ended
         finally:
-            closing = asyncio.ensure_future(asyncio.to_thread(reader.close))
-            try:
-                await asyncio.shield(closing)
-            except asyncio.CancelledError:
-                # Cancelled while the bus is being closed: that takes its half second all the same.
-                await asyncio.wait({closing}, timeout=2 * SHUTDOWN_S)
-                raise
+            # Cancelled while the bus is being closed: that takes its half second all the same.
+            await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
 
     def take(self, found: Sorted) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""

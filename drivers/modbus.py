@@ -11,8 +11,8 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusPort, DeviceAbsentError
+from daqsvc.acquisition.supervisor import Link
+from drivers.keeping import Attempt, keep_up
 from drivers.modbus_client import LineLostError, LineOptions, ModbusClient, ModbusCounters
 from drivers.modbus_line import ModbusLine, Patience, WritableRun
 from drivers.modbus_sampling import reader_for
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import BusPort
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +56,6 @@ class ModbusDriver:
         kind = "Modbus TCP" if self._options.transport == "tcp" else "Modbus RTU"
         self.link = Link(f"{kind} bus {port.name!r} ({self._options.where})")
         self._readers = {spec.name: reader_for(spec, port, self.counters) for spec in port.streams}
-        self._backoff = Backoff()
         self._line: ModbusLine | None = None
 
     @property
@@ -83,23 +83,18 @@ class ModbusDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
-        first_try = True
         try:
-            while True:
-                answered = self.counters.replies
-                self.link.down(await self._session())
-                if self.counters.replies > answered:  # a line that opens and stays silent is not back
-                    self._backoff.reset()
-                elif first_try and self._port.start == "error":
-                    raise DeviceAbsentError(f"{self.link.name} does not answer: {self.link.reason}")
-                elif first_try and self._port.start == "ignore":
-                    return
-                first_try = False
-                await self._port.clock.sleep_ns(self._backoff.next_ns())
+            await keep_up(self.link, self._port, self._attempt, absent="does not answer")
         finally:
             self.link.stop()
             for reader in self._readers.values():
                 reader.flush()
+
+    async def _attempt(self) -> Attempt:
+        answered = self.counters.replies
+        reason = await self._session()
+        heard = self.counters.replies > answered  # a line that opens and stays silent is not there
+        return Attempt(present=heard, useful=heard, reason=reason)
 
     async def _session(self) -> str:
         """Open the line and read until it is lost; returns why."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -59,7 +60,7 @@ class Reader(Protocol):
         ...
 
 
-class _Reader(Generic[LayoutT]):
+class _Reader(ABC, Generic[LayoutT]):
     """What the readers have in common: going on after a request that failed."""
 
     def __init__(self, spec: StreamSpec[LayoutT], port: BusPort, counters: ModbusCounters) -> None:
@@ -87,12 +88,13 @@ class _Reader(Generic[LayoutT]):
                     )
                 await self._pause_after_failure()
 
+    @abstractmethod
     async def _look(self, line: ModbusLine) -> None:
         """Read what there is, and wait until it is worth looking again."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _pause_after_failure(self) -> None:
-        raise NotImplementedError
+        """Wait until it is worth asking again."""
 
 
 class _AssembledReader(_Reader[LayoutT]):

@@ -11,17 +11,18 @@ import asyncio
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusCounters, BusPort, DeviceAbsentError
+from daqsvc.acquisition.supervisor import Link
+from drivers.base import BusCounters, BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.frames import FrameLayout
+from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.replay_files import (
     TABLE_COUNTER_BITS,
     CanLog,
@@ -35,7 +36,7 @@ from drivers.replay_files import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     import can
     from numpy.typing import NDArray
@@ -47,8 +48,6 @@ if TYPE_CHECKING:
     from drivers.replay_files import Recording
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 POLL_NS = NS_PER_S // 20
 SPAN_NS = NS_PER_S // 20
@@ -104,7 +103,6 @@ class ReplayDriver:
         self._first_index: dict[str, int] = {}
         self._shift_ns: int | None = None
         self._newest_ns = 0
-        self._backoff = Backoff()
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -113,32 +111,25 @@ class ReplayDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`; also ends at the end of a recording that is played once."""
-        first_try = True
         try:
-            while True:
-                recording = await self._open()
-                if recording is not None:
-                    self.link.up()
-                    before = self._frames
-                    reason = await self._play(recording)
-                    if self._frames > before:
-                        self._backoff.reset()
-                    if reason == END_OF_FILE and self._at_end == "stop":
-                        self.link.end(reason)
-                        return
-                    if reason == END_OF_FILE and self._frames > before:
-                        continue
-                    self.link.down(reason)
-                elif first_try and self._port.start == "error":
-                    raise DeviceAbsentError(f"{self.link.name} cannot be opened: {self.link.reason}")
-                elif first_try and self._port.start == "ignore":
-                    return
-                first_try = False
-                await self._port.clock.sleep_ns(self._backoff.next_ns())
+            await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
+
+    async def _attempt(self) -> Attempt | None:
+        while (recording := await self._open()) is not None:
+            self.link.up()
+            before = self._frames
+            reason = await self._play(recording)
+            played = self._frames > before
+            if reason == END_OF_FILE and self._at_end == "stop":
+                self.link.end(reason)
+                return None
+            if reason != END_OF_FILE or not played:
+                return Attempt(present=True, useful=played, reason=reason)
+        return Attempt(present=False, useful=False, reason=self.link.reason)
 
     @property
     def _frames(self) -> int:
@@ -146,7 +137,7 @@ class ReplayDriver:
 
     async def _open(self) -> Recording | None:
         try:
-            return await _in_thread(self._open_file, undo=lambda recording: recording.close())
+            return await in_thread(self._open_file, undo=lambda recording: recording.close())
         except RecordingError as error:
             reason = f"{error}"
         except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
@@ -173,7 +164,7 @@ class ReplayDriver:
             self._shift_ns = None
         try:
             while True:
-                piece = await _in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
+                piece = await in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
                 if piece is None:
                     self.counters.passes += 1
                     return END_OF_FILE
@@ -185,7 +176,7 @@ class ReplayDriver:
             self.counters.reader_failures += 1
             return f"its reader failed: {words(error)}"
         finally:
-            await _in_thread(recording.close)
+            await in_thread(recording.close)
 
     async def _take(self, piece: Sorted) -> None:
         clock = self._port.clock
@@ -228,18 +219,6 @@ class ReplayDriver:
             self._assemblers[frames.stream].accept(
                 decoded.counter, decoded.samples, decoded.intact, arrival_ns
             )
-
-
-async def _in_thread(call: Callable[..., T], *arguments: Any, undo: Callable[[T], None] | None = None) -> T:
-    """Call something that reads a file; if cancelled meanwhile, wait for its end and undo it."""
-    work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
-    try:
-        return await asyncio.shield(work)
-    except asyncio.CancelledError:
-        await asyncio.wait({work})
-        if work.exception() is None and undo is not None:
-            undo(work.result())
-        raise
 
 
 def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:

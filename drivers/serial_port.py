@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import serial
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusCounters, BusPort, DeviceAbsentError
+from daqsvc.acquisition.supervisor import Link
+from drivers.base import BusCounters, BusPort
+from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial_lines import TIME_COUNTER_BITS, LineFraming, LineLayout
 from drivers.serial_reader import SHUTDOWN_S, Batch, SerialReader, close_port
@@ -90,7 +91,6 @@ class SerialDriver:
         self._port = port
         self._framing = framing_of(port.options, port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
-        self._backoff = Backoff()
         self._said: set[str] = set()
 
     @property
@@ -100,42 +100,29 @@ class SerialDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
-        first_try = True
         try:
-            while True:
-                device = await self._open()
-                if device is not None:
-                    self.link.up()
-                    before = self._frames
-                    reason = await self._receive(device)
-                    self.link.down(reason)
-                    if self._frames > before:  # a port that opens and fails at once is not back
-                        self._backoff.reset()
-                elif first_try and self._port.start == "error":
-                    raise DeviceAbsentError(f"{self.link.name} cannot be opened: {self.link.reason}")
-                elif first_try and self._port.start == "ignore":
-                    return
-                first_try = False
-                await self._port.clock.sleep_ns(self._backoff.next_ns())
+            await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
+
+    async def _attempt(self) -> Attempt:
+        device = await self._open()
+        if device is None:
+            return Attempt(present=False, useful=False, reason=self.link.reason)
+        self.link.up()
+        before = self._frames
+        reason = await self._receive(device)
+        return Attempt(present=True, useful=self._frames > before, reason=reason)
 
     @property
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
     async def _open(self) -> serial.Serial | None:
-        opening = asyncio.ensure_future(asyncio.to_thread(_open_port, self._port.options))
         try:
-            return await asyncio.shield(opening)
-        except asyncio.CancelledError:
-            # A port that opens all the same must be closed again, or its next owner finds it locked.
-            await asyncio.wait({opening}, timeout=SHUTDOWN_S)
-            if opening.done() and opening.exception() is None:
-                await asyncio.to_thread(close_port, opening.result())
-            raise
+            return await in_thread(_open_port, self._port.options, undo=close_port, patience_s=SHUTDOWN_S)
         except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
             self.counters.open_failures += 1
             self.link.down(f"it cannot be opened: {_why_not_open(error, self._port.options)}")
@@ -150,13 +137,8 @@ class SerialDriver:
         try:
             return await reader.ended
         finally:
-            closing = asyncio.ensure_future(asyncio.to_thread(reader.close))
-            try:
-                await asyncio.shield(closing)
-            except asyncio.CancelledError:
-                # Cancelled while the port is being closed: that takes its time all the same.
-                await asyncio.wait({closing}, timeout=2 * SHUTDOWN_S)
-                raise
+            # Cancelled while the port is being closed: that takes its time all the same.
+            await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
 
     def take(self, batch: Batch) -> None:
         """Take in what the reader thread has found; runs on the event loop."""

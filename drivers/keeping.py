@@ -1,0 +1,88 @@
+"""What all drivers have in common: a link that is tried again, and blocking calls that end in order."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from daqsvc.acquisition.supervisor import Backoff
+from drivers.base import DeviceAbsentError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from daqsvc.acquisition.supervisor import Link
+    from drivers.base import BusPort
+
+T = TypeVar("T")
+
+
+class Attempt(NamedTuple):
+    """How an attempt at a link went.
+
+    Attributes:
+        present: whether the device was there.
+        useful: whether anything came from it: a link that opens and fails at once is not back.
+        reason: why the attempt ended.
+    """
+
+    present: bool
+    useful: bool
+    reason: str
+
+
+async def keep_up(
+    link: Link,
+    port: BusPort,
+    attempt: Callable[[], Awaitable[Attempt | None]],
+    absent: str = "cannot be opened",
+) -> None:
+    """Try a link again and again, each time later unless something came over it; until cancelled.
+
+    Args:
+        link: its state; `attempt` says when it is up.
+        port: what to do if the device is absent at first, and the clock.
+        attempt: opens the link and uses it until it is lost; None if there is nothing more to come.
+        absent: what is wrong if the device is absent, in words.
+
+    Raises:
+        DeviceAbsentError: the device is absent at start and the policy is ``"error"``.
+    """
+    backoff = Backoff()
+    first = True
+    while (outcome := await attempt()) is not None:
+        link.down(outcome.reason)
+        if outcome.useful:
+            backoff.reset()
+        if first and not outcome.present and port.start == "error":
+            raise DeviceAbsentError(f"{link.name} {absent}: {link.reason}")
+        if first and not outcome.present and port.start == "ignore":
+            return
+        first = False
+        await port.clock.sleep_ns(backoff.next_ns())
+
+
+async def in_thread(
+    call: Callable[..., T],
+    *arguments: Any,
+    undo: Callable[[T], object] | None = None,
+    patience_s: float | None = None,
+) -> T:
+    """Make a blocking call; if cancelled meanwhile, wait for its end all the same and undo what it did.
+
+    A bus that opens after its driver was cancelled must be closed again, or its next owner finds it taken.
+
+    Args:
+        call: blocks.
+        arguments: of it.
+        undo: takes back its result; blocks.
+        patience_s: how long to wait for its end when cancelled; None for as long as it takes.
+    """
+    work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
+    try:
+        return await asyncio.shield(work)
+    except asyncio.CancelledError:
+        await asyncio.wait({work}, timeout=patience_s)
+        if undo is not None and work.done() and work.exception() is None:
+            await asyncio.to_thread(undo, work.result())
+        raise

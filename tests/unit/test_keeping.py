@@ -1,0 +1,138 @@
+"""What all drivers have in common: trying a link again, and blocking calls that are cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING
+
+import pytest
+
+from daqsvc.acquisition.supervisor import Link
+from drivers.base import BusPort, DeviceAbsentError
+from drivers.keeping import Attempt, in_thread, keep_up
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from drivers.base import StartPolicy
+
+ABSENT = Attempt(present=False, useful=False, reason="nobody is there")
+USEFUL = Attempt(present=True, useful=True, reason="the plug is out")
+USELESS = Attempt(present=True, useful=False, reason="it failed at once")
+MANY = 12
+FIRST_CEILING_NS = 250_000_000
+
+
+class _NotedWaits:
+    """A clock on which every wait is over at once, and noted."""
+
+    def __init__(self) -> None:
+        self.waits_ns: list[int] = []
+
+    def now_ns(self) -> int:
+        return 0
+
+    def wall_ns(self) -> int:
+        return 0
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        self.waits_ns.append(duration_ns)
+        await asyncio.sleep(0)
+
+
+def _port(clock: _NotedWaits, start: StartPolicy = "retry") -> BusPort:
+    return BusPort("can0", {}, (), clock, lambda _block: None, start)
+
+
+async def _kept(outcomes: list[Attempt | None], start: StartPolicy = "retry") -> tuple[Link, list[int], int]:
+    left = iter(outcomes)
+    made = 0
+
+    async def attempt() -> Attempt | None:
+        nonlocal made
+        made += 1
+        return next(left)
+
+    clock, link = _NotedWaits(), Link("CAN bus 'can0'")
+    await keep_up(link, _port(clock, start), attempt)
+    return link, clock.waits_ns, made
+
+
+async def test_a_link_is_tried_until_there_is_nothing_more_to_come() -> None:
+    link, waits_ns, made = await _kept([ABSENT, USELESS, USEFUL, None])
+    assert made == 4
+    assert len(waits_ns) == 3
+    assert link.reason == "the plug is out"
+
+
+async def test_the_wait_grows_unless_something_came_over_the_link() -> None:
+    longest_ns = {}
+    for outcome in (ABSENT, USELESS, USEFUL):
+        _, waits_ns, _ = await _kept([outcome] * MANY + [None])
+        longest_ns[outcome] = max(waits_ns)
+    assert longest_ns[USEFUL] <= FIRST_CEILING_NS < min(longest_ns[ABSENT], longest_ns[USELESS])
+
+
+async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_that_is_asked_for() -> None:
+    with pytest.raises(DeviceAbsentError, match="CAN bus 'can0' cannot be opened: nobody is there"):
+        await _kept([ABSENT], start="error")
+    for there_once in (USEFUL, USELESS):
+        _, waits_ns, _ = await _kept([there_once, ABSENT, None], start="error")
+        assert len(waits_ns) == 2
+
+
+async def test_an_absent_device_may_be_gone_without() -> None:
+    _, waits_ns, made = await _kept([ABSENT], start="ignore")
+    assert (made, waits_ns) == (1, [])
+
+
+def _call_that_waits(go_on: threading.Event) -> Callable[[], str]:
+    def call() -> str:
+        go_on.wait(10)
+        return "opened"
+
+    return call
+
+
+async def test_what_opens_after_its_driver_was_cancelled_is_closed_again() -> None:
+    go_on, undone = threading.Event(), []
+    opening = asyncio.create_task(in_thread(_call_that_waits(go_on), undo=undone.append))
+    await asyncio.sleep(0.01)
+    opening.cancel()
+    await asyncio.sleep(0.01)
+    assert not opening.done()
+    go_on.set()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert undone == ["opened"]
+
+
+async def test_a_call_that_never_ends_is_waited_for_with_patience_only() -> None:
+    go_on = threading.Event()
+    opening = asyncio.create_task(in_thread(_call_that_waits(go_on), patience_s=0.02))
+    await asyncio.sleep(0.01)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert not go_on.is_set()
+    go_on.set()
+    await asyncio.gather(*(asyncio.all_tasks() - {asyncio.current_task()}))
+
+
+async def test_what_failed_needs_no_undoing() -> None:
+    go_on, undone = threading.Event(), []
+
+    def fails() -> str:
+        go_on.wait(10)
+        message = "taken"
+        raise OSError(message)
+
+    opening = asyncio.create_task(in_thread(fails, undo=undone.append))
+    await asyncio.sleep(0.01)
+    opening.cancel()
+    await asyncio.sleep(0.01)
+    go_on.set()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert undone == []
