@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.supervisor import Backoff, Link
-from drivers.base import BusCounters, BusOptionError, BusPort, DeviceAbsentError
+from daqsvc.acquisition.supervisor import Link
+from drivers.base import BusCounters, BusOptionError
+from drivers.keeping import Attempt, keep_up
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import BusPort
 
 CHUNK_BYTES = 65_536
 TICK_NS = 20_000_000
@@ -64,30 +66,25 @@ class TcpFramesDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
-        backoff = Backoff()
-        first_try = True
         try:
-            while True:
-                try:
-                    reader, writer = await asyncio.open_connection(self._host, self._tcp_port)
-                except OSError as error:
-                    self.counters.open_failures += 1
-                    self.link.down(f"it cannot be reached: {error}")
-                    if first_try and self._port.start == "error":
-                        raise DeviceAbsentError(f"{self.link.name}: {self.link.reason}") from None
-                    if first_try and self._port.start == "ignore":
-                        return
-                else:
-                    self.link.up()
-                    before = self._stream.counters.frames_received
-                    self.link.down(await self._receive(reader, writer))
-                    if self._stream.counters.frames_received > before:
-                        backoff.reset()  # one that answers and says nothing is not back
-                first_try = False
-                await self._port.clock.sleep_ns(backoff.next_ns())
+            await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             self._stream.flush()
+
+    async def _attempt(self) -> Attempt:
+        try:
+            reader, writer = await asyncio.open_connection(self._host, self._tcp_port)
+        except OSError as error:
+            self.counters.open_failures += 1
+            return Attempt(present=False, useful=False, reason=f"it cannot be reached: {error}")
+        self.link.up()
+        before = self._stream.counters.frames_received
+        reason = await self._receive(reader, writer)
+        useful = (
+            self._stream.counters.frames_received > before
+        )  # one that answers and says nothing is not back
+        return Attempt(present=True, useful=useful, reason=reason)
 
     async def _receive(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
         """Read until the connection is lost; returns why."""
