@@ -1,4 +1,4 @@
-"""Verbs of the command line, run in this process."""
+"""What many of these tests need: verbs of the command line run in this process, a store, a broker."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from brokers import running_mosquitto
 
+from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
+from daqsvc.outbox.store import Outbox
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
+
+    from brokers import Mosquitto
 
     Run = Callable[..., tuple[int, list[dict[str, Any]], str]]
 
@@ -35,3 +41,19 @@ def verb(capsys: pytest.CaptureFixture[str]) -> Run:
 def analyze(verb: Run) -> Run:
     """Runs ``daqsvc analyze``; see `verb`."""
     return partial(verb, "analyze")
+
+
+@pytest.fixture
+async def outbox(tmp_path: Path) -> AsyncIterator[Outbox]:
+    """An empty journal, open."""
+    outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
+    await outbox.open()
+    yield outbox
+    await outbox.close()
+
+
+@pytest.fixture
+def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
+    """A broker that has just been started."""
+    with running_mosquitto(tmp_path) as broker:
+        yield broker

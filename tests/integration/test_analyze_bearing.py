@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
@@ -13,8 +12,6 @@ import numpy as np
 import pytest
 from bearing_signals import BALL, INNER, OPTIONS, OUTER, RATE_HZ, Housing, healthy
 
-from daqsvc.cli import main
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -23,21 +20,6 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "config" / "machines" / "bearing.toml"
 WORDS = {"normal", "changed", "inner", "outer", "ball", "inner_or_outer"}
-
-
-@pytest.fixture
-def verb(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a verb in this process with ``--json``: exit code, objects, what went to stderr."""
-
-    def run(*arguments: object) -> tuple[int, list[dict[str, Any]], str]:
-        try:
-            code = main([*map(str, arguments), "--json"])
-        except SystemExit as stopped:
-            code = int(stopped.code or 0)
-        out, err = capsys.readouterr()
-        return code, [json.loads(line, parse_constant=pytest.fail) for line in out.splitlines()], err
-
-    return run
 
 
 @pytest.fixture(scope="module")

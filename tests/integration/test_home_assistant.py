@@ -9,10 +9,9 @@ from dataclasses import replace
 import pytest
 from brokers import Consumer, TcpProxy, eventually, running_mosquitto
 from home_assistant_rules import check_discovery, rendered
-from mqtt_publishing import CLOCK, publishing
+from mqtt_publishing import publishing
 from test_mqtt_commands import say
 
-from daqsvc.outbox.store import Outbox
 from daqsvc.publish.settings import HomeAssistantSettings, Reading
 
 pytestmark = pytest.mark.mosquitto
@@ -24,20 +23,6 @@ RIG = HomeAssistantSettings(
 )
 CONFIG = "homeassistant/device/daqsvc_2flab_2fedge-1_2frig/config"
 SUMMARY = "daqsvc/lab/edge-1/rig/summary"
-
-
-@pytest.fixture
-async def outbox(tmp_path):
-    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
-    await outbox.open()
-    yield outbox
-    await outbox.close()
-
-
-@pytest.fixture
-def mosquitto(tmp_path):
-    with running_mosquitto(tmp_path) as broker:
-        yield broker
 
 
 def alarm(state, level, occurrence="o-1"):

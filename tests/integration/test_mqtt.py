@@ -46,14 +46,6 @@ async def broker(request, tmp_path):
             yield mosquitto.port, protocol
 
 
-@pytest.fixture
-async def outbox(tmp_path):
-    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
-    await outbox.open()
-    yield outbox
-    await outbox.close()
-
-
 @contextlib.asynccontextmanager
 async def publishing(outbox, port, protocol="5", **settings):
     publisher = MqttPublisher(

@@ -11,26 +11,17 @@ from datetime import UTC, datetime
 import paho.mqtt.client as paho
 import pytest
 from brokers import PATIENCE_S, Consumer, TcpProxy, eventually, running_mosquitto
-from mqtt_publishing import CLOCK, publishing
+from mqtt_publishing import publishing
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
-from daqsvc.outbox.store import Outbox
 from daqsvc.publish.command_payloads import ResponsePayload
 from daqsvc.publish.settings import CommandSettings
 
 pytestmark = pytest.mark.mosquitto
 ACKNOWLEDGE = "daqsvc/lab/edge-1/rig/commands/acknowledge"
 SETTINGS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE}))
-
-
-@pytest.fixture
-async def outbox(tmp_path):
-    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
-    await outbox.open()
-    yield outbox
-    await outbox.close()
 
 
 class Desk:

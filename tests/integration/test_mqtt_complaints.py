@@ -22,20 +22,6 @@ from daqsvc.publish.mqtt import FIRST_RETRY_NS
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
 
 
-@pytest.fixture
-async def outbox(tmp_path):
-    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
-    await outbox.open()
-    yield outbox
-    await outbox.close()
-
-
-@pytest.fixture
-def mosquitto(tmp_path):
-    with running_mosquitto(tmp_path) as broker:
-        yield broker
-
-
 async def append(outbox, count, topic=ALARM):
     """Alarms on disk; their numbers."""
     payload = '{{"sequence": {0}}}'.format

@@ -13,7 +13,6 @@ from brokers import Consumer, eventually, free_port, listens, running_mosquitto
 from tls_files import authority, openssl, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.outbox.store import Outbox
 from daqsvc.publish.certificates import CertificateError
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
@@ -22,14 +21,6 @@ from daqsvc.publish.payloads import status_payload
 pytestmark = pytest.mark.mosquitto
 CLOCK = SystemClock()
 SECRET = "correct horse battery staple"  # noqa: S105  nobody's
-
-
-@pytest.fixture
-async def outbox(tmp_path):
-    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
-    await outbox.open()
-    yield outbox
-    await outbox.close()
 
 
 @contextlib.asynccontextmanager
