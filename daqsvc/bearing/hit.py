@@ -64,6 +64,31 @@ def spectra(residual: Floats, frame: int) -> Complexes:
     return np.asarray(np.fft.rfft(cut * np.hanning(frame), axis=2).swapaxes(1, 2), dtype=np.complex128)
 
 
+def healthy_spectrum(
+    residual: Floats, rate_hz: float, frame: int, kept: Mask, least: int, purpose: str
+) -> HealthySpectrum:
+    """What the frames of the residual of a healthy machine are like.
+
+    Args:
+        residual: float64 ``[n, 2]``.
+        rate_hz: its sampling rate.
+        frame: samples.
+        kept: bool ``[frame // 2 + 1]``, lines that are looked at.
+        least: frames that are needed.
+        purpose: of the spectrum, for people.
+
+    Raises:
+        ValueError: there are fewer frames without NaN.
+    """
+    learnt = spectra(residual, frame)[:, kept]
+    if len(learnt) < least:
+        raise ValueError(
+            f"bearing {purpose}: {len(residual) / rate_hz:.2f} s of healthy residual; "
+            f"{(least + 1) * frame / 2.0 / rate_hz:.2f} s or more without gaps are needed"
+        )
+    return HealthySpectrum(covariance(learnt), len(learnt))
+
+
 def best_direction(noise: Complexes, D: Floats) -> tuple[Complexes, Floats]:
     """Where displacements of the races stand out best against noise: the first of two whitened directions.
 

@@ -93,13 +93,7 @@ def isolation_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
         ValueError: the residual is too short.
     """
     frame, _, kept = short_lines(rate_hz)
-    learnt = hit.spectra(residual, frame)[:, kept]
-    if len(learnt) < 4 * frame:
-        raise ValueError(
-            f"bearing isolation: {len(residual) / rate_hz:.2f} s of healthy residual; "
-            f"{2.0 * (frame + 1) * frame / rate_hz:.1f} s or more are needed"
-        )
-    return hit.HealthySpectrum(hit.covariance(learnt), len(learnt))
+    return hit.healthy_spectrum(residual, rate_hz, frame, kept, 4 * frame, "isolation")
 
 
 class IsolationRule:

@@ -85,13 +85,7 @@ def detection_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
         ValueError: the residual is too short.
     """
     frame, _, kept = _lines(rate_hz)
-    learnt = hit.spectra(residual, frame)[:, kept]
-    if len(learnt) < LEAST_FRAMES:
-        raise ValueError(
-            f"bearing detection: {len(residual) / rate_hz:.2f} s of healthy residual; "
-            f"{(LEAST_FRAMES + 1) * frame / 2.0 / rate_hz:.2f} s or more without gaps are needed"
-        )
-    return hit.HealthySpectrum(hit.covariance(learnt), len(learnt))
+    return hit.healthy_spectrum(residual, rate_hz, frame, kept, LEAST_FRAMES, "detection")
 
 
 class WhittleDetector:

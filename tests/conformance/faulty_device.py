@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -9,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-class FaultyDevice:
+class FaultyDevice(ABC):
     """A `conformance.transport.Device` but for the wire: a transport adds how one frame is put on it.
 
     Args:
@@ -30,9 +31,9 @@ class FaultyDevice:
         self._held: tuple[int, NDArray[np.float32]] | None = None
         self._counted_from = 0
 
+    @abstractmethod
     def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
         """Put one frame on the wire; tells whether the wire has taken it. Made by the transport."""
-        raise NotImplementedError
 
     async def send(self, first_index: int, samples: NDArray[np.float32]) -> None:
         """See `Device.send`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 from conformance.faulty_device import FaultyDevice
@@ -62,7 +63,7 @@ class _Device(FaultyDevice):
         self._plug()
 
 
-class _Modbus:
+class _Modbus(ABC):
     """See `conformance.transport.Transport`."""
 
     rate_hz = RATE_HZ
@@ -81,14 +82,17 @@ class _Modbus:
         self._spec: StreamSpec[Any] = StreamSpec(STREAM, self._layout, RATE_HZ)
         self.device = _Device(self._layout, self.unplug, self.plug)
 
+    @abstractmethod
     def plug(self) -> None:
-        raise NotImplementedError
+        """The server answers."""
 
+    @abstractmethod
     def unplug(self) -> None:
-        raise NotImplementedError
+        """The server is gone."""
 
+    @abstractmethod
     def options(self) -> dict[str, Any]:
-        raise NotImplementedError
+        """Of the bus."""
 
     async def stop(self) -> None:
         self.unplug()

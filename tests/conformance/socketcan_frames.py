@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from abc import abstractmethod
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,9 +35,9 @@ class SocketDevice(FaultyDevice):
         super().__init__(PER_FRAME)
         self._layout = layout()
 
+    @abstractmethod
     def put_frame(self, frame: bytes) -> bool:
         """Put a frame on the wire; tells whether the wire has taken it. Made by the transport."""
-        raise NotImplementedError
 
     def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
         data = bytearray(self._layout.encode(np.array([first_index], np.int64), samples[None])[0].tobytes())
