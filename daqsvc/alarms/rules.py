@@ -263,15 +263,21 @@ class MeasureWatch:
             )
         return None
 
-    def in_words(self, diagnosis: Diagnosis, sensor: str, value: float, level: Level) -> str:
-        """The value of ``sensor`` and the limit that makes ``level`` of it."""
+    def in_words(self, diagnosis: Diagnosis, sensor: str, value: float) -> str:
+        """The value of ``sensor`` and the limit that makes the present level of it."""
         unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
         measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
-        limit = self.setpoint.limit(level)
+        limit = self.monitor.reached(value)
         if limit is not None:
-            multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 else ""
-            return f"{measured}, {level.label} limit {limit:.4g}{unit}{multiplied}"
-        return f"{measured}, below its limit of {self.setpoint.lowest:.4g}{unit}"
+            side = "lower " if limit.lower else ""
+            multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""
+            return f"{measured}, {side}{limit.level.label} limit {limit.at:.4g}{unit}{multiplied}"
+        low, high = self.setpoint.highest_low, self.setpoint.lowest
+        if low is None:
+            return f"{measured}, below its limit of {high:.4g}{unit}"
+        if high is None:
+            return f"{measured}, above its limit of {low:.4g}{unit}"
+        return f"{measured}, between its limits of {low:.4g} and {high:.4g}{unit}"
 
 
 class _LevelWatch:
@@ -284,7 +290,7 @@ class _LevelWatch:
         if found is None:
             return None
         level, value = found
-        return Finding(level, "", self._watch.in_words(diagnosis, self._sensor, value, level))
+        return Finding(level, "", self._watch.in_words(diagnosis, self._sensor, value))
 
     def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
         self._watch.monitor.hold()

@@ -4,8 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 from daqsvc.alarms.states import Level
+
+
+class Limit(NamedTuple):
+    """One limit.
+
+    Attributes:
+        level: the level that begins at it.
+        at: where it lies, in the unit of the measure.
+        lower: whether the level is reached at and below it, rather than at and above it.
+    """
+
+    level: Level
+    at: float
+    lower: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,9 +31,12 @@ class Setpoint:
     Attributes:
         alert: at or above this the level is alert; None for no such limit.
         danger: at or above this the level is danger; None for no such limit.
-        deadband: a limit that has been reached is left only below ``limit - deadband``.
-        on_delay_ns: how long the value must stay at or above a limit before the limit counts as reached.
-        off_delay_ns: how long it must stay below the deadband before the limit counts as left.
+        deadband: a limit that has been reached is left only below ``limit - deadband``, a lower one only
+            above ``limit + deadband``.
+        on_delay_ns: how long the value must stay at or beyond a limit before the limit counts as reached.
+        off_delay_ns: how long it must stay clear of the deadband before the limit counts as left.
+        alert_low: at or below this the level is alert; None for no such limit.
+        danger_low: at or below this the level is danger; None for no such limit.
 
     Raises:
         ValueError: no limit, limits out of order or not finite, a negative deadband or delay.
@@ -28,15 +47,25 @@ class Setpoint:
     deadband: float = 0.0
     on_delay_ns: int = 0
     off_delay_ns: int = 0
+    alert_low: float | None = None
+    danger_low: float | None = None
 
     def __post_init__(self) -> None:
-        limits = [limit for limit in (self.alert, self.danger) if limit is not None]
-        if not limits:
+        upwards = (
+            ("danger_low", self.danger_low),
+            ("alert_low", self.alert_low),
+            ("alert", self.alert),
+            ("danger", self.danger),
+        )
+        given = [(name, limit) for name, limit in upwards if limit is not None]
+        if not given:
             raise ValueError("a setpoint needs an alert or a danger limit; it has neither")
-        if not all(math.isfinite(limit) for limit in limits):
-            raise ValueError(f"limits must be finite, not alert {self.alert} and danger {self.danger}")
-        if self.alert is not None and self.danger is not None and self.alert >= self.danger:
-            raise ValueError(f"alert {self.alert} must lie below danger {self.danger}")
+        for name, limit in given:
+            if not math.isfinite(limit):
+                raise ValueError(f"limits must be finite, not {name} {limit}")
+        for (name, limit), (above, higher) in pairwise(given):
+            if limit >= higher:
+                raise ValueError(f"{name} {limit} must lie below {above} {higher}")
         if not (math.isfinite(self.deadband) and self.deadband >= 0):
             raise ValueError(f"deadband is {self.deadband}; it must be zero or more")
         if self.on_delay_ns < 0 or self.off_delay_ns < 0:
@@ -45,13 +74,25 @@ class Setpoint:
             )
 
     @property
-    def lowest(self) -> float:
-        """The limit that is reached first."""
-        return min(limit for limit in (self.alert, self.danger) if limit is not None)
+    def limits(self) -> tuple[Limit, ...]:
+        """All limits, the danger limits first."""
+        described = (
+            (Level.DANGER, self.danger, False),
+            (Level.DANGER, self.danger_low, True),
+            (Level.ALERT, self.alert, False),
+            (Level.ALERT, self.alert_low, True),
+        )
+        return tuple(Limit(level, at, lower) for level, at, lower in described if at is not None)
 
-    def limit(self, level: Level) -> float | None:
-        """The limit at which ``level`` begins; None if it has none."""
-        return {Level.NORMAL: None, Level.ALERT: self.alert, Level.DANGER: self.danger}[level]
+    @property
+    def lowest(self) -> float | None:
+        """The upper limit that is reached first; None if there is none."""
+        return min((limit.at for limit in self.limits if not limit.lower), default=None)
+
+    @property
+    def highest_low(self) -> float | None:
+        """The lower limit that is reached first; None if there is none."""
+        return max((limit.at for limit in self.limits if limit.lower), default=None)
 
 
 class SetpointMonitor:
@@ -62,23 +103,24 @@ class SetpointMonitor:
     """
 
     def __init__(self, setpoint: Setpoint) -> None:
-        self._comparators = [
-            (level, _Comparator(limit, setpoint))
-            for level in (Level.DANGER, Level.ALERT)
-            if (limit := setpoint.limit(level)) is not None
-        ]
+        self._comparators = [_Comparator(limit, setpoint) for limit in setpoint.limits]
         self._known_at_ns: int | None = None
 
     @property
     def level(self) -> Level:
         """The level by all values so far."""
-        return next((level for level, comparator in self._comparators if comparator.reached), Level.NORMAL)
+        return max((one.limit.level for one in self._comparators if one.reached), default=Level.NORMAL)
+
+    def reached(self, value: float) -> Limit | None:
+        """The limit that makes the present level, of two the one nearer to ``value``; None at normal."""
+        makes = [one.limit for one in self._comparators if one.reached and one.limit.level is self.level]
+        return min(makes, key=lambda limit: abs(limit.at - value), default=None)
 
     def update(self, value: float, t_ns: int, factor: float = 1.0) -> Level:
         """Take in the value at ``t_ns`` (monotonic time of the data) and return the level.
 
-        ``factor`` multiplies the limits at which a level begins, never those at which it ends: it may keep
-        an alarm from being raised, but makes none return.
+        ``factor`` multiplies the upper limits at which a level begins, never those at which it ends: it may
+        keep an alarm from being raised, but makes none return.
 
         NaN and minus infinity hold the level; plus infinity (an overflow) counts as exceeding.
         Time that runs backwards, as it can by a corrected time base, counts as none.
@@ -88,14 +130,17 @@ class SetpointMonitor:
             return self.level
         elapsed_ns = 0 if self._known_at_ns is None else max(t_ns - self._known_at_ns, 0)
         self._known_at_ns = t_ns
-        for _, comparator in self._comparators:
+        for comparator in self._comparators:
             comparator.update(value, elapsed_ns, factor)
         return self.level
 
     def resume(self, level: Level) -> None:
-        """Go on from a level that was reached before a restart; the delays begin anew."""
-        for begins, comparator in self._comparators:
-            comparator.reached = level >= begins
+        """Go on from a level that was reached before a restart; the delays begin anew.
+
+        Whether at an upper or at a lower limit is not told: the value must be clear of both.
+        """
+        for comparator in self._comparators:
+            comparator.reached = level >= comparator.limit.level
 
     def hold(self) -> None:
         """A value is missing: the level stays and the delays stand still until the next one."""
@@ -105,15 +150,19 @@ class SetpointMonitor:
 class _Comparator:
     """One limit: whether it has been reached, and for how long the value has said otherwise."""
 
-    def __init__(self, limit: float, setpoint: Setpoint) -> None:
+    def __init__(self, limit: Limit, setpoint: Setpoint) -> None:
+        self.limit = limit
         self.reached = False
-        self._enter_at = limit
-        self._leave_below = limit - setpoint.deadband
+        # A lower limit is an upper one with the sign turned.
+        self._sign = -1.0 if limit.lower else 1.0
+        self._enter_at = self._sign * limit.at
+        self._leave_below = self._enter_at - setpoint.deadband
         self._on_delay_ns = setpoint.on_delay_ns
         self._off_delay_ns = setpoint.off_delay_ns
         self._contrary_ns: int | None = None
 
     def update(self, value: float, elapsed_ns: int, factor: float) -> None:
+        value, factor = self._sign * value, 1.0 if self.limit.lower else factor
         contrary = value < self._leave_below if self.reached else value >= factor * self._enter_at
         if not contrary:
             self._contrary_ns = None

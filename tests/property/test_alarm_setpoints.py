@@ -12,9 +12,10 @@ from daqsvc.alarms.setpoints import Setpoint, SetpointMonitor
 from daqsvc.alarms.states import Level
 
 LIMITS = st.tuples(st.none() | st.integers(1, 6), st.none() | st.integers(7, 12)).filter(any)
+LOW_LIMITS = st.tuples(st.none() | st.integers(-1, 0), st.none() | st.integers(-9, -2))
 STEPS = st.lists(
     st.tuples(
-        st.one_of(st.integers(-2, 15).map(float), st.just(math.nan), st.just(math.inf), st.just(-math.inf)),
+        st.one_of(st.integers(-12, 15).map(float), st.just(math.nan), st.just(math.inf), st.just(-math.inf)),
         st.integers(0, 4),
     ),
     max_size=40,
@@ -43,36 +44,42 @@ def known_stretch(history, says):
 def reference(setpoint, history):
     """The level after ``history``, one limit at a time, each by replaying everything."""
 
-    def reached(limit):
+    def reached(beyond, clear):
         state, since = False, 0
         for end in range(1, len(history) + 1):
             part = history[since:end]
-            if state:
-                stretch = known_stretch(part, lambda value: value < limit - setpoint.deadband)
-                changes = stretch is not None and stretch >= setpoint.off_delay_ns
-            else:
-                stretch = known_stretch(part, lambda value: value >= limit)
-                changes = stretch is not None and stretch >= setpoint.on_delay_ns
-            if changes:
+            stretch = known_stretch(part, clear if state else beyond)
+            if stretch is not None and stretch >= (setpoint.off_delay_ns if state else setpoint.on_delay_ns):
                 state, since = not state, end
         return state
 
-    if setpoint.danger is not None and reached(setpoint.danger):
+    def above(limit):
+        return limit is not None and reached(
+            lambda value: value >= limit, lambda value: value < limit - setpoint.deadband
+        )
+
+    def below(limit):
+        return limit is not None and reached(
+            lambda value: value <= limit, lambda value: value > limit + setpoint.deadband
+        )
+
+    if above(setpoint.danger) or below(setpoint.danger_low):
         return Level.DANGER
-    if setpoint.alert is not None and reached(setpoint.alert):
+    if above(setpoint.alert) or below(setpoint.alert_low):
         return Level.ALERT
     return Level.NORMAL
 
 
 @given(
     limits=LIMITS,
+    low_limits=LOW_LIMITS,
     deadband=st.integers(0, 4),
     on_delay=st.integers(0, 6),
     off_delay=st.integers(0, 6),
     steps=STEPS,
 )
-def test_agrees_with_the_model(limits, deadband, on_delay, off_delay, steps):
-    setpoint = Setpoint(limits[0], limits[1], deadband, on_delay, off_delay)
+def test_agrees_with_the_model(limits, low_limits, deadband, on_delay, off_delay, steps):
+    setpoint = Setpoint(limits[0], limits[1], deadband, on_delay, off_delay, *low_limits)
     monitor = SetpointMonitor(setpoint)
     history, t_ns = [], 0
     for value, step_ns in steps:
@@ -101,12 +108,31 @@ def test_a_gap_does_not_count_towards_a_delay():
     assert monitor.update(2.0, 110) is Level.ALERT
 
 
+def test_after_a_restart_the_value_must_be_clear_of_the_limits_on_both_sides():
+    monitor = SetpointMonitor(Setpoint(alert=10.0, deadband=2.0, alert_low=-10.0))
+    monitor.resume(Level.ALERT)
+    assert [monitor.update(value, 0) for value in (-9.0, 9.0)] == [Level.ALERT] * 2
+    assert monitor.reached(9.0).at == 10.0
+    assert monitor.update(-7.9, 0) is Level.NORMAL
+
+
+def test_a_start_up_multiplies_upper_limits_only():
+    monitor = SetpointMonitor(Setpoint(alert=4.0, alert_low=1.0))
+    assert monitor.update(6.0, 0, factor=2.0) is Level.NORMAL
+    assert monitor.update(1.5, 1, factor=2.0) is Level.NORMAL
+    assert monitor.update(0.9, 2, factor=2.0) is Level.ALERT
+    assert monitor.reached(0.9).lower
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         ({}, "neither"),
         ({"alert": 2.0, "danger": 2.0}, "below"),
         ({"alert": math.nan}, "finite"),
+        ({"alert_low": 3.0, "alert": 2.0}, "alert_low 3.0 must lie below alert 2.0"),
+        ({"danger_low": 2.0, "alert_low": 2.0}, "below"),
+        ({"danger_low": -math.inf}, "danger_low -inf"),
         ({"alert": 1.0, "deadband": -1.0}, "deadband"),
         ({"alert": 1.0, "on_delay_ns": -1}, "negative"),
         ({"alert": 1.0, "off_delay_ns": -1}, "negative"),
