@@ -109,11 +109,12 @@ def test_a_gap_does_not_count_towards_a_delay():
 
 
 def test_after_a_restart_the_value_must_be_clear_of_the_limits_on_both_sides():
-    monitor = SetpointMonitor(Setpoint(alert=10.0, deadband=2.0, alert_low=-10.0))
-    monitor.resume(Level.ALERT)
-    assert [monitor.update(value, 0) for value in (-9.0, 9.0)] == [Level.ALERT] * 2
-    assert monitor.reached(9.0).at == 10.0
-    assert monitor.update(-7.9, 0) is Level.NORMAL
+    for side in (-1.0, 1.0):
+        monitor = SetpointMonitor(Setpoint(alert=10.0, deadband=2.0, alert_low=-10.0))
+        monitor.resume(Level.ALERT)
+        assert monitor.update(side * 9.0, 0) is Level.ALERT
+        assert monitor.reached(side * 9.0).at == side * 10.0
+        assert monitor.update(side * 7.9, 0) is Level.NORMAL
 
 
 def test_a_start_up_multiplies_upper_limits_only():
