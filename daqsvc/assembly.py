@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from daqsvc.assembly_drivers import AssemblyError
 from daqsvc.assembly_rotor import healthy_rotor, rotor_bank, rotor_synchronous
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
+from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
 from daqsvc.rotor.calibration.file import CalibrationFileError
 from daqsvc.settings.models import (
     Accelerometer,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from daqsvc.diagnosis.record import Diagnosis, silence_reason
+from daqsvc.diagnosis.level_statements import Evidence, LevelStatements
+from daqsvc.diagnosis.record import silence_reason
 from daqsvc.diagnosis.standstill import StandstillWatch
 from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
 
@@ -17,7 +18,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.level_statements import Limits
+    from daqsvc.diagnosis.record import DataQuality, Diagnosis
     from daqsvc.diagnosis.standstill import Standstill
 
 MIN_PRESENT = 0.5
@@ -34,15 +36,6 @@ _TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
     "m/s2": (1000.0, True),
     "mm/s": (1.0, False),
 }
-_DECISIONS: tuple[Severity, ...] = ("normal", "alert", "danger")
-
-
-class Limits(NamedTuple):
-    """Setpoints of one measure; None where there is none."""
-
-    measure: str
-    alert: float | None
-    danger: float | None
 
 
 class GapCheck(NamedTuple):
@@ -107,11 +100,10 @@ class LevelDetector:
         self.name = f"levels/{stream}"
         self.stream = stream
         self.block = max(4, round(window_s * rate_hz))
-        self._machine = machine
+        self._statements = LevelStatements(machine, stream, "levels/1")
         self._rate_hz = rate_hz
         self._channels = tuple(channels)
         self._band_hz = velocity_band_hz
-        self._decided: dict[str, Severity] = {}
         self._standstills = {channel.sensor: StandstillWatch() for channel in self._channels}
         self._next_index = 0
 
@@ -136,70 +128,39 @@ class LevelDetector:
     def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.silent`."""
         reason = silence_reason(self.stream, silence_s)
-        return [
-            self._statement(c, {}, self._next_index, self._next_index, t_ns, "missing", reason)
-            for c in self._channels
-        ]
+        nothing = Evidence(self._next_index, self._next_index, t_ns)
+        return [self._state(c, nothing, {}, "missing", reason) for c in self._channels]
 
     def _judge(
         self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int
     ) -> Diagnosis:
         present = np.isfinite(samples)
         count = int(present.sum())
-        end_index = first_index + len(samples)
+        evidence = Evidence(first_index, first_index + len(samples), t_ns)
         if count < MIN_PRESENT * len(samples):
             reason = (
-                f"only {count} of {len(samples)} samples of {channel.sensor} arrived; check bus and device"
+                f"only {count} of {len(samples)} samples of {channel.sensor} are there, the others were lost "
+                "or the device had none; check bus, device and sensor"
             )
-            return self._statement(channel, {}, first_index, end_index, t_ns, "missing", reason)
+            return self._state(channel, evidence, {}, "missing", reason)
         statistics = self._measure(channel, samples)
         known = samples[present]
         still = self._standstills[channel.sensor].take(known)
         reason = _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still)
         quality: DataQuality = "not_ok" if reason else "good"
-        return self._statement(channel, statistics, first_index, end_index, t_ns, quality, reason)
+        return self._state(channel, evidence, statistics, quality, reason)
 
-    def _statement(
+    def _state(
         self,
         channel: LevelChannel,
+        evidence: Evidence,
         statistics: dict[str, float],
-        first_index: int,
-        end_index: int,
-        t_ns: int,
         quality: DataQuality,
         reason: str,
     ) -> Diagnosis:
-        before = self._decided.get(channel.sensor)
-        severity = before or "normal"
-        if quality == "good":
-            severity = max(
-                (_severity(statistics[limit.measure], limit) for limit in channel.limits),
-                key=_DECISIONS.index,
-                default="normal",
-            )
-            self._decided[channel.sensor] = severity
-        return Diagnosis(
-            machine=self._machine,
-            detector=f"levels/{channel.sensor}",
-            t_ns=t_ns,
-            stream=self.stream,
-            first_index=first_index,
-            end_index=end_index,
-            decision=severity if quality == "good" or before else "undetermined",
-            changed=quality == "good" and before not in {None, severity},
-            severity=severity,
-            statistics=statistics,
-            units={name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"},
-            thresholds={
-                f"{limit.measure}.{name}": value
-                for limit in channel.limits
-                for name, value in (("alert", limit.alert), ("danger", limit.danger))
-                if value is not None
-            },
-            quality=quality,
-            reason=reason,
-            sensors=(channel.sensor,),
-            model="levels/1",
+        units = {name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"}
+        return self._statements.state(
+            channel.sensor, channel.limits, evidence, statistics, units, quality, reason
         )
 
     def _measure(self, channel: LevelChannel, samples: NDArray[np.float32]) -> dict[str, float]:
@@ -220,14 +181,6 @@ class LevelDetector:
             rms = band_rms(there, self._rate_hz, *self._band_hz, integrate=integrate)
             statistics["velocity_rms"] = factor * rms
         return statistics
-
-
-def _severity(value: float, limits: Limits) -> Severity:
-    if limits.danger is not None and value >= limits.danger:
-        return "danger"
-    if limits.alert is not None and value >= limits.alert:
-        return "alert"
-    return "normal"
 
 
 def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: NDArray[np.float32]) -> str:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
+from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
 from daqsvc.dsp.levels import band_rms, levels
 
 RATE_HZ = 2000.0

@@ -10,7 +10,8 @@ from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector, Limits
+from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
 
 RATE_HZ = 300.0
 BLOCK = 150

@@ -12,7 +12,7 @@ from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules
-from daqsvc.diagnosis.levels import Limits
+from daqsvc.diagnosis.level_statements import Limits
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 

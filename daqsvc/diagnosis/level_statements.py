@@ -1,0 +1,124 @@
+"""What is said of a sensor's level: held against its setpoints, and kept while the data is not good."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.diagnosis.record import Diagnosis
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daqsvc.diagnosis.record import DataQuality, Severity
+
+_DECISIONS: tuple[Severity, ...] = ("normal", "alert", "danger")
+
+
+class Limits(NamedTuple):
+    """Setpoints of one measure; None where there is none."""
+
+    measure: str
+    alert: float | None
+    danger: float | None
+    alert_low: float | None = None
+    danger_low: float | None = None
+
+    def severity(self, value: float) -> Severity:
+        """How bad ``value`` is: a limit is reached at it."""
+        if _reached(value, self.danger, self.danger_low):
+            return "danger"
+        return "alert" if _reached(value, self.alert, self.alert_low) else "normal"
+
+    @property
+    def thresholds(self) -> dict[str, float]:
+        """What there is, by names such as ``"rms.alert"``."""
+        described = {
+            "alert": self.alert,
+            "danger": self.danger,
+            "alert_low": self.alert_low,
+            "danger_low": self.danger_low,
+        }
+        return {f"{self.measure}.{name}": limit for name, limit in described.items() if limit is not None}
+
+
+class Evidence(NamedTuple):
+    """What a statement rests on.
+
+    Attributes:
+        first_index: first sample.
+        end_index: one past the last one.
+        t_ns: monotonic time of the last one.
+    """
+
+    first_index: int
+    end_index: int
+    t_ns: int
+
+
+class LevelStatements:
+    """States the levels of the sensors of one stream, as detector ``levels/<sensor>``.
+
+    Args:
+        machine: name of the machine.
+        stream: name of the stream.
+        model: name and version of what measures them.
+    """
+
+    def __init__(self, machine: str, stream: str, model: str) -> None:
+        self._machine = machine
+        self._stream = stream
+        self._model = model
+        self._decided: dict[str, Severity] = {}
+
+    def state(
+        self,
+        sensor: str,
+        limits: Sequence[Limits],
+        evidence: Evidence,
+        statistics: Mapping[str, float],
+        units: Mapping[str, str],
+        quality: DataQuality = "good",
+        reason: str = "",
+    ) -> Diagnosis:
+        """One statement about one sensor.
+
+        Args:
+            sensor: its name.
+            limits: its setpoints.
+            evidence: the samples that it rests on.
+            statistics: what was measured.
+            units: of the statistics that have one.
+            quality: of the data.
+            reason: why that is not good.
+        """
+        before = self._decided.get(sensor)
+        severity = before or "normal"
+        if quality == "good":
+            severity = max(
+                (limit.severity(statistics[limit.measure]) for limit in limits),
+                key=_DECISIONS.index,
+                default="normal",
+            )
+            self._decided[sensor] = severity
+        return Diagnosis(
+            machine=self._machine,
+            detector=f"levels/{sensor}",
+            t_ns=evidence.t_ns,
+            stream=self._stream,
+            first_index=evidence.first_index,
+            end_index=evidence.end_index,
+            decision=severity if quality == "good" or before else "undetermined",
+            changed=quality == "good" and before not in {None, severity},
+            severity=severity,
+            statistics=statistics,
+            units=units,
+            thresholds={name: value for limit in limits for name, value in limit.thresholds.items()},
+            quality=quality,
+            reason=reason,
+            sensors=(sensor,),
+            model=self._model,
+        )
+
+
+def _reached(value: float, upper: float | None, lower: float | None) -> bool:
+    return (upper is not None and value >= upper) or (lower is not None and value <= lower)
