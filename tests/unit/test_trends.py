@@ -1,0 +1,113 @@
+"""Trend values: held against setpoints as they come, bridged, missed, and believed or not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
+
+SECOND_NS = 10**9
+NAN = float("nan")
+TEMPERATURE = Limits("value", 80.0, 95.0, 5.0, 0.0)
+
+
+def window(values, first=0, period_s=1.0):
+    samples = np.array(values, np.float32).reshape(len(values), -1)
+    period_ns = period_s * SECOND_NS
+    return Window(first, samples, round((first + len(samples) - 1) * period_ns), period_ns)
+
+
+def detector(*, rate_hz=1.0, window_s=0.5, **changes):
+    channel = {"sensor": "oil", "column": 0, "unit": "degC", "limits": [TEMPERATURE]} | changes
+    return TrendDetector("pump", "trend", rate_hz, [TrendChannel(**channel)], window_s=window_s)
+
+
+def test_each_value_is_held_against_setpoints_on_both_sides():
+    said = detector().process(window([20.0, 80.0, 95.0, 5.0, -1.0, 50.0]))
+    assert [d.decision for d in said] == ["normal", "alert", "danger", "alert", "danger", "normal"]
+    assert [d.changed for d in said] == [False, True, True, True, True, True]
+    assert [d.t_ns for d in said] == [k * SECOND_NS for k in range(6)]
+    assert [(d.first_index, d.end_index) for d in said] == [(k, k + 1) for k in range(6)]
+    assert [d.statistics for d in said][:2] == [{"value": 20.0}, {"value": 80.0}]
+    assert {d.detector for d in said} == {"levels/oil"}
+    assert said[0].units == {"value": "degC"}
+    assert said[0].thresholds == {
+        "value.alert": 80.0,
+        "value.danger": 95.0,
+        "value.alert_low": 5.0,
+        "value.danger_low": 0.0,
+    }
+
+
+def test_a_value_that_stands_still_is_no_dead_sensor():
+    said = detector().process(window([20.0] * 500))
+    assert {d.quality for d in said} == {"good"}
+
+
+def test_a_fast_trend_is_averaged_over_its_window():
+    fast = detector(rate_hz=10.0, window_s=1.0)
+    assert fast.block == 10
+    values = [*[70.0, 90.0] * 5, *[NAN] * 9, 20.0]
+    said = fast.process(window(values, period_s=0.1))
+    assert [d.statistics["value"] for d in said] == [80.0, 20.0]
+    assert [d.end_index for d in said] == [10, 20]
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 1 / 60])
+def test_a_slow_trend_is_judged_sample_by_sample(rate_hz):
+    assert detector(rate_hz=rate_hz).block == 1
+
+
+def test_two_missing_values_are_bridged_and_the_third_is_told_and_clears_nothing():
+    slow = detector()
+    assert slow.process(window([85.0]))[0].decision == "alert"
+    assert slow.process(window([NAN, NAN], 1)) == []
+    assert [d.quality for d in slow.process(window([85.0, NAN, NAN], 3))] == ["good"]
+    (missing,) = slow.process(window([np.inf], 6))
+    assert (missing.quality, missing.decision, missing.severity) == ("missing", "alert", "alert")
+    assert missing.statistics == {}
+    assert "the last 3 values of oil did not arrive" in missing.reason
+    (silence,) = slow.silent(210.0, 99)
+    assert (silence.quality, silence.decision, silence.first_index) == ("missing", "alert", 7)
+    assert "no samples of trend for 210.0 s" in silence.reason
+
+
+def test_before_its_first_value_nothing_is_decided():
+    (missing,) = detector().silent(2.0, 0)
+    assert (missing.quality, missing.decision) == ("missing", "undetermined")
+
+
+@pytest.mark.parametrize("broken", [-55.0, 1638.35])
+def test_beyond_its_ok_limits_a_sensor_is_not_believed(broken):
+    slow = detector(ok_between=(-40.0, 125.0))
+    good, not_ok, back = slow.process(window([85.0, broken, 60.0]))
+    assert (good.quality, good.decision) == ("good", "alert")
+    assert (not_ok.quality, not_ok.decision) == ("not_ok", "alert")
+    assert f"oil reads {broken:g} degC, outside its OK limits -40 to 125 degC" in not_ok.reason
+    assert (back.quality, back.decision) == ("good", "normal")
+
+
+def test_one_such_value_spoils_its_window():
+    fast = detector(rate_hz=4.0, window_s=1.0, ok_between=(-40.0, 125.0))
+    (said,) = fast.process(window([60.0, 60.0, 150.0, 60.0], period_s=0.25))
+    assert said.quality == "not_ok"
+    assert "oil reads 150 degC" in said.reason
+
+
+def test_the_channels_of_a_stream_are_judged_each_for_itself():
+    channels = [
+        TrendChannel("velocity", 1, "mm/s", [Limits("value", 4.5, None)]),
+        TrendChannel("oil", 0, "degC", [TEMPERATURE]),
+    ]
+    both = TrendDetector("pump", "trend", 1.0, channels)
+    said = both.process(window([[60.0, 5.0], [NAN, 5.0], [NAN, 1.0], [NAN, NAN]]))
+    assert [(d.detector, d.decision, d.quality) for d in said] == [
+        ("levels/velocity", "alert", "good"),
+        ("levels/oil", "normal", "good"),
+        ("levels/velocity", "alert", "good"),
+        ("levels/velocity", "normal", "good"),
+        ("levels/oil", "normal", "missing"),
+    ]
