@@ -114,7 +114,14 @@ class Service:
         self.alignment = alignment(machine, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
-        self.pipeline = Pipeline(self.rings, detectors, self._report, self.clock, settling_ns=settling_ns)
+        self.pipeline = Pipeline(
+            self.rings,
+            detectors,
+            self._report,
+            self.clock,
+            settling_ns=settling_ns,
+            rate_hz={grid.name: grid.rate_hz for grid in grids},
+        )
         self.desk = AlarmDesk(
             self._identity,
             alarm_rules(machine),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.trends import BRIDGED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -30,7 +31,10 @@ MOST_BLOCKS = 64
 
 LOOK_NS = NS_PER_S // 2
 SILENCE_NS = 2 * NS_PER_S
-"""A stream from which nothing has come for so long is silent."""
+"""A stream from which nothing has come for so long is silent, ..."""
+
+SILENT_PERIODS = BRIDGED + 1.5
+"""... but not before so many of its sampling periods: a value that is polled once a minute is no silence."""
 
 
 @dataclass(slots=True)
@@ -62,6 +66,7 @@ class Pipeline:
         clock: tells how long a stream has been silent.
         threads: kernels that may run at a time.
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
+        rate_hz: by stream, its sampling rate; whatever is not named is fast.
     """
 
     def __init__(
@@ -72,12 +77,17 @@ class Pipeline:
         clock: Clock,
         threads: int = 2,
         settling_ns: Mapping[str, int] | None = None,
+        rate_hz: Mapping[str, float] | None = None,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
         self._rings = rings
         self._settling_ns = settling_ns or {}
+        self._patience_ns = dict.fromkeys(rings, SILENCE_NS) | {
+            name: max(SILENCE_NS, round(SILENT_PERIODS * NS_PER_S / rate))
+            for name, rate in (rate_hz or {}).items()
+        }
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._report = report
         self._clock = clock
@@ -145,7 +155,7 @@ class Pipeline:
                 if ring.end_index != ends[name]:
                     ends[name], since_ns[name] = ring.end_index, now_ns
                     said.discard(name)
-                elif name not in said and now_ns - since_ns[name] >= SILENCE_NS:
+                elif name not in said and now_ns - since_ns[name] >= self._patience_ns[name]:
                     said.add(name)
                     self._silent_until_ns[name] = now_ns
                     silence_s = (now_ns - since_ns[name]) / NS_PER_S

@@ -133,3 +133,22 @@ async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
     assert silences[11:] == [2, 2, 2, 2]
     ring.close()
     await running
+
+
+async def test_a_stream_that_is_sampled_once_a_minute_is_silent_after_minutes_only() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [Listener("one", 1)], said.append, clock, rate_hz={"s": 1 / 60})
+    running = asyncio.create_task(pipeline.run())
+    await asyncio.sleep(0.005)
+    silent_at = []
+    for half_seconds in range(1, 1000):
+        if half_seconds in {1, 121, 481}:  # the values of the second and the third minute are lost
+            write(ring, 1)
+        clock.advance_to(clock.monotonic_ns() + 500_000_000)
+        for _ in range(4):
+            await asyncio.sleep(0)
+        silent_at += [half_seconds / 2] * (len([d for d in said if d.quality == "missing"]) - len(silent_at))
+    assert silent_at == [481 / 2 + 210.0]
+    ring.close()
+    await running
