@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.modbus import RegisterChannel, SampleChannel
-    from daqsvc.settings.models import Channel, MachineFile
+    from daqsvc.settings.models import Channel, DbcChannel, MachineFile
     from drivers.base import Driver
 
 DRIVERS = "daqsvc.drivers"
@@ -90,6 +90,7 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
             counter=given.counter.signal,
             counts=given.counter.counts,
             channels={channel.name: channel.signals for channel in given.channels},
+            valid_raw=_valid_raw(given.channels),
         )
     elif isinstance(given, PlainLayout):
         layout = _plain_layout(given)
@@ -181,6 +182,7 @@ def _plain_layout(given: PlainLayout) -> FrameLayout:
         first_byte=given.first_byte,
         crc_byte=given.crc_byte,
         byte_order=given.byte_order,
+        valid_raw=_valid_raw(given.channels),
     )
 
 
@@ -195,6 +197,7 @@ def _serial_layout(given: SerialLayout) -> FrameLayout:
         counts=given.counter.counts,
         first_byte=given.first_byte,
         byte_order=given.byte_order,
+        valid_raw=_valid_raw(given.channels),
     )
 
 
@@ -218,6 +221,10 @@ def _packed(channels: Sequence[Channel]) -> list[tuple[str, int, Kind, float, fl
         return "float" if raw_type == "float32" else "unsigned" if raw_type.startswith("u") else "signed"
 
     return [(c.name, 8 * c.raw_bytes, kind(c.type), c.scale, c.offset) for c in channels]
+
+
+def _valid_raw(channels: Sequence[Channel | DbcChannel]) -> dict[str, tuple[float, float]]:
+    return {c.name: c.valid_raw for c in channels if c.valid_raw is not None}
 
 
 def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> list[Driver]:

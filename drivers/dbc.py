@@ -22,6 +22,7 @@ def layout_from_dbc(
     counter: str,
     counts: Counts,
     channels: Mapping[str, Sequence[str]],
+    valid_raw: Mapping[str, tuple[float, float]] | None = None,
 ) -> FrameLayout:
     """The layout of one message of a DBC file.
 
@@ -34,6 +35,7 @@ def layout_from_dbc(
         counter: name of the counter signal.
         counts: what it counts.
         channels: for each channel the signals of its consecutive samples.
+        valid_raw: see `FrameLayout`.
 
     Raises:
         LayoutError: the file, the message or a signal is not there, no frame has all of the signals, or
@@ -84,6 +86,7 @@ def layout_from_dbc(
         counter=cells[counter],
         counts=counts,
         any_priority=described.protocol == "j1939",
+        valid_raw=valid_raw or {},
         selectors=tuple(Selector(name, field(name), values) for name, values in pages.items()),
     )
 

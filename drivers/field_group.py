@@ -11,7 +11,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from drivers.frames import Field, Payloads
+    from drivers.fields import Field
+    from drivers.frames import Payloads
 
 
 class FieldGroup:

@@ -8,13 +8,14 @@ the same object that the driver decodes with.
 from __future__ import annotations
 
 import binascii
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from drivers.field_group import FieldGroup
+from drivers.fields import ByteOrder, Field, Kind, LayoutError, RawValues, j1939_valid_raw
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,15 +24,20 @@ if TYPE_CHECKING:
 
     Payloads: TypeAlias = NDArray[np.uint8]
 
-Kind = Literal["signed", "unsigned", "float"]
-ByteOrder = Literal["little", "big"]
+__all__ = [
+    "ByteOrder",
+    "Counts",
+    "Decoded",
+    "Field",
+    "FrameLayout",
+    "Kind",
+    "LayoutError",
+    "Selector",
+]
+
 Counts = Literal["samples", "frames"]
 
 CRC_BYTES = 2
-
-
-class LayoutError(ValueError):
-    """A layout contradicts itself, its DBC file, or the values it should carry."""
 
 
 class Decoded(NamedTuple):
@@ -46,58 +52,6 @@ class Decoded(NamedTuple):
     counter: NDArray[np.int64]
     samples: NDArray[np.float32]
     intact: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """One raw number inside a payload.
-
-    Attributes:
-        start: bit number as DBC files count: bit ``8 * byte + b`` with ``b = 0`` the least significant
-            bit of its byte; the field's least significant bit if ``order`` is little, its most
-            significant bit if it is big.
-        bits: width, 1 to 64 (32 or 64 for a float).
-        kind: how the bits are read.
-        order: byte order.
-    """
-
-    start: int
-    bits: int
-    kind: Kind = "unsigned"
-    order: ByteOrder = "little"
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.bits <= 64 or (self.kind == "float" and self.bits not in {32, 64}):
-            raise LayoutError(
-                f"a {self.kind} field of {self.bits} bits cannot be; use 1 to 64 (float: 32, 64)"
-            )
-
-    @classmethod
-    def at_byte(cls, byte: int, bits: int, kind: Kind = "unsigned", order: ByteOrder = "little") -> Field:
-        """A field that begins on a byte boundary."""
-        return cls(8 * byte + (0 if order == "little" else 7), bits, kind, order)
-
-    @property
-    def positions(self) -> list[int]:
-        """The field's bits from most to least significant, counted from the payload's first bit.
-
-        In this count bit 0 is the *most* significant bit of byte 0, as `numpy.unpackbits` orders them.
-        """
-        if self.order == "little":
-            dbc_bits = range(self.start + self.bits - 1, self.start - 1, -1)
-            return [8 * (bit // 8) + 7 - bit % 8 for bit in dbc_bits]
-        first = 8 * (self.start // 8) + 7 - self.start % 8
-        return list(range(first, first + self.bits))
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Smallest and largest value the field can carry."""
-        if self.kind == "float":
-            largest = float(np.finfo(np.float32 if self.bits == 32 else np.float64).max)
-            return -largest, largest
-        if self.kind == "signed":
-            return -float(2 ** (self.bits - 1)), float(2 ** (self.bits - 1) - 1)
-        return 0.0, float(2**self.bits - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +86,9 @@ class FrameLayout:
         crc_byte: where a CRC-16/IBM-3740 (big endian) over all other bytes lies; None without one.
         selectors: which frames of the id have this layout, where not all of them do.
         any_priority: whether the id is one of SAE J1939, whose three highest bits are only a priority.
+        valid_raw: by channel, the least and the largest raw value that is a measurement; with any other the
+            device says that it has none. Channels that are not named have `j1939_valid_raw` if the id is one
+            of SAE J1939, else nothing but measurements.
     """
 
     frame_id: int
@@ -146,6 +103,7 @@ class FrameLayout:
     crc_byte: int | None = None
     selectors: tuple[Selector, ...] = ()
     any_priority: bool = False
+    valid_raw: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         taken: dict[int, str] = {}
@@ -182,6 +140,7 @@ class FrameLayout:
         byte_order: ByteOrder = "little",
         extended: bool = False,
         any_priority: bool = False,
+        valid_raw: Mapping[str, tuple[float, float]] | None = None,
     ) -> FrameLayout:
         """Samples packed one after another: all channels of sample 0, all of sample 1, and so on.
 
@@ -198,6 +157,7 @@ class FrameLayout:
             byte_order: of the counter and of the samples.
             extended: whether the id has 29 bits.
             any_priority: whether the three highest of them are a priority, as in SAE J1939.
+            valid_raw: see `FrameLayout`.
 
         Raises:
             LayoutError: something does not fit into ``length`` or overlaps.
@@ -222,6 +182,7 @@ class FrameLayout:
             counts=counts,
             crc_byte=crc_byte,
             any_priority=any_priority,
+            valid_raw=valid_raw or {},
         )
 
     @property
@@ -256,12 +217,25 @@ class FrameLayout:
         return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
 
     @cached_property
+    def _cells(self) -> list[Field]:
+        return [cell for row in self.fields for cell in row]
+
+    @cached_property
+    def _raw_values(self) -> RawValues:
+        valid = [
+            self.valid_raw.get(name, j1939_valid_raw(cell) if self.any_priority else None)
+            for row in self.fields
+            for name, cell in zip(self.channels, row, strict=True)
+        ]
+        return RawValues(self._cells, valid)
+
+    @cached_property
     def _counter_group(self) -> FieldGroup:
         return FieldGroup([self.counter], [0], self.length)
 
     @cached_property
     def _sample_groups(self) -> list[FieldGroup]:
-        flat = [cell for row in self.fields for cell in row]
+        flat = self._cells
         kinds = dict.fromkeys((cell.bits, cell.kind) for cell in flat)
         return [
             FieldGroup(
@@ -305,6 +279,9 @@ class FrameLayout:
 
         Args:
             payloads: uint8 ``[n, length]``.
+
+        Returns:
+            Samples that are NaN where the device says that it has no value (`valid_raw`).
         """
         n = len(payloads)
         raw = np.empty((n, self.scale.size), np.float64)
@@ -312,6 +289,7 @@ class FrameLayout:
         with np.errstate(over="ignore", invalid="ignore"):
             for group in self._sample_groups:
                 raw[:, slice(None) if len(self._sample_groups) == 1 else group.columns] = group.read(payloads)
+            self._raw_values.leave_out_absent(raw)
             scaled = raw.reshape(n, *self.scale.shape)
             scaled *= self.scale
             scaled += self.offset
@@ -336,33 +314,27 @@ class FrameLayout:
         Args:
             first_index: int64 ``[n]``, absolute index of each frame's first sample; the counter wraps
                 it to its width.
-            samples: ``[n, samples_per_frame, channels]`` in physical units.
+            samples: ``[n, samples_per_frame, channels]`` in physical units; NaN for a value that the device
+                does not have.
             clip: saturate what does not fit, as an analogue input does, instead of raising.
 
         Returns:
             uint8 ``[n, length]``.
 
         Raises:
-            LayoutError: a value does not fit its field (and ``clip`` is False), or is NaN.
+            LayoutError: a value does not fit its field (and ``clip`` is False), or is NaN and no raw value of
+                the field says so.
         """
         n = len(first_index)
         raw = ((np.asarray(samples, np.float64) - self.offset) / self.scale).reshape(n, -1)
         payloads = np.zeros((n, self.length), np.uint8)
         for group in self._sample_groups:
-            values = raw[:, group.columns]
-            cell = [c for row in self.fields for c in row][group.columns[0]]
-            low, high = cell.limits
-            rounded = values if cell.kind == "float" else np.rint(values)
-            outside = ~((rounded >= low) & (rounded <= high))
-            if np.isnan(rounded).any() or (outside.any() and not clip):
-                row, column = np.argwhere(outside)[0]
-                at, channel = divmod(int(group.columns[column]), len(self.channels))
-                value = float(np.asarray(samples)[row, at, channel])
-                raise LayoutError(
-                    f"channel {self.channels[channel]!r}: {value:g} does not fit a {cell.bits}-bit "
-                    f"{cell.kind} field of frame {self.frame_id:#x}; choose a larger scale"
-                )
-            group.write(payloads, np.clip(rounded, low, high))
+            kind = self._cells[group.columns[0]].kind
+            values, refused = self._raw_values.fit(raw, group.columns, kind, clip=clip)
+            if refused.any():
+                row, place = np.argwhere(refused)[0]
+                raise self._refusal(raw[row], int(group.columns[place]))
+            group.write(payloads, values)
         for multiplexer, pages in self._selector_groups:
             multiplexer.write(payloads, np.full((n, 1), pages[0]))
         counts = first_index if self.counts == "samples" else first_index // self.samples_per_frame
@@ -372,3 +344,14 @@ class FrameLayout:
             payloads[:, self.crc_byte] = crc >> 8
             payloads[:, self.crc_byte + 1] = crc & 0xFF
         return payloads
+
+    def _refusal(self, raw: NDArray[np.float64], column: int) -> LayoutError:
+        """Why one cell of a frame cannot be encoded."""
+        at, channel = divmod(column, len(self.channels))
+        cell, name = self._cells[column], self.channels[channel]
+        value = raw[column] * self.scale[at, channel] + self.offset[at, channel]
+        remedy = "say by valid_raw which raw value stands for none"
+        return LayoutError(
+            f"channel {name!r}: {value:g} does not fit a {cell.bits}-bit {cell.kind} field of frame "
+            f"{self.frame_id:#x}; {remedy if np.isnan(value) else 'choose a larger scale'}"
+        )

@@ -45,6 +45,7 @@ class StreamCounters:
         samples_received: samples handed on.
         samples_lost: samples declared missing, by the device's counter.
         gaps: how often samples were missing.
+        values_absent: values in the samples handed on, of any channel, that the device said it does not have.
     """
 
     frames_received: int = 0
@@ -57,6 +58,7 @@ class StreamCounters:
     samples_received: int = 0
     samples_lost: int = 0
     gaps: int = 0
+    values_absent: int = 0
 
 
 class StreamAssembler:
@@ -232,6 +234,17 @@ class StreamAssembler:
             self._emit(int(index[0]), self._held[:length], lost)
             self._hold(index[length:], self._held[length:])
 
+    def _count_absent(self, flat: Samples) -> None:
+        absent = int(np.count_nonzero(np.isnan(flat)))
+        if absent and not self.counters.values_absent:
+            logger.warning(
+                "stream %r: the device sends no value %d times, but says that it has none; such values are "
+                "missing, and are counted from now on. Look at the sensors behind it",
+                self.stream,
+                absent,
+            )
+        self.counters.values_absent += absent
+
     def _hold(self, index: NDArray[np.int64], samples: Samples) -> None:
         self._held_index = index
         self._held = samples if len(index) else None
@@ -260,6 +273,7 @@ class StreamAssembler:
         self._waiting_since_ns = self._arrival_ns
         flat = np.ascontiguousarray(samples.reshape(-1, samples.shape[2]))
         self.counters.samples_received += len(flat)
+        self._count_absent(flat)
         self._next = first + len(flat)
         self._deliver(
             SampleBlock(

@@ -18,11 +18,13 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
-from daqsvc.settings.packing import (  # noqa: TC001 - pydantic needs them at run time
+from daqsvc.settings.packing import (
+    VALID_RAW,
     Channel,
     Counter,
     Counts,
     StartPolicy,
+    ValidRaw,
 )
 from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
@@ -149,6 +151,7 @@ class DbcChannel(Section):
             examples=['["AccelX"]'],
         ),
     ]
+    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW)
 
 
 class DbcLayout(Section):

@@ -12,14 +12,16 @@ from daqsvc.settings.packing import CRC_BYTES
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.replay import TableLayout
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.serial import SerialLayout
 from daqsvc.settings.wire import CLASSIC_MAX_LENGTH, frame_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from daqsvc.settings.buses import Layout
     from daqsvc.settings.dbc import DbcMessage
     from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.packing import Channel
     from daqsvc.settings.problems import KeyPath
 
 SHORTEST_WRAP_S = 0.040
@@ -152,6 +154,8 @@ def check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
         yield from unique(list(layout.channel_names), (*at, "columns"), "channel")
         return
     yield from unique([channel.name for channel in layout.channels], (*at, "channels"), "channel")
+    if isinstance(layout, PlainLayout | SerialLayout):
+        yield from _check_valid_raw(layout.channels, (*at, "channels"))
     if not isinstance(layout, DbcLayout):
         return
     taken: dict[str, str] = {layout.counter.signal: "the counter"}
@@ -172,6 +176,20 @@ def check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
                     "name each signal once",
                 )
             taken[signal] = f'channel "{channel.name}"'
+
+
+def _check_valid_raw(channels: Sequence[Channel], at: KeyPath) -> Iterator[Finding]:
+    """What is to be a measurement can be sent."""
+    for index, channel in enumerate(channels):
+        least, largest = channel.raw_limits
+        if channel.valid_raw is not None and not (
+            least <= channel.valid_raw[0] and channel.valid_raw[1] <= largest
+        ):
+            yield Finding(
+                (*at, index, "valid_raw"),
+                f"does not lie within what {channel.type} can carry, {least:g} to {largest:g}",
+                "write the raw values as the device sends them, before scale and offset",
+            )
 
 
 def check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -10,6 +11,7 @@ from pydantic_core import PydanticCustomError
 from daqsvc.settings.section import Name, Section
 
 CRC_BYTES = 2
+VALID_RAW = "least and largest raw value that is a measurement; any other says that there is none"
 
 RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
 Counts = Literal["samples", "frames"]
@@ -43,6 +45,24 @@ def not_zero(scale: float) -> float:
     return scale
 
 
+def _ordered_raw(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] >= limits[1]:
+        raise PydanticCustomError(
+            "valid_raw_order",
+            "the least raw value that is a measurement must come first, and the largest be another",
+            {"remedy": "write e.g. [-32767, 32767] if -32768 says that there is no value"},
+        )
+    return limits
+
+
+ValidRaw = Annotated[
+    tuple[float, float],
+    AfterValidator(_ordered_raw),
+    Field(strict=False),
+]
+"""Raw values that are measurements; any other says that the device has none."""
+
+
 class Counter(Section):
     """The running count in each frame that tells loss and gives a sample its place in time."""
 
@@ -71,8 +91,21 @@ class Channel(Section):
         float, AfterValidator(not_zero), Field(description="worth of one count", examples=[0.0005])
     ]
     offset: float = Field(default=0.0, description="wire value of the raw value 0")
+    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW)
 
     @property
     def raw_bytes(self) -> int:
         """Bytes of one raw sample."""
         return _RAW_BYTES[self.type]
+
+    @property
+    def raw_limits(self) -> tuple[float, float]:
+        """Least and largest value that the raw type can carry."""
+        if self.type == "float32":
+            return -math.inf, math.inf
+        bits = 8 * self.raw_bytes
+        return (
+            (0.0, 2.0**bits - 1.0)
+            if self.type.startswith("u")
+            else (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1.0)
+        )

@@ -1,0 +1,144 @@
+"""Raw numbers inside a payload: where each lies, and which of its values are measurements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+Kind = Literal["signed", "unsigned", "float"]
+ByteOrder = Literal["little", "big"]
+
+J1939_WIDTHS = (8, 16, 24, 32)
+"""Bits of the parameters whose highest values SAE J1939-71 (table 1) keeps for other uses."""
+
+
+class LayoutError(ValueError):
+    """A layout contradicts itself, its DBC file, or the values it should carry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One raw number inside a payload.
+
+    Attributes:
+        start: bit number as DBC files count: bit ``8 * byte + b`` with ``b = 0`` the least significant
+            bit of its byte; the field's least significant bit if ``order`` is little, its most
+            significant bit if it is big.
+        bits: width, 1 to 64 (32 or 64 for a float).
+        kind: how the bits are read.
+        order: byte order.
+    """
+
+    start: int
+    bits: int
+    kind: Kind = "unsigned"
+    order: ByteOrder = "little"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= 64 or (self.kind == "float" and self.bits not in {32, 64}):
+            raise LayoutError(
+                f"a {self.kind} field of {self.bits} bits cannot be; use 1 to 64 (float: 32, 64)"
+            )
+
+    @classmethod
+    def at_byte(cls, byte: int, bits: int, kind: Kind = "unsigned", order: ByteOrder = "little") -> Field:
+        """A field that begins on a byte boundary."""
+        return cls(8 * byte + (0 if order == "little" else 7), bits, kind, order)
+
+    @property
+    def positions(self) -> list[int]:
+        """The field's bits from most to least significant, counted from the payload's first bit.
+
+        In this count bit 0 is the *most* significant bit of byte 0, as `numpy.unpackbits` orders them.
+        """
+        if self.order == "little":
+            dbc_bits = range(self.start + self.bits - 1, self.start - 1, -1)
+            return [8 * (bit // 8) + 7 - bit % 8 for bit in dbc_bits]
+        first = 8 * (self.start // 8) + 7 - self.start % 8
+        return list(range(first, first + self.bits))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest value the field can carry."""
+        if self.kind == "float":
+            largest = float(np.finfo(np.float32 if self.bits == 32 else np.float64).max)
+            return -largest, largest
+        if self.kind == "signed":
+            return -float(2 ** (self.bits - 1)), float(2 ** (self.bits - 1) - 1)
+        return 0.0, float(2**self.bits - 1)
+
+
+def j1939_valid_raw(cell: Field) -> tuple[float, float] | None:
+    """Raw values of a field that are a measurement by SAE J1939-71, e.g. 0 to 0xFAFF of 16 bits.
+
+    Those above say "error" (0xFE..) or "not available" (0xFF..), or are kept back. None for a field to which
+    the standard gives no such range: one that is signed, a float, or no whole number of bytes.
+    """
+    if cell.kind != "unsigned" or cell.bits not in J1939_WIDTHS:
+        return None
+    return 0.0, float((0xFB << (cell.bits - 8)) - 1)
+
+
+class Fitted(NamedTuple):
+    """Raw values as they go on the wire.
+
+    Attributes:
+        values: float64 ``[n, cells]``.
+        refused: bool ``[n, cells]``, where there is no raw value for what was asked.
+    """
+
+    values: NDArray[np.float64]
+    refused: NDArray[np.bool_]
+
+
+class RawValues:
+    """What the raw values of cells mean: a measurement, or that the device has none.
+
+    Args:
+        cells: the fields.
+        valid: for each, the least and the largest raw value that is a measurement; None where all are.
+    """
+
+    def __init__(self, cells: Sequence[Field], valid: Sequence[tuple[float, float] | None]) -> None:
+        n = len(cells)
+        self._all_measured = not any(valid)
+        self._measured = np.array([given or (-np.inf, np.inf) for given in valid], np.float64).reshape(n, 2).T
+        self._least, self._largest, self._no_value = np.empty(n), np.empty(n), np.full(n, np.nan)
+        for k, (cell, (low, high)) in enumerate(zip(cells, self._measured.T.tolist(), strict=True)):
+            least, largest = cell.limits
+            self._least[k], self._largest[k] = max(low, least), min(high, largest)
+            # The largest number if that is no measurement, as in SAE J1939, else the least; a float has NaN.
+            if cell.kind != "float" and high < largest:
+                self._no_value[k] = largest
+            elif cell.kind != "float" and low > least:
+                self._no_value[k] = least
+
+    def leave_out_absent(self, raw: NDArray[np.float64]) -> None:
+        """Put NaN in place of raw values ``[n, cells]`` that are no measurements."""
+        if not self._all_measured:
+            low, high = self._measured
+            raw[(raw < low) | (raw > high)] = np.nan
+
+    def fit(self, raw: NDArray[np.float64], columns: NDArray[np.intp], kind: Kind, *, clip: bool) -> Fitted:
+        """Round what is to go on the wire, and say so where there is no value (NaN).
+
+        Args:
+            raw: float64 ``[n, cells]`` of all cells.
+            columns: the cells that are asked for.
+            kind: what they are.
+            clip: saturate what does not fit.
+        """
+        values = raw[:, columns] if kind == "float" else np.rint(raw[:, columns])
+        low, high, no_value = self._least[columns], self._largest[columns], self._no_value[columns]
+        absent = np.isnan(values)
+        refused = absent & np.isnan(no_value) if kind != "float" else np.zeros_like(absent)
+        if not clip:
+            refused |= (values < low) | (values > high)
+        return Fitted(np.where(absent, no_value, np.clip(values, low, high)), refused)
