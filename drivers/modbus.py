@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
 from drivers.keeping import Attempt, keep_up
-from drivers.modbus_client import LineLostError, LineOptions, ModbusClient, ModbusCounters
+from drivers.modbus_client import LineOptions, ModbusClient
 from drivers.modbus_line import ModbusLine, Patience, WritableRun
+from drivers.modbus_outcomes import LineLostError, ModbusCounters
 from drivers.modbus_sampling import reader_for
 from drivers.registers import Run
 

@@ -1,7 +1,7 @@
-"""The Modbus client: pymodbus carries bytes and PDUs, and what it is given to decode has been judged here.
+"""The Modbus client: pymodbus carries the bytes and encodes the requests, the replies are judged here.
 
 This is the only module that imports pymodbus. Reconnecting, quiet times and retries are not its business:
-pymodbus' own are switched off, see `drivers.modbus_line`.
+see `drivers.modbus_line`.
 """
 
 from __future__ import annotations
@@ -10,29 +10,24 @@ import asyncio
 import contextlib
 import logging
 import termios
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
-from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
-from pymodbus.exceptions import ModbusException
-from pymodbus.framer import FramerRTU
-from pymodbus.pdu import ModbusPDU
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU
 from pymodbus.pdu.file_message import ReadFifoQueueRequest
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersRequest,
     ReadInputRegistersRequest,
     WriteMultipleRegistersRequest,
 )
-from pymodbus.transaction import TransactionManager
+from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.base import BusCounters
+from drivers.modbus_outcomes import LineLostError, ModbusCounters, NoReplyError, RefusedError
 from drivers.modbus_replies import (
-    EXCEPTIONS,
-    READ_FIFO,
     READ_HOLDING,
     READ_INPUT,
-    WRITE_REGISTERS,
     Expected,
     Verdict,
     judge_rtu,
@@ -42,6 +37,8 @@ from drivers.modbus_replies import (
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from pymodbus.pdu import ModbusPDU
 
     from daqsvc.acquisition.clock import Clock
 
@@ -54,83 +51,8 @@ BITS_PER_CHARACTER = 11
 
 LEAST_CONNECT_S = 1.0
 _BUFFER_BYTES = 4096
-_NEVER = 2**31
-
-
-class LineLostError(Exception):
-    """The connection or the port is gone, or cannot be opened."""
-
-
-class NoReplyError(Exception):
-    """A unit has not answered in time, or what it answered was no reply to the request."""
-
-
-class RefusedError(Exception):
-    """A unit has answered with a Modbus exception.
-
-    Attributes:
-        code: the exception code.
-    """
-
-    def __init__(self, message: str, code: int) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-@dataclass(slots=True)
-class ModbusCounters(BusCounters):
-    """What happened on a Modbus line; every figure only grows.
-
-    Attributes:
-        requests: requests sent.
-        replies: sound replies, refusals included.
-        timeouts: requests without a sound reply in time.
-        exceptions: refusals by kind, e.g. ``"illegal data address"``.
-        replies_truncated: replies shorter than what was asked for, or cut off.
-        replies_oversized: replies longer than what was asked for, or than any reply may be.
-        replies_corrupt: RTU frames whose CRC does not match, and bytes that are no frame.
-        replies_wrong_unit: frames of another unit than was asked.
-        replies_wrong_transaction: TCP frames that answer no request under way.
-        replies_wrong_function: frames that answer another function.
-        replies_wrong_protocol: TCP frames that are not Modbus.
-        replies_unasked: bunches of bytes on a serial line while no reply was waited for: late replies.
-        units_demoted: how often a silent unit was set aside.
-        probes: requests to a unit set aside, to see if it is back.
-        units_back: how often one was.
-        blocks_torn: waveform blocks that the device replaced while they were read.
-        blocks_missed: waveform blocks that were over before they could be read.
-        ring_overruns: how often a ring was overwritten before it was read.
-    """
-
-    requests: int = 0
-    replies: int = 0
-    timeouts: int = 0
-    exceptions: dict[str, int] = field(default_factory=dict)
-    replies_truncated: int = 0
-    replies_oversized: int = 0
-    replies_corrupt: int = 0
-    replies_wrong_unit: int = 0
-    replies_wrong_transaction: int = 0
-    replies_wrong_function: int = 0
-    replies_wrong_protocol: int = 0
-    replies_unasked: int = 0
-    units_demoted: int = 0
-    probes: int = 0
-    units_back: int = 0
-    blocks_torn: int = 0
-    blocks_missed: int = 0
-    ring_overruns: int = 0
-
-    def note(self, fault: str) -> None:
-        """Count a faulty reply."""
-        name = f"replies_{fault}"
-        setattr(self, name, getattr(self, name) + 1)
-
-    def note_exception(self, code: int) -> str:
-        """Count a refusal, and return what it is called."""
-        kind = EXCEPTIONS.get(code, f"exception {code}")
-        self.exceptions[kind] = self.exceptions.get(kind, 0) + 1
-        return kind
+_LAST_TRANSACTION = 0xFFFF
+_READS = {READ_HOLDING: ReadHoldingRegistersRequest, READ_INPUT: ReadInputRegistersRequest}
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,40 +102,19 @@ class ModbusClient:
     """
 
     def __init__(self, options: LineOptions, clock: Clock, counters: ModbusCounters) -> None:
-        timeout_s = options.timeout_ns / NS_PER_S
-        made: AsyncModbusTcpClient | AsyncModbusSerialClient
-        common: dict[str, Any] = {
-            "timeout": max(timeout_s, LEAST_CONNECT_S),
-            "retries": 0,
-            "reconnect_delay": 0,
-            "name": options.where,
-        }
-        if options.transport == "tcp":
-            made = AsyncModbusTcpClient(options.host, port=options.tcp_port, **common)
-        else:
-            made = AsyncModbusSerialClient(
-                options.serial_port,
-                baudrate=options.baud,
-                parity=options.parity[0].upper(),
-                stopbits=options.stop_bits,
-                **common,
-            )
-        self._transactions = _Transactions(made.ctx, options, clock, counters)
-        made.ctx = self._transactions
-        made.set_max_no_responses(_NEVER)
-        self._client = made
+        self._wire = _Wire(options, clock, counters)
         self._options = options
         self._counters = counters
 
     @property
     def last_byte_ns(self) -> int:
         """When bytes last arrived, monotonic; 0 if never."""
-        return self._transactions.last_byte_ns
+        return self._wire.last_byte_ns
 
     @property
     def connected(self) -> bool:
         """Whether the connection stands."""
-        return self._client.connected
+        return self._wire.is_active()
 
     async def connect(self) -> None:
         """Open the connection.
@@ -221,26 +122,24 @@ class ModbusClient:
         Raises:
             LineLostError: it cannot be opened.
         """
-        why = "nobody answers there"
+        patience_s = max(self._options.timeout_ns / NS_PER_S, LEAST_CONNECT_S)
         try:
-            opened = await self._client.connect()
-        except (ModbusException, OSError, ValueError, termios.error) as error:
-            opened, why = False, f"{error}"
-        _heed_cancellation()
-        if not opened:
+            async with asyncio.timeout(patience_s):
+                await self._wire.open()
+        except (OSError, ValueError, termios.error) as error:  # a time-out and pyserial's own are OSErrors
             self._counters.open_failures += 1
-            raise LineLostError(f"{self._options.where} cannot be opened: {why}")
-        self._transactions.comm_params.timeout_connect = self._options.timeout_ns / NS_PER_S
+            why = f"{error}" or f"nobody answers there within {patience_s:g} s"
+            raise LineLostError(f"{self._options.where} cannot be opened: {why}") from error
 
     async def close(self) -> None:
         """Close the connection; harmless if it is closed."""
-        serial = getattr(self._transactions.transport, "sync_serial", None)
+        serial = getattr(self._wire.transport, "sync_serial", None)
         if serial is not None:
             # Closing a tty waits until everything is sent, which a dead adapter never does.
             with contextlib.suppress(OSError, ValueError):
                 serial.reset_output_buffer()
         with contextlib.suppress(OSError):
-            self._client.close()
+            self._wire.close()
         await asyncio.sleep(0)  # a TCP transport closes its socket in the next turn
 
     async def read(self, unit: int, function: int, address: int, count: int) -> bytes:
@@ -260,161 +159,193 @@ class ModbusClient:
             NoReplyError: no sound reply came in time.
             RefusedError: the unit answers with an exception.
         """
-        kind = {READ_HOLDING: ReadHoldingRegistersRequest, READ_INPUT: ReadInputRegistersRequest}[function]
-        request = kind(address=address, count=count, dev_id=unit)
-        return await self._ask(request, Expected(unit, function, 2 * count))
+        return await self._ask(_READS[function](address=address, count=count, dev_id=unit), 2 * count)
 
     async def read_fifo(self, unit: int, address: int) -> bytes:
         """Read a FIFO queue (function 24); see `read` for what is returned and raised."""
-        request = ReadFifoQueueRequest(address=address, dev_id=unit)
-        return await self._ask(request, Expected(unit, READ_FIFO, None))
+        return await self._ask(ReadFifoQueueRequest(address=address, dev_id=unit), None)
 
     async def write(self, unit: int, address: int, values: Sequence[int]) -> None:
         """Write holding registers (function 16); see `read` for what is raised."""
         request = WriteMultipleRegistersRequest(address=address, registers=list(values), dev_id=unit)
-        await self._ask(request, Expected(unit, WRITE_REGISTERS, None))
+        await self._ask(request, None)
 
-    async def _ask(self, request: ModbusPDU, expected: Expected) -> bytes:
-        if not self._client.connected:
-            raise LineLostError(self._transactions.why_lost)
+    async def _ask(self, request: ModbusPDU, data_bytes: int | None) -> bytes:
+        if not self._wire.is_active():
+            raise LineLostError(self._wire.why_lost)
         self._counters.requests += 1
-        transactions = self._transactions
-        transactions.expect(expected)
-        try:
-            await transactions.execute(False, request)
-        except ModbusException as error:
-            _heed_cancellation()
-            self._explain(expected, error)
-        finally:
-            transactions.expect(None)
-        _heed_cancellation()
-        pdu = transactions.accepted
+        pdu = await self._wire.exchange(request, data_bytes)
         self._counters.replies += 1
-        if pdu[0] != expected.function:
+        if pdu[0] != request.function_code:
             kind = self._counters.note_exception(pdu[1])
-            raise RefusedError(f"unit {expected.unit} refuses function {expected.function}: {kind}", pdu[1])
+            raise RefusedError(
+                f"unit {request.dev_id} refuses function {request.function_code}: {kind}", pdu[1]
+            )
         return register_bytes(pdu)
 
-    def _explain(self, expected: Expected, error: ModbusException) -> NoReturn:
-        """Raise what pymodbus' error means."""
-        if not self._client.connected:
-            raise LineLostError(self._transactions.why_lost) from error
-        unit, options = expected.unit, self._options
-        if self._transactions.refused:
-            raise NoReplyError(
-                f"unit {unit} at {options.where} answers with a {self._transactions.refused} reply; "
-                "compare its register map with the layout"
-            ) from error
-        self._counters.timeouts += 1
-        if options.transport == "tcp" and self._transactions.recv_buffer:
-            # Half a frame: its other half, if it comes, would be taken for the head of the next.
-            self._counters.note("truncated")
-            self._client.close()
-            raise LineLostError(f"unit {unit} at {options.where} has sent half a frame") from error
-        raise NoReplyError(
-            f"unit {unit} at {options.where} has not answered within {options.timeout_ns / 1e6:g} ms"
-        ) from error
 
+class _Wire(ModbusProtocol):
+    """pymodbus' transport: one request goes out, and of all bytes that come in only its reply is taken.
 
-class _Transactions(TransactionManager):
-    """pymodbus' transactions, given only those bytes that are the reply to the request under way."""
+    pymodbus' own transactions sit between this and its client. They are left out: they skip faulty frames
+    without counting them, and take a task and a turn of the event loop more for each request.
+    """
 
-    def __init__(
-        self, made: TransactionManager, options: LineOptions, clock: Clock, counters: ModbusCounters
-    ) -> None:
-        super().__init__(
-            made.comm_params,
-            made.framer,
-            0,
-            is_server=False,
-            trace_packet=None,
-            trace_pdu=None,
-            trace_connect=None,
-        )
-        self.max_buffer_size = _BUFFER_BYTES  # a flood is judged and counted like anything else
+    def __init__(self, options: LineOptions, clock: Clock, counters: ModbusCounters) -> None:
+        super().__init__(_transport_of(options), is_server=False)
         self.last_byte_ns = 0
-        self.accepted = b""
-        self.refused = ""
         self.why_lost = f"{options.where} is closed"
-        self._where = options.where
+        self._options = options
         self._serial = options.transport == "rtu"
+        self._timeout_s = options.timeout_ns / NS_PER_S
+        self._framer = (FramerRTU if self._serial else FramerSocket)(DecodePDU(False))
         self._clock = clock
         self._counters = counters
+        self._transaction = 0
         self._expected: Expected | None = None
+        self._reply: asyncio.Future[bytes] = self.loop.create_future()
 
-    def expect(self, expected: Expected | None) -> None:
-        """Say which reply is waited for from now on; None for none."""
-        if expected is None and self._expected is not None and self._serial and self.recv_buffer:
-            self._counters.note("truncated")  # the request is over, and this is all that came of its reply
-        if expected is not None:
-            self.refused = ""
-        self.recv_buffer = b""
-        self._expected = expected
+    async def open(self) -> None:
+        """Open the connection or the port."""
+        self.transport, _ = await self.call_create()
 
-    def callback_data(self, data: bytes, addr: tuple[Any, ...] | None = None) -> int:
-        """Take what answers the request, count all else; see `ModbusProtocol.callback_data`."""
-        del addr
+    async def exchange(self, request: ModbusPDU, data_bytes: int | None) -> bytes:
+        """Send a request and wait for its reply.
+
+        Args:
+            request: its unit and function tell which reply is waited for.
+            data_bytes: see `Expected`.
+
+        Returns:
+            PDU of the reply, or of the refusal.
+
+        Raises:
+            LineLostError: the connection is gone.
+            NoReplyError: no sound reply came in time.
+        """
+        if not self._serial:
+            self._transaction = self._transaction % _LAST_TRANSACTION + 1
+            request.transaction_id = self._transaction
+        self._expected = Expected(request.dev_id, request.function_code, data_bytes, self._transaction)
+        self._reply = self.loop.create_future()
+        timer = self.loop.call_later(self._timeout_s, self._give_up)
+        self._begin_anew()
+        try:
+            self.transport.write(self._framer.buildFrame(request))  # type: ignore[attr-defined]
+            return await self._reply
+        finally:
+            timer.cancel()
+            if self._serial and self._expected is not None and self.recv_buffer:
+                self._counters.note(
+                    "truncated"
+                )  # the request is over, and this is all that came of its reply
+            self._expected = None
+            self._begin_anew()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what answers the request, count all else; see `asyncio.Protocol`."""
         self.last_byte_ns = self._clock.monotonic_ns()
-        used = 0
-        while used < len(data):
-            verdict = self._judge(data[used:])
+        data = self.recv_buffer + data
+        while data:
+            verdict = self._judge(data)
             if not verdict.used:
                 break
-            used += verdict.used
+            data = data[verdict.used :]
             if verdict.fault is not None:
                 self._counters.note(verdict.fault)
             if verdict.final:
                 self._settle(verdict)
-        return used
+        self.recv_buffer = data
 
     def callback_disconnected(self, exc: Exception | None) -> None:
         """Let nobody wait for a reply that cannot come any more."""
-        self.why_lost = f"{self._where} has closed the connection" + (f" ({exc})" if exc else "")
-        self._fail(self.why_lost)
+        self.why_lost = f"{self._options.where} has closed the connection" + (f" ({exc})" if exc else "")
+        self._fail(LineLostError(self.why_lost))
+
+    def callback_connected(self) -> None:
+        """Nothing to do: whoever opens the connection waits for it."""
+
+    def callback_data(self, data: bytes, addr: tuple[object, ...] | None = None) -> int:
+        """Never called: `data_received` takes all."""
+        raise NotImplementedError(f"{len(data)} bytes from {addr} have not come through data_received")
+
+    def callback_new_connection(self) -> ModbusProtocol:
+        """Never called: this end connects, and does not listen."""
+        raise NotImplementedError(f"{self._options.where} is a client's end and accepts no connection")
+
+    def _begin_anew(self) -> None:
+        """On a serial line, what came before a request or is left of it belongs to no reply."""
+        if self._serial:
+            self.recv_buffer = b""
 
     def _judge(self, data: bytes) -> Verdict:
-        # The transaction id is pymodbus' to choose, when it sends.
-        expected = self._expected
+        if len(data) > _BUFFER_BYTES:
+            return Verdict(len(data), fault="oversized", final=True)
         if not self._serial:
-            if expected is not None:
-                expected = Expected(
-                    expected.unit, expected.function, expected.data_bytes, self.request_transaction_id
-                )
-            return judge_tcp(data, expected)
-        if expected is None:
+            return judge_tcp(data, self._expected)
+        if self._expected is None:
             self._counters.note("unasked")
             return Verdict(len(data))
-        return judge_rtu(data, expected, FramerRTU.compute_CRC)
+        return judge_rtu(data, self._expected, FramerRTU.compute_CRC)
 
     def _settle(self, verdict: Verdict) -> None:
         """End the request: with its reply, or because this was its reply and it is faulty."""
-        if verdict.pdu is None:
-            self.refused = str(verdict.fault)
-            self._fail(f"the reply is {verdict.fault}")
-            if verdict.fault == "wrong_protocol" and self.transport is not None:
-                self.transport.close()  # where the next frame begins is not known any more
-        elif self._waits:
-            # The registers are decoded in bulk later; pymodbus only needs to see that this is its reply.
-            self.accepted = verdict.pdu
-            self.response_future.set_result(
-                ModbusPDU(dev_id=self.request_dev_id, transaction_id=self.request_transaction_id)
+        if verdict.pdu is not None:
+            if self._waits:
+                self._reply.set_result(verdict.pdu)
+        elif verdict.fault == "wrong_protocol":
+            # Where the next frame begins is not known any more.
+            where = self._options.where
+            self._lose(f"{where} does not speak Modbus TCP; compare host and tcp_port with the device's")
+        elif self._expected is not None:
+            who = f"unit {self._expected.unit} at {self._options.where}"
+            self._fail(
+                NoReplyError(
+                    f"{who} answers with a {verdict.fault} reply; compare its register map with the layout"
+                )
             )
         self._expected = None
 
+    def _give_up(self) -> None:
+        """End the request without a reply: its time is over."""
+        if not self._waits or self._expected is None:
+            return
+        self._counters.timeouts += 1
+        unit, where = self._expected.unit, self._options.where
+        if self._serial or not self.recv_buffer:
+            self._fail(
+                NoReplyError(f"unit {unit} at {where} has not answered within {1e3 * self._timeout_s:g} ms")
+            )
+            return
+        # Half a frame: its other half, if it comes, would be taken for the head of the next.
+        self._counters.note("truncated")
+        self._lose(f"unit {unit} at {where} has sent half a frame")
+
+    def _lose(self, why: str) -> None:
+        """Close the connection: what comes over it cannot be told apart any more."""
+        self.why_lost = why
+        self._fail(LineLostError(why))
+        self.close()
+
     @property
     def _waits(self) -> bool:
-        return self._expected is not None and not self.response_future.done()
+        return self._expected is not None and not self._reply.done()
 
-    def _fail(self, why: str) -> None:
+    def _fail(self, error: Exception) -> None:
         if self._waits:
-            self.response_future.set_exception(ModbusException(why))
+            self._reply.set_exception(error)
 
 
-def _heed_cancellation() -> None:
-    """Raise the cancellation that `asyncio.wait_for` has swallowed, as it does when a result comes with it.
-
-    Python 3.12 does not any more.
-    """
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError
+def _transport_of(options: LineOptions) -> CommParams:
+    """What pymodbus is to open; it neither tries again nor keeps time."""
+    if options.transport == "tcp":
+        return CommParams(options.where, CommType.TCP, host=options.host, port=options.tcp_port)
+    return CommParams(
+        options.where,
+        CommType.SERIAL,
+        host=options.serial_port,
+        baudrate=options.baud,
+        bytesize=8,
+        parity=options.parity[0].upper(),
+        stopbits=options.stop_bits,
+    )

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus_client import LineLostError, NoReplyError, RefusedError
+from drivers.modbus_outcomes import LineLostError, NoReplyError, RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.modbus_client import ModbusClient, ModbusCounters
+    from drivers.modbus_client import ModbusClient
+    from drivers.modbus_outcomes import ModbusCounters
     from drivers.registers import Run
 
 logger = logging.getLogger(__name__)
@@ -140,7 +141,8 @@ class ModbusLine:
 
     async def _ask(self, unit: int, request: Callable[[], Awaitable[Result]]) -> Result:
         async with self._lock:
-            await self._keep_quiet()
+            if self._quiet_left_ns() > 0:
+                await self._keep_quiet()
             state = self._units.setdefault(unit, _Unit())
             if state.probe_ns is not None:
                 if self._clock.monotonic_ns() < state.probe_ns:
@@ -173,13 +175,12 @@ class ModbusLine:
     async def _keep_quiet(self) -> None:
         """Wait out the quiet time; a late reply makes it longer by a frame's gap."""
         longest_ns = self._quiet_until_ns + LONGEST_BABBLE * self._patience.quiet_ns
-        while True:
-            now_ns = self._clock.monotonic_ns()
-            until_ns = max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
-            left_ns = min(until_ns, longest_ns) - now_ns
-            if left_ns <= 0:
-                return
+        while (left_ns := min(self._quiet_left_ns(), longest_ns - self._clock.monotonic_ns())) > 0:
             await self._clock.sleep_ns(left_ns)
+
+    def _quiet_left_ns(self) -> int:
+        until_ns = max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
+        return until_ns - self._clock.monotonic_ns()
 
     def _answered(self, unit: int, state: _Unit) -> None:
         self._heard()

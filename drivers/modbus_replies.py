@@ -6,8 +6,7 @@ that were asked for. Modbus Application Protocol 1.1b3; Modbus over serial line 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,8 +42,7 @@ _WRITES = (WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS)
 _READS = (READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT)
 
 
-@dataclass(frozen=True, slots=True)
-class Expected:
+class Expected(NamedTuple):
     """The reply that is waited for.
 
     Attributes:
@@ -60,8 +58,7 @@ class Expected:
     transaction: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """What the bytes received so far are.
 
     Attributes:

@@ -12,8 +12,8 @@ from daqsvc.acquisition.assembler import StreamAssembler, StreamCounters
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
-from drivers.modbus_client import LineLostError, NoReplyError, RefusedError
 from drivers.modbus_layouts import FUNCTIONS, Fifo, ModbusLayout, Ring, Trend, Waveform
+from drivers.modbus_outcomes import LineLostError, NoReplyError, RefusedError
 from drivers.registers import Run
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from drivers.base import BusPort, StreamSpec
-    from drivers.modbus_client import ModbusCounters
     from drivers.modbus_line import ModbusLine
+    from drivers.modbus_outcomes import ModbusCounters
 
 logger = logging.getLogger(__name__)
 

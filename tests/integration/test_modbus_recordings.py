@@ -12,7 +12,8 @@ import pytest
 from pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus_client import LineOptions, ModbusClient, ModbusCounters, RefusedError
+from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_outcomes import ModbusCounters, RefusedError
 from drivers.modbus_replies import (
     EXCEPTIONS,
     READ_INPUT,

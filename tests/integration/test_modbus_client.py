@@ -1,0 +1,105 @@
+"""The Modbus client against a far end that a test plays byte by byte."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+
+import pytest
+
+from daqsvc.acquisition.clock import SystemClock
+from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_outcomes import LineLostError, ModbusCounters, NoReplyError
+
+TIMEOUT_NS = 50_000_000
+
+
+def reply(request: bytes, *words: int) -> bytes:
+    """The frame that answers a request to read registers."""
+    data = struct.pack(f">{len(words)}H", *words)
+    return request[:4] + struct.pack(">HBBB", 3 + len(data), request[6], request[7], len(data)) + data
+
+
+@contextlib.asynccontextmanager
+async def far_end(*answers):
+    """A client and its counters; each of ``answers`` takes a request and writes what it likes."""
+
+    async def talk(reader, writer):
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            for answer in answers:
+                answer(await reader.readexactly(12), writer)
+            await reader.read()
+        writer.close()
+
+    server = await asyncio.start_server(talk, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    counters = ModbusCounters()
+    options = LineOptions("tcp", host="127.0.0.1", tcp_port=port, timeout_ns=TIMEOUT_NS)
+    client = ModbusClient(options, SystemClock(), counters)
+    await client.connect()
+    try:
+        yield client, counters
+    finally:
+        await client.close()
+        server.close()
+
+
+async def test_the_end_of_a_late_reply_is_not_taken_for_the_head_of_the_next():
+    late = []
+
+    def first_half_too_late(request, writer):
+        frame = reply(request, 1, 2, 3)
+        late.append(frame[6:])
+        loop = asyncio.get_running_loop()
+        loop.call_later(1.5 * TIMEOUT_NS / 1e9, writer.write, frame[:6])
+
+    def second_half_and_the_answer(request, writer):
+        writer.write(late.pop() + reply(request, 4, 5, 6))
+
+    async with far_end(first_half_too_late, second_half_and_the_answer) as (client, counters):
+        with pytest.raises(NoReplyError, match="has not answered within 50 ms"):
+            await client.read(1, 3, 0, 3)
+        before_ns = client.last_byte_ns
+        async with asyncio.timeout(10):
+            while client.last_byte_ns == before_ns:
+                await asyncio.sleep(0.005)
+        assert await client.read(1, 3, 0, 3) == struct.pack(">3H", 4, 5, 6)
+    assert (counters.replies_wrong_transaction, counters.replies_wrong_protocol) == (1, 0)
+
+
+async def test_a_flood_is_counted_and_ends_the_request():
+    async with far_end(lambda _request, writer: writer.write(bytes(100_000))) as (client, counters):
+        with pytest.raises((NoReplyError, LineLostError)):
+            await client.read(1, 3, 0, 3)
+    assert counters.replies_oversized + counters.replies_truncated >= 1
+    assert counters.replies == 0
+
+
+async def test_who_speaks_another_protocol_is_told_so():
+    async with far_end(lambda _request, writer: writer.write(b"HTTP/1.1 400 Bad Request\r\n")) as (
+        client,
+        counters,
+    ):
+        with pytest.raises(LineLostError, match=r"127\.0\.0\.1:\d+ does not speak Modbus TCP; compare host"):
+            await client.read(1, 3, 0, 3)
+        assert not client.connected
+    assert counters.replies_wrong_protocol == 1
+
+
+async def test_a_connection_that_is_closed_ends_the_request_at_once():
+    async with far_end(lambda _request, writer: writer.close()) as (client, counters):
+        with pytest.raises(LineLostError, match="has closed the connection"):
+            await client.read(1, 3, 0, 3)
+    assert counters.timeouts == 0
+
+
+async def test_why_nobody_can_be_reached_is_told():
+    async with far_end() as (client, _counters):
+        taken = client._options
+    counters = ModbusCounters()
+    gone = ModbusClient(taken, SystemClock(), counters)
+    with pytest.raises(LineLostError, match=r"127\.0\.0\.1:\d+ cannot be opened: .*Connect call failed"):
+        await gone.connect()
+    assert counters.open_failures == 1
+    await gone.close()
