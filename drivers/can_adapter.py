@@ -7,11 +7,22 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 
-from drivers.can_batches import ERROR, EXTENDED, LONGEST, REMOTE, BusOffError, CanBatch
+from drivers.can_batches import (
+    BIT_RATE_SWITCH,
+    ERROR,
+    ERROR_PASSIVE_SENDER,
+    EXTENDED,
+    EXTENDED_ID,
+    FD,
+    LONGEST,
+    REMOTE,
+    BusOffError,
+    CanBatch,
+)
 from drivers.can_errors import BUS_OFF
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
 
@@ -108,10 +119,40 @@ def batch_of(
     """
     n = len(messages)
     ids = np.fromiter((_id(m) for m in messages), np.uint32, n)
-    lengths = np.fromiter((len(m.data) for m in messages), np.int64, n)
+    lengths = np.fromiter((m.dlc if m.is_remote_frame else len(m.data) for m in messages), np.int64, n)
+    fd_flags = np.fromiter((_fd_flags(m) for m in messages), np.uint8, n)
     raw = b"".join(m.data.ljust(LONGEST, b"\0") for m in messages)
     data = np.frombuffer(raw, np.uint8).reshape(n, LONGEST)
-    return CanBatch(ids, lengths, data, np.array(arrival_ns, np.int64), drained_ns=drained_ns)
+    return CanBatch(
+        ids, lengths, data, np.array(arrival_ns, np.int64), drained_ns=drained_ns, fd_flags=fd_flags
+    )
+
+
+def messages_of(batch: CanBatch, t_us: Sequence[int]) -> Iterator[can.Message]:
+    """Arrays as messages of python-can.
+
+    Args:
+        batch: the frames.
+        t_us: the time stamp of each, in microseconds.
+    """
+    fd_flags = [0] * len(batch.ids) if batch.fd_flags is None else batch.fd_flags.tolist()
+    payloads, width = batch.data.tobytes(), batch.data.shape[1]
+    for k, (frame_id, length, fd, t) in enumerate(
+        zip(batch.ids.tolist(), batch.lengths.tolist(), fd_flags, t_us, strict=True)
+    ):
+        remote = bool(frame_id & REMOTE)
+        yield can.Message(
+            timestamp=t / 1e6,
+            arbitration_id=frame_id & EXTENDED_ID,
+            is_extended_id=bool(frame_id & EXTENDED),
+            is_remote_frame=remote,
+            is_error_frame=bool(frame_id & ERROR),
+            is_fd=bool(fd),
+            bitrate_switch=bool(fd & BIT_RATE_SWITCH),
+            error_state_indicator=bool(fd & ERROR_PASSIVE_SENDER),
+            dlc=length,
+            data=None if remote else payloads[k * width : k * width + length],
+        )
 
 
 def _id(message: can.Message) -> int:
@@ -121,3 +162,14 @@ def _id(message: can.Message) -> int:
     if message.is_remote_frame:
         flags |= REMOTE
     return message.arbitration_id | flags
+
+
+def _fd_flags(message: can.Message) -> int:
+    if not message.is_fd:
+        return 0
+    flags = FD
+    if message.bitrate_switch:
+        flags |= BIT_RATE_SWITCH
+    if message.error_state_indicator:
+        flags |= ERROR_PASSIVE_SENDER
+    return flags

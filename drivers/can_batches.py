@@ -6,7 +6,7 @@ three flags that say what kind of frame it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -26,6 +26,10 @@ REMOTE = 0x4000_0000
 ERROR = 0x2000_0000
 EXTENDED_ID = 0x1FFF_FFFF
 STANDARD_ID = 0x7FF
+BIT_RATE_SWITCH = 0x01
+ERROR_PASSIVE_SENDER = 0x02
+FD = 0x04
+"""Flags of CAN FD frames (``CANFD_BRS``, ``CANFD_ESI`` and ``CANFD_FDF``)."""
 PRIORITY = 0x1C00_0000
 """Bits of a 29-bit id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
@@ -42,14 +46,16 @@ class CanBatch:
 
     Attributes:
         ids: uint32 ``[n]``, arbitration ids with `EXTENDED`, `REMOTE` and `ERROR`.
-        lengths: int64 ``[n]``, payload lengths in bytes.
+        lengths: int64 ``[n]``, payload lengths in bytes; of a remote frame the length that it asks for.
         data: uint8 ``[n, 64]``, payloads; bytes past a payload's length hold anything. It may be a view of
-            memory that the next read overwrites.
+            memory that the next read overwrites, as may be ids.
         arrival_ns: int64 ``[n]``, host monotonic.
         overrun: frames that the kernel dropped since the last batch, because its buffer was full.
         malformed: what came since the last batch and was no frame at all.
         drained_ns: when the bus was last known to hold no frame that was sent before; None if there
             may be more.
+        fd_flags: uint8 ``[n]``, of CAN FD frames `FD` with `BIT_RATE_SWITCH` and `ERROR_PASSIVE_SENDER`, of
+            others 0; None if there are no CAN FD frames.
     """
 
     ids: NDArray[np.uint32]
@@ -59,6 +65,12 @@ class CanBatch:
     overrun: int = 0
     malformed: int = 0
     drained_ns: int | None = None
+    fd_flags: NDArray[np.uint8] | None = None
+
+    def kept(self) -> CanBatch:
+        """The same frames in memory of their own, payloads cut to the longest: ``[n, width]``."""
+        width = int(self.lengths.max(initial=0))
+        return replace(self, ids=self.ids.copy(), data=self.data[:, :width].copy())
 
 
 class CanSource(Protocol):

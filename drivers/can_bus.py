@@ -18,6 +18,7 @@ from drivers.can_adapter import open_adapter
 from drivers.can_batches import FrameSorter
 from drivers.can_errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can_reader import SHUTDOWN_S, CanReader, close_quietly, words
+from drivers.can_record import recorder_of
 from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.socketcan import open_socketcan
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import BusPort, StreamSpec
     from drivers.can_batches import CanSource, Sorted
+    from drivers.can_record import CanRecorder
     from drivers.frames import FrameLayout
 
 logger = logging.getLogger(__name__)
@@ -39,8 +41,9 @@ class CanDriver:
     """Reads one CAN bus.
 
     Options of the bus: ``interface`` and ``channel`` as python-can names them, ``fd``, and optionally
-    ``bitrate``, ``data_bitrate`` and ``options`` (a table handed to python-can as it is). With interface
-    ``socketcan`` python-can is left out; see `drivers.socketcan` for what can be set there.
+    ``bitrate``, ``data_bitrate``, ``options`` (a table handed to python-can as it is) and ``record`` (see
+    `drivers.can_record`). With interface ``socketcan`` python-can is left out; see `drivers.socketcan` for
+    what can be set there.
 
     Args:
         port: settings, streams, clock and where to deliver.
@@ -58,6 +61,7 @@ class CanDriver:
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._open_source = open_source or _open_source
         self._said: set[str] = set()
+        self._recorder: CanRecorder | None = None
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -66,12 +70,17 @@ class CanDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
+        self._recorder = recorder_of(self._port, self.link.name, self.counters)
+        if self._recorder is not None:
+            self._recorder.start()
         try:
             await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
                 assembler.flush()
+            if self._recorder is not None:
+                await in_thread(self._recorder.close)
 
     async def _attempt(self) -> Attempt:
         source = await self._open()
@@ -99,7 +108,14 @@ class CanDriver:
 
     async def _receive(self, source: CanSource) -> str:
         """Read until the link fails; returns why."""
-        reader = CanReader(self.link.name, source, self._sorter, self.take, asyncio.get_running_loop())
+        reader = CanReader(
+            self.link.name,
+            source,
+            self._sorter,
+            self.take,
+            asyncio.get_running_loop(),
+            None if self._recorder is None else self._recorder.take,
+        )
         reader.start()
         try:
             return await reader.ended

@@ -75,6 +75,8 @@ class CanCounters(BusCounters):
         error_warnings: how often the controller reached the warning limit of 96 errors.
         error_passives: how often it became error-passive (128 errors).
         restarts: how often it came back after bus-off.
+        frames_recorded: frames that are in the recording of the bus.
+        frames_unrecorded: frames that are not, because the disk refused them or was too slow.
         controller_state: its state as last reported; error-active until something else is reported.
         tx_errors: its transmit error counter as last reported.
         rx_errors: its receive error counter as last reported.
@@ -93,6 +95,8 @@ class CanCounters(BusCounters):
     error_warnings: int = 0
     error_passives: int = 0
     restarts: int = 0
+    frames_recorded: int = 0
+    frames_unrecorded: int = 0
     controller_state: ControllerState = "error-active"
     tx_errors: int = 0
     rx_errors: int = 0

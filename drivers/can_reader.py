@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-    from drivers.can_batches import CanSource, FrameSorter
+    from drivers.can_batches import CanBatch, CanSource, FrameSorter
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +38,7 @@ class CanReader(threading.Thread):
         sorter: what knows the streams.
         take: called on the event loop with each batch.
         loop: the event loop.
+        record: called with each batch as it came, on this thread; must not wait.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class CanReader(threading.Thread):
         sorter: FrameSorter,
         take: Callable[[Sorted], None],
         loop: asyncio.AbstractEventLoop,
+        record: Callable[[CanBatch], None] | None = None,
     ) -> None:
         super().__init__(name=f"can-reader {link_name}", daemon=True)
         self.ended: asyncio.Future[str] = loop.create_future()
@@ -55,6 +57,7 @@ class CanReader(threading.Thread):
         self._sorter = sorter
         self._take = take
         self._loop = loop
+        self._record = record
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
 
@@ -94,6 +97,8 @@ class CanReader(threading.Thread):
         except BusOffError:
             self._hand_over(Sorted(notes={"bus_off": 1}))
             raise
+        if self._record is not None:
+            self._record(batch)
         found = self._sorter.sort(batch, self._source.error_classes)
         self._hand_over(found)
         if found.errors is not None and found.errors.bus_off and not self._source.recovers:

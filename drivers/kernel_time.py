@@ -40,7 +40,7 @@ class KernelTime:
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._offset_ns, _ = self._measure()
+        self._offset_ns, _ = monotonic_minus_wall_ns(clock)
         self._before_step_ns: int | None = None
         self._measured_at_ns = clock.monotonic_ns()
         self._hardware_offsets: deque[tuple[int, int]] = deque()
@@ -60,7 +60,7 @@ class KernelTime:
         """
         if not len(software_ns):
             return np.empty(0, np.int64)
-        offset_ns, bracket_ns = self._measure()
+        offset_ns, bracket_ns = monotonic_minus_wall_ns(self._clock)
         now_ns = self._clock.monotonic_ns()
         allowed = _STEP_NS + bracket_ns + _MOST_SLEW * (now_ns - self._measured_at_ns)
         if abs(offset_ns - self._offset_ns) > allowed:
@@ -91,15 +91,16 @@ class KernelTime:
         window.append((now_ns, offset_ns))
         return hardware_ns + window[0][1]
 
-    def _measure(self) -> tuple[int, int]:
-        """Monotonic minus wall time, and how long the closest of a few readings took."""
-        best_ns, best_bracket_ns = 0, 1 << 62
-        for _ in range(_TRIES):
-            before_ns = self._clock.monotonic_ns()
-            wall_ns = self._clock.wall_ns()
-            bracket_ns = self._clock.monotonic_ns() - before_ns
-            if bracket_ns < best_bracket_ns:
-                best_ns, best_bracket_ns = before_ns + bracket_ns // 2 - wall_ns, bracket_ns
-            if bracket_ns <= _GOOD_BRACKET_NS:
-                break
-        return best_ns, best_bracket_ns
+
+def monotonic_minus_wall_ns(clock: Clock) -> tuple[int, int]:
+    """Monotonic minus wall time, and how long the closest of a few readings took."""
+    best_ns, best_bracket_ns = 0, 1 << 62
+    for _ in range(_TRIES):
+        before_ns = clock.monotonic_ns()
+        wall_ns = clock.wall_ns()
+        bracket_ns = clock.monotonic_ns() - before_ns
+        if bracket_ns < best_bracket_ns:
+            best_ns, best_bracket_ns = before_ns + bracket_ns // 2 - wall_ns, bracket_ns
+        if bracket_ns <= _GOOD_BRACKET_NS:
+            break
+    return best_ns, best_bracket_ns

@@ -7,7 +7,8 @@ of every CAN bus:
 - ``receive_buffer_bytes``: how much the kernel holds while nobody reads. It allows itself twice that, and
   a frame takes some 768 bytes of it.
 - ``filter``: whether the kernel passes on only frames that some stream has (and error frames). It saves
-  the work for all others, which are then not seen and hence not counted as unknown.
+  the work for all others, which are then not seen and hence not counted as unknown. Left out, it does so
+  unless the bus is recorded.
 
 Bit rates are the interface's, set with ``ip link``, and not a matter of this module.
 """
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.can_batches import LONGEST, CanBatch
+from drivers.can_batches import BIT_RATE_SWITCH, ERROR_PASSIVE_SENDER, FD, LONGEST, CanBatch
 from drivers.can_errors import ALL_CLASSES
 from drivers.kernel_time import KernelTime
 from drivers.recvmmsg import SO_RXQ_OVFL, SO_TIMESTAMPING, SO_TIMESTAMPNS, DatagramBuffer
@@ -47,6 +48,7 @@ FD_BYTES = 72
 """``sizeof(struct can_frame)`` and ``sizeof(struct canfd_frame)``; both begin with id, length, flags."""
 
 _HEADER_BYTES = 8
+_FD_FLAGS = np.uint8(BIT_RATE_SWITCH | ERROR_PASSIVE_SENDER)
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
 _RX_HARDWARE_RAW = 1 << 2 | 1 << 6
@@ -117,6 +119,7 @@ class SocketCan:
                 raise OSError(errno.ENOTCONN, "the other end has closed the socket")
             malformed = int((~whole).sum())
             rows, sizes, arrival_ns = rows[whole], sizes[whole], arrival_ns[whole]
+        is_fd = sizes == FD_BYTES
         return CanBatch(
             ids=np.ascontiguousarray(rows[:, :4]).view(np.uint32)[:, 0],
             lengths=np.minimum(rows[:, 4].astype(np.int64), sizes.astype(np.int64) - _HEADER_BYTES),
@@ -125,6 +128,8 @@ class SocketCan:
             overrun=overrun,
             malformed=malformed,
             drained_ns=asked_ns if drained else None,
+            # Not every kernel sets the flag that says FD; the size says it in any.
+            fd_flags=np.where(is_fd, rows[:, 5] & _FD_FLAGS | FD, 0) if is_fd.any() else None,
         )
 
     def close(self) -> None:
@@ -154,7 +159,7 @@ def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock
     """Open a CAN interface of the Linux kernel.
 
     Args:
-        options: the bus's settings: ``channel``, ``fd``, ``receive_buffer_bytes``, ``filter``.
+        options: the bus's settings: ``channel``, ``fd``, ``receive_buffer_bytes``, ``filter``, ``record``.
         matches: ids that some stream has.
         clock: what arrivals are told in.
 
@@ -172,7 +177,7 @@ def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock
         if options.get("fd"):
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ALL_CLASSES)
-        if options.get("filter", True) and len(matches) <= _MOST_FILTERS:
+        if _filtered(options) and len(matches) <= _MOST_FILTERS:
             filters = b"".join(struct.pack("=II", match.id, match.mask) for match in matches)
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
         source = SocketCan(
@@ -186,6 +191,12 @@ def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock
         sock.close()
         raise
     return source
+
+
+def _filtered(options: Mapping[str, Any]) -> bool:
+    """Whether only frames of some stream are wanted: a recording is of the whole bus unless it is said."""
+    asked = options.get("filter")
+    return not options.get("record") if asked is None else bool(asked)
 
 
 def dropped_frames(sock: socket.socket) -> int:
