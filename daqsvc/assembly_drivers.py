@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.settings.buses import CanBus
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.replay import ReplayBus, TableLayout
@@ -234,31 +235,53 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
         AssemblyError: a driver is not installed, cannot be loaded, or cannot use an option.
         LayoutError: see `frame_layout`.
     """
+    return [bus_driver(machine, name, clock, deliver) for name in machine.buses]
+
+
+def bus_driver(
+    machine: MachineFile,
+    name: str,
+    clock: Clock,
+    deliver: Callable[[SampleBlock], None],
+    changed: Mapping[str, Any] | None = None,
+) -> Driver:
+    """The driver of one bus.
+
+    Args:
+        machine: the machine file.
+        name: the bus.
+        clock: the service's clock.
+        deliver: see `drivers.base.BusPort`.
+        changed: options that are other than in the machine file.
+
+    Raises:
+        AssemblyError, LayoutError: see `drivers`.
+    """
+    bus = machine.buses[name]
     installed = {point.name: point for point in entry_points(group=DRIVERS)}
-    made: list[Driver] = []
-    for name, bus in machine.buses.items():
-        if bus.driver not in installed:
-            raise AssemblyError(
-                f"{machine.path}: buses.{name}.driver = {bus.driver!r}: no such driver is installed; "
-                f"there are {', '.join(sorted(installed)) or 'none'}. "
-                "Install the package that brings it, or correct the name"
-            )
-        options: Mapping[str, Any] = bus.options if isinstance(bus, OtherBus) else bus.model_dump()
-        if isinstance(bus, ReplayBus):
-            options = {**options, "file": machine.resolve(bus.file)}
-        streams = [
-            StreamSpec(
-                stream_name,
-                stream_layout(machine, stream_name),
-                stream.rate_hz,
-                round(stream.reorder_window_ms * _NS_PER_MS),
-            )
-            for stream_name, stream in machine.streams.items()
-            if stream.bus == name
-        ]
-        port = BusPort(name, options, streams, clock, deliver, bus.start)
-        made.append(_driver(installed[bus.driver], port, f"{machine.path}: buses.{name}"))
-    return made
+    if bus.driver not in installed:
+        raise AssemblyError(
+            f"{machine.path}: buses.{name}.driver = {bus.driver!r}: no such driver is installed; "
+            f"there are {', '.join(sorted(installed)) or 'none'}. "
+            "Install the package that brings it, or correct the name"
+        )
+    options: dict[str, Any] = dict(bus.options) if isinstance(bus, OtherBus) else bus.model_dump()
+    if isinstance(bus, ReplayBus):
+        options["file"] = machine.resolve(bus.file)
+    if isinstance(bus, CanBus) and bus.record is not None:
+        options["record"]["folder"] = machine.resolve(bus.record.folder)
+    streams = [
+        StreamSpec(
+            stream_name,
+            stream_layout(machine, stream_name),
+            stream.rate_hz,
+            round(stream.reorder_window_ms * _NS_PER_MS),
+        )
+        for stream_name, stream in machine.streams.items()
+        if stream.bus == name
+    ]
+    port = BusPort(name, {**options, **(changed or {})}, streams, clock, deliver, bus.start)
+    return _driver(installed[bus.driver], port, f"{machine.path}: buses.{name}")
 
 
 def _driver(point: EntryPoint, port: BusPort, bus: str) -> Driver:

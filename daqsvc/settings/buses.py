@@ -44,6 +44,26 @@ def _payload_length(length: int) -> int:
     return length
 
 
+class CanRecord(Section):
+    """Files that every frame received on a CAN bus is recorded in."""
+
+    folder: Annotated[
+        Path,
+        Field(
+            strict=False,
+            description="holds the files, relative to the machine file; must be there",
+            examples=["/var/lib/daqsvc/can"],
+        ),
+    ]
+    format: Literal["blf", "asc", "candump"] = Field(default="blf", description="which kind of CAN log")
+    file_mb: Annotated[int, Field(ge=1, le=4000)] = Field(
+        default=64, description="a file that is this large is ended, and another one begun"
+    )
+    keep_mb: Annotated[int, Field(ge=2, le=100_000_000)] = Field(
+        default=2048, description="what all files may take together; the oldest are taken away"
+    )
+
+
 class CanBus(Section):
     """A CAN or CAN FD bus: SocketCAN read directly, any other interface through python-can."""
 
@@ -65,9 +85,12 @@ class CanBus(Section):
     receive_buffer_bytes: Annotated[int, Field(ge=4096, le=1 << 30)] = Field(
         default=4 << 20, description="SocketCAN: what the kernel holds for us; a frame takes some 400 of it"
     )
-    filter: bool = Field(
-        default=True, description="SocketCAN: let the kernel leave out frames of no stream, uncounted"
+    filter: bool | None = Field(
+        default=None,
+        description="SocketCAN: let the kernel leave out frames of no stream, uncounted; if left out, it "
+        "does so unless the bus is recorded",
     )
+    record: CanRecord | None = Field(default=None, description="record every frame received in files")
     start: StartPolicy = Field(default="retry", description="what to do if the device is absent at start")
 
 

@@ -33,6 +33,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.problems import Finding
+from daqsvc.settings.record_checks import check_recorded_buses
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
@@ -85,6 +86,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_interfaces(draft)
     yield check_serial_ports(draft)
     yield check_replay_buses(draft)
+    yield check_recorded_buses(draft)
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
             at = ("sensors", index)

@@ -97,6 +97,8 @@ def _bus(machine: MachineFile, name: str) -> str:
     if loads and len(known) == len(loads):
         load = _percent(sum(least for least, _ in known), sum(most for _, most in known))
         parts.append(f"load about {load} of the bus")
+    if bus.record is not None:
+        parts.append(f"recorded as {bus.record.format} in {bus.record.folder}, {bus.record.keep_mb} MB at most")
     return f"{', '.join(parts)}; if absent at start: {bus.start}"
 
 
