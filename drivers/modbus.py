@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -18,6 +19,7 @@ from drivers.modbus_line import ModbusLine, Patience, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
 from drivers.modbus_sampling import reader_for
 from drivers.registers import Run
+from drivers.tty import Character, CharacterFormat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -56,6 +58,7 @@ class ModbusDriver:
         ]
         kind = "Modbus TCP" if self._options.transport == "tcp" else "Modbus RTU"
         self.link = Link(f"{kind} bus {port.name!r} ({self._options.where})")
+        self._characters = CharacterFormat(self.link.name, Character(8, self._options.parity))
         self._readers = {spec.name: reader_for(spec, port, self.counters) for spec in port.streams}
         self._line: ModbusLine | None = None
 
@@ -99,7 +102,9 @@ class ModbusDriver:
 
     async def _session(self) -> str:
         """Open the line and read until it is lost; returns why."""
-        client = ModbusClient(self._options, self._port.clock, self.counters)
+        character = self._characters.on(self._options.serial_port)
+        options = replace(self._options, parity=character.parity)
+        client = ModbusClient(options, self._port.clock, self.counters)
         reading: list[asyncio.Task[None]] = []
         try:
             try:

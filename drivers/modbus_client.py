@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from pymodbus.pdu import ModbusPDU
 
     from daqsvc.acquisition.clock import Clock
+    from drivers.tty import Parity
 
 logging.getLogger("pymodbus.logging").setLevel(
     logging.CRITICAL
@@ -75,7 +76,7 @@ class LineOptions:
     tcp_port: int = 502
     serial_port: str = ""
     baud: int = 19_200
-    parity: Literal["none", "even", "odd"] = "even"
+    parity: Parity = "even"
     stop_bits: Literal[1, 2] = 1
     timeout_ns: int = NS_PER_S // 2
 

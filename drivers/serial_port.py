@@ -24,6 +24,7 @@ from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial_lines import TIME_COUNTER_BITS, LineFraming, LineLayout
 from drivers.serial_reader import SHUTDOWN_S, Batch, SerialReader, close_port
+from drivers.tty import Character, CharacterFormat
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -92,6 +93,8 @@ class SerialDriver:
         self._framing = framing_of(port.options, port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._said: set[str] = set()
+        asked = Character(port.options.get("data_bits", 8), port.options.get("parity", "none"))
+        self._characters = CharacterFormat(self.link.name, asked)
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -122,7 +125,9 @@ class SerialDriver:
 
     async def _open(self) -> serial.Serial | None:
         try:
-            return await in_thread(_open_port, self._port.options, undo=close_port, patience_s=SHUTDOWN_S)
+            return await in_thread(
+                _open_port, self._port.options, self._characters, undo=close_port, patience_s=SHUTDOWN_S
+            )
         except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
             self.counters.open_failures += 1
             self.link.down(f"it cannot be opened: {_why_not_open(error, self._port.options)}")
@@ -238,13 +243,14 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
     )
 
 
-def _open_port(options: Mapping[str, Any]) -> serial.Serial:
+def _open_port(options: Mapping[str, Any], characters: CharacterFormat) -> serial.Serial:
     flow = options.get("flow_control", "none")
+    character = characters.on(options["port"])
     device = serial.Serial(
         options["port"],
         baudrate=options.get("baud", 115_200),
-        bytesize=options.get("data_bits", 8),
-        parity=_PARITY[options.get("parity", "none")],
+        bytesize=character.data_bits,
+        parity=_PARITY[character.parity],
         stopbits=options.get("stop_bits", 1),
         rtscts=flow == "rts-cts",
         xonxoff=flow == "xon-xoff",

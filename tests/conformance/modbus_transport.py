@@ -146,8 +146,7 @@ class ModbusRtu(_Modbus):
 
     def options(self) -> dict[str, Any]:
         writes = [{"unit": UNIT, "address": ACKNOWLEDGE, "count": 2}]
-        # A pseudo-terminal has no parity.
-        line = {"serial_port": str(self._path), "baud": 115_200, "parity": "none", "stop_bits": 2}
+        line = {"serial_port": str(self._path), "baud": 115_200}
         return {"transport": "rtu", "writes": writes, **line}
 
 

@@ -1,0 +1,78 @@
+"""Serial ports that have no UART: what a pseudo-terminal cannot carry is left out when it is opened."""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+Parity: TypeAlias = Literal["none", "even", "odd"]
+
+PSEUDO_TERMINAL_MAJORS = range(136, 144)
+"""Major numbers of pseudo-terminals (Linux, Documentation/admin-guide/devices.txt: Unix98 PTY slaves)."""
+
+
+class Character(NamedTuple):
+    """How a character travels.
+
+    Attributes:
+        data_bits: 5 to 8.
+        parity: of these bits.
+    """
+
+    data_bits: int
+    parity: Parity
+
+
+class CharacterFormat:
+    """The characters of a serial line, and those that its port can carry.
+
+    A pseudo-terminal passes bytes: the kernel drops parity and makes all characters 8 bits long, and the C
+    library then fails with EINVAL. So that the virtual line works with the machine file of the real one, a
+    port that turns out to be a pseudo-terminal is opened without parity, with 8 bits.
+
+    Args:
+        link: what a person calls the line.
+        asked: characters of the device's line.
+    """
+
+    def __init__(self, link: str, asked: Character) -> None:
+        self._link = link
+        self._asked = asked
+        self._said = False
+
+    def on(self, port: str | Path) -> Character:
+        """The characters with which to open a port; what is left out is told once, as a warning.
+
+        Args:
+            port: path of its device, which may be a link to it, and need not be there.
+        """
+        if not is_pseudo_terminal(port):
+            return self._asked
+        carried = Character(8, "none")
+        if carried != self._asked and not self._said:
+            self._said = True
+            logger.warning(
+                "%s is a pseudo-terminal, which passes whole bytes only: it is opened without parity and "
+                "with 8 data bits, instead of parity %r and %d data bits; correct the port if a real device "
+                "is meant",
+                self._link,
+                self._asked.parity,
+                self._asked.data_bits,
+            )
+        return carried
+
+
+def is_pseudo_terminal(port: str | Path) -> bool:
+    """Whether a path leads to a pseudo-terminal; False if there is nothing."""
+    try:
+        status = os.stat(port)  # noqa: PTH116 - a path or an URL, as pyserial takes it
+    except (OSError, ValueError):  # whoever opens it says what is wrong with it
+        return False
+    return stat.S_ISCHR(status.st_mode) and os.major(status.st_rdev) in PSEUDO_TERMINAL_MAJORS
