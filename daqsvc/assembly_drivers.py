@@ -88,8 +88,8 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
         layout = layout_from_dbc(
             machine.resolve(given.dbc),
             given.message,
-            counter=given.counter.signal,
-            counts=given.counter.counts,
+            counter=None if given.counter is None else given.counter.signal,
+            counts="frames" if given.counter is None else given.counter.counts,
             channels={channel.name: channel.signals for channel in given.channels},
             valid_raw=_valid_raw(given.channels),
         )
@@ -177,9 +177,9 @@ def _plain_layout(given: PlainLayout) -> FrameLayout:
         length=given.length,
         channels=_packed(given.channels),
         samples_per_frame=given.samples_per_frame,
-        counter_byte=given.counter.byte,
-        counter_bits=given.counter.bits,
-        counts=given.counter.counts,
+        counter_byte=None if given.counter is None else given.counter.byte,
+        counter_bits=32 if given.counter is None else given.counter.bits,
+        counts="frames" if given.counter is None else given.counter.counts,
         first_byte=given.first_byte,
         crc_byte=given.crc_byte,
         byte_order=given.byte_order,

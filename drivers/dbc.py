@@ -19,7 +19,7 @@ def layout_from_dbc(
     path: Path,
     message: str,
     *,
-    counter: str,
+    counter: str | None,
     counts: Counts,
     channels: Mapping[str, Sequence[str]],
     valid_raw: Mapping[str, tuple[float, float]] | None = None,
@@ -32,7 +32,7 @@ def layout_from_dbc(
     Args:
         path: the DBC file.
         message: name of the message.
-        counter: name of the counter signal.
+        counter: name of the counter signal; None if there is none.
         counts: what it counts.
         channels: for each channel the signals of its consecutive samples.
         valid_raw: see `FrameLayout`.
@@ -66,7 +66,8 @@ def layout_from_dbc(
         order: ByteOrder = "little" if signal.byte_order == "little_endian" else "big"
         return Field(signal.start, signal.length, kind, order)
 
-    names = [counter, *(name for column in channels.values() for name in column)]
+    names = [] if counter is None else [counter]
+    names += [name for column in channels.values() for name in column]
     cells = {name: field(name) for name in names}
     pages = selecting_values(signals, names)
     if not all(pages.values()):
@@ -83,7 +84,7 @@ def layout_from_dbc(
         fields=tuple(tuple(cells[name] for name in row) for row in rows),
         scale=np.array([[float(signals[name].scale) for name in row] for row in rows]),
         offset=np.array([[float(signals[name].offset) for name in row] for row in rows]),
-        counter=cells[counter],
+        counter=None if counter is None else cells[counter],
         counts=counts,
         any_priority=described.protocol == "j1939",
         valid_raw=valid_raw or {},

@@ -44,7 +44,7 @@ class Decoded(NamedTuple):
     """A batch of decoded frames.
 
     Attributes:
-        counter: int64 ``[n]``, the device's counter as sent (wrapped).
+        counter: int64 ``[n]``, the device's counter as sent (wrapped); zeros if it sends none.
         samples: float32 ``[n, samples_per_frame, channels]`` in physical units.
         intact: bool ``[n]``, False where the frame's CRC does not match (all True without a CRC).
     """
@@ -71,7 +71,7 @@ class Selector:
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """Several samples of several channels, with a sample counter, in every frame of one id.
+    """Several samples of several channels, as a rule with a counter, in every frame of one id.
 
     Attributes:
         frame_id: arbitration id.
@@ -81,7 +81,7 @@ class FrameLayout:
         fields: one field per sample and channel, ``[samples_per_frame][channels]``.
         scale: physical value of one count, float64 ``[samples_per_frame, channels]``.
         offset: physical value of count zero, same shape.
-        counter: where the counter lies.
+        counter: where the counter lies; None if the frames carry none.
         counts: whether the counter counts samples or frames.
         crc_byte: where a CRC-16/IBM-3740 (big endian) over all other bytes lies; None without one.
         selectors: which frames of the id have this layout, where not all of them do.
@@ -98,7 +98,7 @@ class FrameLayout:
     fields: tuple[tuple[Field, ...], ...]
     scale: NDArray[np.float64]
     offset: NDArray[np.float64]
-    counter: Field
+    counter: Field | None
     counts: Counts
     crc_byte: int | None = None
     selectors: tuple[Selector, ...] = ()
@@ -107,7 +107,7 @@ class FrameLayout:
 
     def __post_init__(self) -> None:
         taken: dict[int, str] = {}
-        named = [("counter", self.counter)]
+        named = [] if self.counter is None else [("counter", self.counter)]
         for i, row in enumerate(self.fields):
             named += [(f"sample {i} of {name}", cell) for name, cell in zip(self.channels, row, strict=True)]
         named += [(selector.name, selector.field) for selector in self.selectors]
@@ -132,8 +132,8 @@ class FrameLayout:
         length: int,
         channels: Sequence[tuple[str, int, Kind, float, float]],
         samples_per_frame: int,
-        counter_byte: int,
-        counter_bits: int,
+        counter_byte: int | None,
+        counter_bits: int = 32,
         counts: Counts = "samples",
         first_byte: int,
         crc_byte: int | None = None,
@@ -149,7 +149,7 @@ class FrameLayout:
             length: payload length in bytes.
             channels: name, bits (8, 16, 24, 32), kind, scale and offset of each channel.
             samples_per_frame: samples of every channel in a frame.
-            counter_byte: first byte of the counter.
+            counter_byte: first byte of the counter; None if there is none.
             counter_bits: 8, 16 or 32.
             counts: what the counter counts.
             first_byte: first byte of the samples.
@@ -178,7 +178,9 @@ class FrameLayout:
             fields=tuple(fields),
             scale=np.tile([scale for *_, scale, _ in channels], (samples_per_frame, 1)),
             offset=np.tile([offset for *_, offset in channels], (samples_per_frame, 1)),
-            counter=Field.at_byte(counter_byte, counter_bits, "unsigned", byte_order),
+            counter=None
+            if counter_byte is None
+            else Field.at_byte(counter_byte, counter_bits, "unsigned", byte_order),
             counts=counts,
             crc_byte=crc_byte,
             any_priority=any_priority,
@@ -196,9 +198,9 @@ class FrameLayout:
         return self.length > 8
 
     @property
-    def counter_bits(self) -> int:
-        """Width of the counter."""
-        return self.counter.bits
+    def counter_bits(self) -> int | None:
+        """Width of the counter; None without one."""
+        return None if self.counter is None else self.counter.bits
 
     @property
     def counts_per_frame(self) -> int:
@@ -230,8 +232,8 @@ class FrameLayout:
         return RawValues(self._cells, valid)
 
     @cached_property
-    def _counter_group(self) -> FieldGroup:
-        return FieldGroup([self.counter], [0], self.length)
+    def _counter_group(self) -> FieldGroup | None:
+        return None if self.counter is None else FieldGroup([self.counter], [0], self.length)
 
     @cached_property
     def _sample_groups(self) -> list[FieldGroup]:
@@ -294,7 +296,12 @@ class FrameLayout:
             scaled *= self.scale
             scaled += self.offset
             samples = scaled.astype(np.float32)
-        counter = self._counter_group.read(payloads)[:, 0].astype(np.int64)
+        group_of_counter = self._counter_group
+        counter = (
+            np.zeros(n, np.int64)
+            if group_of_counter is None
+            else group_of_counter.read(payloads)[:, 0].astype(np.int64)
+        )
         if self.crc_byte is None:
             intact = np.ones(n, np.bool_)
         else:
@@ -337,8 +344,9 @@ class FrameLayout:
             group.write(payloads, values)
         for multiplexer, pages in self._selector_groups:
             multiplexer.write(payloads, np.full((n, 1), pages[0]))
-        counts = first_index if self.counts == "samples" else first_index // self.samples_per_frame
-        self._counter_group.write(payloads, (counts % 2**self.counter_bits).astype(np.int64)[:, None])
+        if self.counter is not None and self._counter_group is not None:
+            counts = first_index if self.counts == "samples" else first_index // self.samples_per_frame
+            self._counter_group.write(payloads, (counts % 2**self.counter.bits).astype(np.int64)[:, None])
         if self.crc_byte is not None:
             crc = self._crc(payloads)
             payloads[:, self.crc_byte] = crc >> 8

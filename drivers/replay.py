@@ -223,6 +223,7 @@ class ReplayDriver:
 
 def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:
     layout = spec.layout
+    bits: int | None
     if isinstance(layout, ColumnLayout):
         bits, per_frame, counts = TABLE_COUNTER_BITS, 1, 1
     else:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.acquisition.arrival_count import COUNTER_BITS, ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBase, TimeBaseState
@@ -43,7 +44,7 @@ class StreamCounters:
         frames_rejected: of those, with a counter that fits nothing.
         frames_wrong_length: frames of the stream's id that are shorter or longer than its layout.
         samples_received: samples handed on.
-        samples_lost: samples declared missing, by the device's counter.
+        samples_lost: samples declared missing, by the device's counter, or by time if it sends none.
         gaps: how often samples were missing.
         values_absent: values in the samples handed on, of any channel, that the device said it does not have.
     """
@@ -67,7 +68,8 @@ class StreamAssembler:
     Args:
         stream: name of the stream.
         rate_hz: nominal sampling rate.
-        counter_bits: width of the device's counter.
+        counter_bits: width of the device's counter; None if it sends none, and loss can only be estimated
+            from the times of arrival (`daqsvc.acquisition.arrival_count`).
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         deliver: called with each block, in order, from the thread that calls `accept`.
@@ -79,7 +81,7 @@ class StreamAssembler:
         stream: str,
         rate_hz: float,
         *,
-        counter_bits: int,
+        counter_bits: int | None,
         samples_per_frame: int,
         counts_per_frame: int,
         deliver: Callable[[SampleBlock], None],
@@ -91,6 +93,10 @@ class StreamAssembler:
         self._per_frame = samples_per_frame
         self._window = round(rate_hz * reorder_window_ns / NS_PER_S) + samples_per_frame
         self._patience_ns = 4 * reorder_window_ns + round(4 * samples_per_frame / rate_hz * NS_PER_S)
+        self._arrivals = None
+        if counter_bits is None:
+            self._arrivals = ArrivalCount(samples_per_frame / rate_hz * NS_PER_S)
+            counter_bits, counts_per_frame = COUNTER_BITS, 1
         self._time = TimeBase(rate_hz, counter_bits, samples_per_frame, counts_per_frame, reorder_window_ns)
         self._next: int | None = None
         self._highest: int | None = None
@@ -121,7 +127,7 @@ class StreamAssembler:
         """Take in a batch of frames in their order of arrival.
 
         Args:
-            counter: int64 ``[n]``, as sent.
+            counter: int64 ``[n]``, as sent; anything if the device sends none.
             samples: float32 ``[n, samples_per_frame, channels]``.
             intact: bool ``[n]``.
             arrival_ns: int64 ``[n]``, host monotonic.
@@ -138,6 +144,8 @@ class StreamAssembler:
             counter, samples, arrival_ns = counter[intact], samples[intact], arrival_ns[intact]
         if not len(counter):
             return
+        if self._arrivals is not None:
+            counter = self._arrivals.count(arrival_ns)
         placed = self._time.place(counter, arrival_ns)
         rejected = int((~placed.kept).sum())
         if rejected and not self.counters.frames_rejected:
@@ -256,7 +264,7 @@ class StreamAssembler:
             quality |= Quality.TIME_UNSETTLED
         if lost:
             quality |= Quality.AFTER_LOSS
-            if self._after_restart:
+            if self._after_restart or self._arrivals is not None:
                 quality |= Quality.LOSS_ESTIMATED
             if not self.counters.gaps:
                 logger.warning(

@@ -27,7 +27,7 @@ class Quality(IntFlag):
     AFTER_LOSS = 2
     """Samples just before this block are missing (`SampleBlock.lost_before`)."""
     LOSS_ESTIMATED = 4
-    """The number of missing samples comes from the host clock (the device restarted its counter)."""
+    """The number of missing samples comes from the host clock: the device has no counter, or restarted it."""
 
 
 @dataclass(frozen=True, slots=True)

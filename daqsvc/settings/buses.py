@@ -34,6 +34,9 @@ CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
 
 
+NO_COUNTER = "says that the frames carry none: what is lost is then estimated from the times of arrival"
+
+
 def _payload_length(length: int) -> int:
     if length not in CAN_FD_LENGTHS:
         raise PydanticCustomError(
@@ -118,10 +121,16 @@ class PlainLayout(Section):
         int, AfterValidator(_payload_length), Field(description="payload length in bytes", examples=[64])
     ]
     byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
-    counter: Annotated[
-        Counter,
-        Field(description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']),
-    ]
+    counter: (
+        Annotated[
+            Counter,
+            Field(
+                description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']
+            ),
+        ]
+        | None
+    ) = None
+    no_counter: bool = Field(default=False, description=NO_COUNTER)
     crc_byte: Annotated[int, Field(ge=0, le=62, description="byte where a CRC-16 starts")] | None = None
     first_byte: Annotated[int, Field(ge=0, le=63, description="where the samples start", examples=[2])]
     samples_per_frame: Annotated[int, Field(ge=1, le=64, description="samples per channel", examples=[10])]
@@ -187,10 +196,14 @@ class DbcLayout(Section):
         str,
         Field(min_length=1, description="the message that carries the samples", examples=["Acceleration"]),
     ]
-    counter: Annotated[
-        DbcCounter,
-        Field(description="the frame's counter", examples=['{ signal = "Sequence", counts = "frames" }']),
-    ]
+    counter: (
+        Annotated[
+            DbcCounter,
+            Field(description="the frame's counter", examples=['{ signal = "Sequence", counts = "frames" }']),
+        ]
+        | None
+    ) = None
+    no_counter: bool = Field(default=False, description=NO_COUNTER)
     channels: Annotated[
         tuple[DbcChannel, ...],
         Field(

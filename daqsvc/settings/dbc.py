@@ -103,7 +103,9 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
 
 def _asked(layout: DbcLayout, at: KeyPath) -> list[tuple[KeyPath, str]]:
     """The signals that a layout names, and where."""
-    asked: list[tuple[KeyPath, str]] = [((*at, "counter", "signal"), layout.counter.signal)]
+    asked: list[tuple[KeyPath, str]] = []
+    if layout.counter is not None:
+        asked.append(((*at, "counter", "signal"), layout.counter.signal))
     for index, channel in enumerate(layout.channels):
         asked += [
             ((*at, "channels", index, "signals", place), name) for place, name in enumerate(channel.signals)
@@ -138,7 +140,7 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             "pages of its multiplexer",
             "make a stream for each page, with a counter that is on it",
         )
-    counter = signals.get(layout.counter.signal)
+    counter = None if layout.counter is None else signals.get(layout.counter.signal)
     if counter is not None and (counter.is_signed or counter.is_float):
         yield Finding(
             (*at, "counter", "signal"),

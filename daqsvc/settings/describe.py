@@ -122,7 +122,7 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
         f"{stream.rate_hz:g} Hz",
         f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
         f"{facts.length} bytes, {samples}",
-        f"{facts.counter_bits} bit {layout.counter.counts}",
+        "none: by time" if layout.counter is None else f"{facts.counter_bits} bit {layout.counter.counts}",
         shown_share,
     )
 

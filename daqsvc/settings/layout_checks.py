@@ -37,7 +37,7 @@ class FrameFacts(NamedTuple):
     frame_id: int
     extended: bool
     length: int
-    counter_bits: int
+    counter_bits: int | None
     counts_samples: bool
     samples_per_frame: int
     any_priority: bool
@@ -57,24 +57,24 @@ def frame_facts(stream: Stream, message: DbcMessage | None) -> FrameFacts | None
     layout = stream.layout
     if not isinstance(layout, PlainLayout | DbcLayout):
         return None
-    counts_samples = layout.counter.counts == "samples"
+    counts_samples = layout.counter is not None and layout.counter.counts == "samples"
     if isinstance(layout, PlainLayout):
         return FrameFacts(
             layout.id,
             layout.extended,
             layout.length,
-            layout.counter.bits,
+            None if layout.counter is None else layout.counter.bits,
             counts_samples,
             layout.samples_per_frame,
             layout.any_priority,
         )
-    if message is None or layout.counter.signal not in message.signal_bits:
+    if message is None or (layout.counter is not None and layout.counter.signal not in message.signal_bits):
         return None
     return FrameFacts(
         message.frame_id,
         message.extended,
         message.length,
-        message.signal_bits[layout.counter.signal],
+        None if layout.counter is None else message.signal_bits[layout.counter.signal],
         counts_samples,
         layout.samples_per_frame,
         message.any_priority,
@@ -113,10 +113,9 @@ def check_plain_layout(layout: PlainLayout, at: KeyPath) -> Iterator[Finding]:
             "cannot be with an id of 11 bits: it has no priority to leave out",
             "write extended = true, since all ids of SAE J1939 have 29 bits; else leave any_priority out",
         )
-    fields = [
-        ("counter", "the counter", layout.counter.byte, layout.counter.end_byte),
-        ("first_byte", "the samples", layout.first_byte, layout.samples_end_byte),
-    ]
+    fields = [("first_byte", "the samples", layout.first_byte, layout.samples_end_byte)]
+    if layout.counter is not None:
+        fields.append(("counter", "the counter", layout.counter.byte, layout.counter.end_byte))
     if layout.crc_byte is not None:
         fields.append(("crc_byte", "the CRC", layout.crc_byte, layout.crc_byte + CRC_BYTES))
     fields.sort(key=lambda field: field[2])
@@ -158,7 +157,7 @@ def check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
         yield from _check_valid_raw(layout.channels, (*at, "channels"))
     if not isinstance(layout, DbcLayout):
         return
-    taken: dict[str, str] = {layout.counter.signal: "the counter"}
+    taken = {} if layout.counter is None else {layout.counter.signal: "the counter"}
     for index, channel in enumerate(layout.channels):
         path = (*at, "channels", index, "signals")
         if len(channel.signals) != layout.samples_per_frame:
@@ -253,9 +252,11 @@ def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> It
 
 
 def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> Iterator[Finding]:
-    """The counter is wide enough to tell how much is missing after a gap."""
-    facts = frame_facts(stream, message)
-    if facts is None:
+    """There is a counter, unless the file denies it, and it tells how much is missing after a gap."""
+    layout, facts = stream.layout, frame_facts(stream, message)
+    if isinstance(layout, PlainLayout | DbcLayout):
+        yield from _check_counted(layout, (*at, "layout"))
+    if facts is None or facts.counter_bits is None:
         return
     per_count = 1 if facts.counts_samples else facts.samples_per_frame
     wrap_s = 2**facts.counter_bits * per_count / stream.rate_hz
@@ -266,6 +267,23 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
             f"{stream.rate_hz:g} Hz: the loss in a longer gap is estimated from the host clock",
             'have the device send a wider counter, or count "frames"',
             fatal=False,
+        )
+
+
+def _check_counted(layout: PlainLayout | DbcLayout, at: KeyPath) -> Iterator[Finding]:
+    """Whoever goes without a counter says so."""
+    if layout.counter is None and not layout.no_counter:
+        yield Finding(
+            (*at, "counter"),
+            "is missing: it tells what was lost, and what the time of a sample is",
+            "say where the device's counter lies; if it sends none, write no_counter = true, and loss is "
+            "estimated from the times of arrival",
+        )
+    elif layout.counter is not None and layout.no_counter:
+        yield Finding(
+            (*at, "no_counter"),
+            "contradicts counter",
+            "leave it out if the device counts, else remove counter",
         )
 
 

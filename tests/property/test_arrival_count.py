@@ -1,0 +1,116 @@
+"""Streams whose frames carry no counter: placed, and their loss told, by the times of arrival."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from machine_files import MACHINES, changed, only_problem
+
+from daqsvc.acquisition.arrival_count import COUNTER_BITS, ArrivalCount
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.assembly_drivers import frame_layout
+from daqsvc.settings import describe, load_machine_file, parse_machine_file
+from drivers.dbc import layout_from_dbc
+
+PERIOD_NS = 10_000_000
+SENSOR = MACHINES / "j1939-pgn61485.toml"
+TRIAXIAL = MACHINES / "dbc-triaxial.toml"
+
+
+@given(
+    drift=st.floats(-5e-3, 5e-3),
+    gaps=st.lists(st.tuples(st.integers(1, 60), st.integers(1, 20)), max_size=30),
+    seed=st.integers(0, 2**32 - 1),
+    batch=st.integers(1, 40),
+)
+def test_loss_is_exact_while_no_frame_is_later_than_half_a_period(drift, gaps, seed, batch) -> None:
+    rng = np.random.default_rng(seed)
+    lost = np.concatenate([[0] * 40, *([0] * whole + [missing] for whole, missing in gaps), [0] * 5])
+    sent = np.cumsum(lost + 1) - 1
+    late_ns = rng.uniform(0, 0.5 * PERIOD_NS, len(sent))
+    arrival_ns = (sent * PERIOD_NS * (1 + drift) + late_ns).astype(np.int64)
+    counter = ArrivalCount(PERIOD_NS)
+    counts = np.concatenate(
+        [counter.count(part) for part in np.split(arrival_ns, range(batch, len(sent), batch))]
+    )
+    assert (counts - counts[0]).tolist() == (sent - sent[0]).tolist()
+
+
+def test_a_device_that_is_a_little_slow_loses_nothing_over_the_hours() -> None:
+    arrival_ns = (np.arange(300_000) * PERIOD_NS * 1.004).astype(np.int64)
+    assert ArrivalCount(PERIOD_NS).count(arrival_ns)[-1] == 299_999
+
+
+def test_frames_that_come_all_at_once_are_a_frame_each() -> None:
+    arrival_ns = np.array([0, 1, 1, 1, 1]) * PERIOD_NS
+    assert (np.diff(ArrivalCount(PERIOD_NS).count(arrival_ns)) >= 1).all()
+
+
+def test_counts_wrap_as_a_counter_of_32_bits_does() -> None:
+    counter = ArrivalCount(PERIOD_NS)
+    counter.count(np.array([0]))
+    assert counter.count(np.array([2**COUNTER_BITS * PERIOD_NS])).tolist() == [0]
+
+
+def test_what_the_assembler_makes_of_them_is_whole_and_says_that_loss_is_estimated() -> None:
+    blocks: list[SampleBlock] = []
+    stream = StreamAssembler(
+        "foot", 100.0, counter_bits=None, samples_per_frame=1, counts_per_frame=1, deliver=blocks.append
+    )
+    sent = np.delete(np.arange(1000), [*range(400, 407), 700])
+    samples = sent.astype(np.float32)[:, None, None]
+    for part in np.array_split(np.arange(len(sent)), 60):
+        intact = np.isin(sent[part], [800], invert=True)
+        stream.accept(np.zeros(len(part), np.int64), samples[part], intact, sent[part] * PERIOD_NS + 10**9)
+        stream.tick(int(sent[part[-1]]) * PERIOD_NS + 10**9)
+    stream.flush()
+    counters = stream.counters
+    assert (counters.samples_received, counters.samples_lost) == (991, 9)
+    assert (counters.frames_corrupt, counters.frames_duplicate, counters.gaps) == (1, 0, 3)
+    first = blocks[0].first_index
+    for block in blocks:
+        assert block.samples[:, 0].tolist() == list(range(block.first_index - first, block.end_index - first))
+        assert bool(block.quality & Quality.LOSS_ESTIMATED) == bool(block.lost_before)
+    last = blocks[-1]
+    assert last.t_first_ns == pytest.approx(10**9 + (last.first_index - first) * PERIOD_NS, abs=1000)
+
+
+def test_the_standard_acceleration_message_of_j1939_is_read_without_a_counter() -> None:
+    machine = load_machine_file(SENSOR)
+    layout = frame_layout(machine, "foot")
+    assert (layout.counter, layout.counter_bits, layout.counts_per_frame) == (None, None, 1)
+    payload = np.array([[0x00, 0x7D, 0x01, 0x7D, 0xFF, 0xFF, 0xFF, 0xFF]], np.uint8)
+    lateral, longitudinal, vertical = layout.decode(payload).samples[0, 0].tolist()
+    assert (lateral, longitudinal) == (
+        0.0,
+        pytest.approx(0.01, abs=1e-6),
+    )  # 0x7d00 is 320 m/s2 above the offset
+    assert np.isnan(vertical)
+    sent = layout.encode(np.array([5]), np.array([[[0.0, 0.01, np.nan]]]))
+    assert sent[0, :6].tobytes() == payload[0, :6].tobytes()
+    assert "none: by time" in describe(machine)
+
+
+def test_a_message_of_a_data_base_may_have_no_counter_either() -> None:
+    text, _ = changed(TRIAXIAL, ("counter = {", "no_counter = true # {"))
+    machine = parse_machine_file(text, TRIAXIAL)
+    (stream,) = machine.streams
+    assert frame_layout(machine, stream).counter is None
+    given = machine.streams[stream].layout
+    channels = {channel.name: channel.signals for channel in given.channels}
+    read = layout_from_dbc(
+        machine.resolve(given.dbc), given.message, counter=None, counts="frames", channels=channels
+    )
+    assert read.counter_bits is None
+
+
+def test_whoever_goes_without_a_counter_says_so() -> None:
+    problem, _ = only_problem(SENSOR, ("no_counter = true\n", ""))
+    assert problem.key == "streams.foot.layout.counter"
+    assert "no_counter = true" in problem.remedy
+    both = 'no_counter = true\ncounter = { byte = 7, bits = 8, counts = "frames" }'
+    problem, _ = only_problem(SENSOR, ("no_counter = true", both))
+    assert problem.key == "streams.foot.layout.no_counter"
