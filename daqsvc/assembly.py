@@ -8,21 +8,24 @@ from daqsvc.assembly_drivers import AssemblyError
 from daqsvc.assembly_rotor import healthy_rotor, rotor_bank, rotor_synchronous
 from daqsvc.diagnosis.level_statements import Limits
 from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
+from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 from daqsvc.rotor.calibration.file import CalibrationFileError
 from daqsvc.settings.models import (
     Accelerometer,
     ProximityProbe,
     SetpointAlarm,
+    TrendValue,
     VelocitySensor,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.settings.models import MachineFile, RotorSynchronous, Sensor
+    from daqsvc.settings.models import Levels, MachineFile, RotorSynchronous, Sensor
 
 __all__ = ["AssemblyError", "check_calibrations", "detectors"]
 
@@ -40,22 +43,7 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
     made: list[Detector] = []
     if machine.pipeline.levels is not None:
         for stream in machine.streams:
-            channels = [
-                LevelChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), _gap_check(s))
-                for s in machine.sensors
-                if s.stream == stream and isinstance(s, ProximityProbe | Accelerometer | VelocitySensor)
-            ]
-            if channels:
-                made.append(
-                    LevelDetector(
-                        machine.machine.name,
-                        stream,
-                        machine.streams[stream].rate_hz,
-                        channels,
-                        window_s=machine.pipeline.levels.window_s,
-                        velocity_band_hz=machine.pipeline.levels.velocity_band_hz,
-                    )
-                )
+            made += _levels(machine, machine.pipeline.levels, stream)
     if machine.pipeline.rotor_bank is not None:
         made.append(rotor_bank(machine, machine.pipeline.rotor_bank))
     if machine.pipeline.rotor_synchronous is not None:
@@ -64,6 +52,33 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
     if machine.pipeline.bearing is not None:
         made.append(_bearing(machine, store))
     return made
+
+
+def _levels(machine: MachineFile, given: Levels, stream: str) -> Iterator[Detector]:
+    """What measures the levels of waveforms, and what takes levels as the device has measured them."""
+    sensors = [sensor for sensor in machine.sensors if sensor.stream == stream]
+    name, rate_hz = machine.machine.name, machine.streams[stream].rate_hz
+    channels = [
+        LevelChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), _gap_check(s))
+        for s in sensors
+        if isinstance(s, ProximityProbe | Accelerometer | VelocitySensor)
+    ]
+    if channels:
+        yield LevelDetector(
+            name,
+            stream,
+            rate_hz,
+            channels,
+            window_s=given.window_s,
+            velocity_band_hz=given.velocity_band_hz,
+        )
+    trends = [
+        TrendChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), s.ok_between)
+        for s in sensors
+        if isinstance(s, TrendValue)
+    ]
+    if trends:
+        yield TrendDetector(name, stream, rate_hz, trends, window_s=given.window_s)
 
 
 def _bearing(machine: MachineFile, store: Path | None) -> Detector:
@@ -77,7 +92,7 @@ def _bearing(machine: MachineFile, store: Path | None) -> Detector:
 
 def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
     return [
-        Limits(alarm.measure, alarm.alert, alarm.danger)
+        Limits(alarm.measure, alarm.alert, alarm.danger, alarm.alert_low, alarm.danger_low)
         for alarm in machine.alarms
         if isinstance(alarm, SetpointAlarm) and sensor in alarm.watched
     ]

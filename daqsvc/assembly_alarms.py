@@ -63,7 +63,13 @@ def alarm_handling(machine: MachineFile) -> AlarmHandling:
 
 def _setpoint_rule(alarm: SetpointAlarm) -> LevelRule | VotingRule:
     setpoint = Setpoint(
-        alarm.alert, alarm.danger, alarm.deadband, _ns(alarm.on_delay_s), _ns(alarm.off_delay_s)
+        alarm.alert,
+        alarm.danger,
+        alarm.deadband,
+        _ns(alarm.on_delay_s),
+        _ns(alarm.off_delay_s),
+        alarm.alert_low,
+        alarm.danger_low,
     )
     if isinstance(alarm, LevelAlarm):
         return LevelRule(

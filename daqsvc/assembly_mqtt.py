@@ -12,7 +12,14 @@ from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.self_check import conditions
 from daqsvc.settings.broker_url import host_of, is_tls, port_of
-from daqsvc.settings.models import BEARING, ROTOR_BANK, ROTOR_SYNCHRONOUS, Keyphasor, ProximityProbe
+from daqsvc.settings.models import (
+    BEARING,
+    ROTOR_BANK,
+    ROTOR_SYNCHRONOUS,
+    Keyphasor,
+    ProximityProbe,
+    TrendValue,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -144,6 +151,9 @@ def _measured(machine: MachineFile) -> Iterator[Sensor]:
 
 def _levels(sensor: Sensor) -> Iterator[Reading]:
     detector = f"levels/{sensor.name}"
+    if isinstance(sensor, TrendValue):
+        yield Reading(detector, "statistics", "value", sensor.unit)
+        return
     yield Reading(detector, "statistics", "rms", sensor.unit)
     yield Reading(detector, "statistics", "peak", sensor.unit)
     if isinstance(sensor, ProximityProbe):

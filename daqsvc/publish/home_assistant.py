@@ -24,14 +24,26 @@ if TYPE_CHECKING:
 STALE_S = 120
 """A figure that has not been told for so long is shown as unavailable."""
 
-_UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°"}
+_UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F"}
 """Units as Home Assistant writes them, where that differs."""
 
-_CLASSES = {"mm/s": "speed", "V": "voltage"}
+_CLASSES = {"mm/s": "speed", "V": "voltage", "degC": "temperature", "degF": "temperature"}
 """Device classes of Home Assistant that know the unit; it has none for micrometres or g."""
 
 
-_DIGITS = {"um": 1, "mil": 2, "mm": 4, "g": 3, "m/s2": 2, "mm/s": 2, "V": 2, "rpm": 1, "deg": 1}
+_DIGITS = {
+    "um": 1,
+    "mil": 2,
+    "mm": 4,
+    "g": 3,
+    "m/s2": 2,
+    "mm/s": 2,
+    "V": 2,
+    "rpm": 1,
+    "deg": 1,
+    "degC": 1,
+    "degF": 1,
+}
 """Decimal places by unit, so that the levels of a smooth machine still show two figures or so."""
 
 _DIGITS_OF_A_NUMBER = 3

@@ -5,18 +5,19 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.alarms import DiagnosisAlarm, LevelAlarm, SetpointAlarm, VotingAlarm
+from daqsvc.settings.alarms import DiagnosisAlarm, SetpointAlarm, VotingAlarm
 from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
 from daqsvc.settings.rotor_checks import check_alarm_detector
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.setpoint_checks import setpoint_checks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daqsvc.settings.alarms import StartUp
-    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import KeyPath
 
 _TAKEN = ("alarm-flood", "trip-multiply")
@@ -37,10 +38,7 @@ def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
             at: KeyPath = ("alarms", index)
             yield _name(alarm.name, at)
             if isinstance(alarm, SetpointAlarm):
-                yield _setpoints(alarm, at)
-                yield _alarm_sensors(draft, alarm, at)
-                yield _alarm_levels(draft, alarm, at)
-                yield _trip_multiply(draft, alarm, at)
+                yield from setpoint_checks(draft, alarm, at)
             if isinstance(alarm, VotingAlarm):
                 yield _vote(draft, alarm, at)
             if isinstance(alarm, DiagnosisAlarm):
@@ -57,67 +55,6 @@ def _name(name: str, at: KeyPath) -> Iterator[Finding]:
         )
 
 
-def _setpoints(alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
-    setpoints = [level for level in (alarm.alert, alarm.danger) if level is not None]
-    if not setpoints:
-        yield Finding(at, "has neither alert nor danger", "add alert, danger or both")
-        return
-    if alarm.alert is not None and alarm.danger is not None and alarm.alert >= alarm.danger:
-        yield Finding(
-            (*at, "alert"),
-            f"must be below danger = {alarm.danger:g}",
-            "correct one of the two"
-            if alarm.alert == alarm.danger
-            else "swap the two, or correct one of them",
-        )
-    if alarm.deadband >= min(setpoints):
-        yield Finding(
-            (*at, "deadband"),
-            f"must be smaller than the setpoint {min(setpoints):g}, or the alarm never returns",
-            f"write e.g. deadband = {min(setpoints) / 20:.3g}",
-        )
-
-
-def _alarm_sensors(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
-    one = isinstance(alarm, LevelAlarm)
-    for position, name in enumerate(alarm.watched):
-        here = (*at, "sensor") if one else (*at, "sensors", position)
-        yield from _alarm_sensor(draft, alarm, name, here, at)
-
-
-def _alarm_sensor(
-    draft: MachineFile, alarm: SetpointAlarm, name: str, here: KeyPath, at: KeyPath
-) -> Iterator[Finding]:
-    sensors = _named(draft)
-    if name not in sensors:
-        yield Finding(here, "there is no such sensor", choice(name, sensors))
-        return
-    sensor = sensors[name]
-    if sensor.type == "keyphasor":
-        vibration = [other for other, described in sensors.items() if described.type != "keyphasor"]
-        yield Finding(here, "is a keyphasor, which measures no vibration", choice(name, vibration))
-    elif sensor.type == "proximity" and alarm.measure == "velocity_rms":
-        yield Finding(
-            (*at, "measure"),
-            f'needs an accelerometer or a velocity sensor, but "{name}" is a proximity probe',
-            'write measure = "rms" or "peak", with setpoints in ' + sensor.unit,
-        )
-
-
-def _alarm_levels(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
-    with suppress(UnusableValueError):
-        if not set(alarm.watched) <= set(_named(draft)):
-            return  # said already, about the same key
-    if draft.pipeline.levels is None:
-        yield Finding(
-            (*at, "sensor" if isinstance(alarm, LevelAlarm) else "sensors"),
-            "nothing measures its level"
-            if isinstance(alarm, LevelAlarm)
-            else "nothing measures their levels",
-            "write a table [pipeline.levels] (it may be empty), or remove the alarm",
-        )
-
-
 def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Finding]:
     count = len(alarm.sensors)
     if alarm.vote > count:
@@ -129,7 +66,7 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
     for position, name in enumerate(alarm.sensors):
         if name in alarm.sensors[:position]:
             yield Finding((*at, "sensors", position), "votes twice", "name each sensor once")
-    if alarm.measure in {"velocity_rms", "crest_factor"}:
+    if alarm.measure in {"velocity_rms", "crest_factor", "gap_voltage"}:
         return
     units = {s.unit for s in draft.sensors if s.name in alarm.sensors and s.type != "keyphasor"}
     if len(units) > 1:
@@ -137,15 +74,6 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
             (*at, "sensors"),
             f"one setpoint for sensors in {' and '.join(sorted(units))}",
             "let only sensors of one unit vote together",
-        )
-
-
-def _trip_multiply(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator[Finding]:
-    if alarm.trip_multiply > 1 and draft.alarm_handling.start_up is None:
-        yield Finding(
-            (*at, "trip_multiply"),
-            "never holds: nothing says when the machine starts up",
-            "write a table [alarm_handling.start_up], or remove it",
         )
 
 
@@ -165,30 +93,29 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
 
 
 def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
-    speaking = [name for name in draft.detectors if name in _START_UP_SIGNALS]
-    if not speaking:
+    signals = {name: _START_UP_SIGNALS[name] for name in draft.detectors if name in _START_UP_SIGNALS}
+    if draft.pipeline.levels is not None:
+        trends = (sensor.name for sensor in draft.sensors if sensor.type == "trend")
+        signals |= {f"levels/{name}": ("value",) for name in trends}
+    if not signals:
         yield Finding(
             (*_START_UP, "detector"),
             "no detector of this machine states a speed",
-            "write a table [pipeline.rotor_bank] or [pipeline.rotor_synchronous], or remove "
-            "[alarm_handling.start_up] and every trip_multiply",
+            "write a table [pipeline.rotor_bank] or [pipeline.rotor_synchronous], take a trend value that is "
+            "the speed, or remove [alarm_handling.start_up] and every trip_multiply",
         )
-    elif start_up.detector not in speaking:
+    elif start_up.detector not in signals:
         there = start_up.detector in draft.detectors or start_up.detector.startswith("levels/")
         yield Finding(
             (*_START_UP, "detector"),
             "states no speed while the machine starts up"
             if there
             else "there is no such detector in [pipeline]",
-            choice(start_up.detector, speaking),
+            choice(start_up.detector, list(signals)),
         )
-    elif start_up.measure not in _START_UP_SIGNALS[start_up.detector]:
+    elif start_up.measure not in signals[start_up.detector]:
         yield Finding(
             (*_START_UP, "measure"),
             f"is nothing that {start_up.detector} states while the machine starts up",
-            choice(start_up.measure, _START_UP_SIGNALS[start_up.detector]),
+            choice(start_up.measure, signals[start_up.detector]),
         )
-
-
-def _named(draft: MachineFile) -> dict[str, Sensor]:
-    return {sensor.name: sensor for sensor in draft.sensors}

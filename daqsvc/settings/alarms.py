@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
 
-Measure = Literal["rms", "peak", "crest_factor", "velocity_rms"]
+Measure = Literal["rms", "peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
 
 
 class BaseAlarm(Section):
@@ -23,14 +23,27 @@ class Setpoints(BaseAlarm):
     """Setpoints on a measure, in its unit (velocity RMS in mm/s)."""
 
     measure: Annotated[Measure, Field(description="what is held against the setpoints", examples=["rms"])]
-    alert: Positive | None = Field(default=None, description="first setpoint")
-    danger: Positive | None = Field(default=None, description="second setpoint")
-    deadband: NotNegative = Field(default=0.0, description="how far below a setpoint it returns")
-    on_delay_s: NotNegative = Field(default=0.0, description="how long above before it is raised")
-    off_delay_s: NotNegative = Field(default=0.0, description="how long below before it returns")
+    alert: float | None = Field(default=None, description="first setpoint")
+    danger: float | None = Field(default=None, description="second setpoint")
+    alert_low: float | None = Field(default=None, description="first lower setpoint, of what can be too low")
+    danger_low: float | None = Field(default=None, description="second lower setpoint")
+    deadband: NotNegative = Field(default=0.0, description="how far from a setpoint it returns")
+    on_delay_s: NotNegative = Field(default=0.0, description="how long beyond it before it is raised")
+    off_delay_s: NotNegative = Field(default=0.0, description="how long clear of it before it returns")
     trip_multiply: Annotated[
-        float, Field(ge=1, le=10, description="factor on the setpoints while the machine starts up")
+        float, Field(ge=1, le=10, description="factor on alert and danger while the machine starts up")
     ] = 1.0
+
+    @property
+    def setpoints(self) -> dict[str, float]:
+        """Those that it has, by key, from the lowest to the highest if they are in order."""
+        upwards = {
+            "danger_low": self.danger_low,
+            "alert_low": self.alert_low,
+            "alert": self.alert,
+            "danger": self.danger,
+        }
+        return {key: value for key, value in upwards.items() if value is not None}
 
 
 class LevelAlarm(Setpoints):

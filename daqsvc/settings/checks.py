@@ -7,7 +7,6 @@ where it asks for a value that is not (`UnusableValueError`): one mistake never 
 from __future__ import annotations
 
 import ipaddress
-import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -31,6 +30,7 @@ from daqsvc.settings.layout_checks import (
     check_voltages,
     unique,
 )
+from daqsvc.settings.modbus import RegistersLayout
 from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.record_checks import check_recorded_buses
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 _RING_WINDOWS = 2
 _LEAST_WINDOW_SAMPLES = 16
+_WAVEFORMS = ("proximity", "accelerometer", "velocity")
+"""Types of sensors whose levels are measured here, window by window."""
 
 
 def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Finding]:
@@ -136,12 +138,15 @@ def _window(draft: MachineFile) -> Iterator[Finding]:
         return
     window_s = pipeline.levels.window_s
     at = ("pipeline", "levels", "window_s")
-    slowest_hz = min((stream.rate_hz for stream in draft.streams.values()), default=math.inf)
-    if window_s * slowest_hz < _LEAST_WINDOW_SAMPLES:
+    waveforms = {sensor.stream for sensor in draft.sensors if sensor.type in _WAVEFORMS}
+    slow = [(draft.streams[name].rate_hz, name) for name in waveforms if name in draft.streams]
+    if slow and window_s * min(slow)[0] < _LEAST_WINDOW_SAMPLES:
+        slowest_hz, name = min(slow)
+        remedy = f"write window_s = {_LEAST_WINDOW_SAMPLES / slowest_hz:.3g} or more"
         yield Finding(
             at,
             f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
-            f"write window_s = {_LEAST_WINDOW_SAMPLES / slowest_hz:.3g} or more",
+            remedy + _if_no_waveform(draft, name),
         )
     if pipeline.ring_s < _RING_WINDOWS * window_s:
         yield Finding(
@@ -152,24 +157,42 @@ def _window(draft: MachineFile) -> Iterator[Finding]:
 
 
 def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
-    if draft.pipeline.levels is None:
+    levels = draft.pipeline.levels
+    if levels is None:
         return
-    low_hz, high_hz = draft.pipeline.levels.velocity_band_hz
-    for sensor in draft.sensors:
+    at = ("pipeline", "levels", "velocity_band_hz")
+    low_hz, high_hz = levels.velocity_band_hz
+    casing = [sensor for sensor in draft.sensors if sensor.type in {"accelerometer", "velocity"}]
+    if not casing and "velocity_band_hz" in levels.model_fields_set:
+        yield Finding(
+            at,
+            "has no effect: no accelerometer or velocity sensor sends a waveform, and a trend value has the "
+            "band of its device",
+            "remove it",
+            fatal=False,
+        )
+    for sensor in casing:
         rate_hz = _rate_hz(draft, sensor)
-        if sensor.type not in {"accelerometer", "velocity"} or rate_hz is None:
-            continue
-        if high_hz >= rate_hz / 2:
+        if rate_hz is not None and high_hz >= rate_hz / 2:
             usable_hz = 0.4 * rate_hz
-            yield Finding(
-                ("pipeline", "levels", "velocity_band_hz"),
-                f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
-                f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
+            remedy = (
                 f"write velocity_band_hz = [{low_hz:.1f}, {usable_hz:.1f}]"
                 if usable_hz > low_hz
-                else "sample faster, or write a lower band",
+                else "sample faster, or write a lower band"
+            )
+            yield Finding(
+                at,
+                f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
+                f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
+                remedy + _if_no_waveform(draft, sensor.stream),
             )
             return
+
+
+def _if_no_waveform(draft: MachineFile, stream: str) -> str:
+    """What else to do about a stream that is too slow for waveforms, if its registers are polled."""
+    polled = isinstance(draft.streams[stream].layout, RegistersLayout)
+    return ', or type = "trend" for sensors whose level the device measures itself' if polled else ""
 
 
 def _transport(mqtt: Mqtt) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ from daqsvc.settings.bearing import BEARING
 from daqsvc.settings.buses import CanBus, DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.layout_checks import bus_share, frame_facts
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
-from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, VelocitySensor
+from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue, VelocitySensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from daqsvc.settings.bearing import Bearing, WatchedBearing
     from daqsvc.settings.buses import Stream
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
-    from daqsvc.settings.pipeline import Mode, RotorBank
+    from daqsvc.settings.pipeline import Levels, Mode, RotorBank
     from daqsvc.settings.rotor import RotorSynchronous
 
 COLUMNS = 100
@@ -98,7 +98,9 @@ def _bus(machine: MachineFile, name: str) -> str:
         load = _percent(sum(least for least, _ in known), sum(most for _, most in known))
         parts.append(f"load about {load} of the bus")
     if bus.record is not None:
-        parts.append(f"recorded as {bus.record.format} in {bus.record.folder}, {bus.record.keep_mb} MB at most")
+        parts.append(
+            f"recorded as {bus.record.format} in {bus.record.folder}, {bus.record.keep_mb} MB at most"
+        )
     return f"{', '.join(parts)}; if absent at start: {bus.start}"
 
 
@@ -156,6 +158,8 @@ def _sensor_details(sensor: Sensor) -> Iterator[str]:
         yield f"at {sensor.angle_deg:g} deg"
     if isinstance(sensor, Keyphasor):
         yield f"{sensor.edge} at {sensor.threshold_v:g} V, hysteresis {sensor.hysteresis_v:g} V"
+    if isinstance(sensor, TrendValue) and sensor.ok_between is not None:
+        yield f"OK {sensor.ok_between[0]:g} to {sensor.ok_between[1]:g} {sensor.unit}"
 
 
 def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
@@ -168,15 +172,7 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
         yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
     if pipeline.levels is not None:
-        vibration = [sensor.name for sensor in machine.sensors if not isinstance(sensor, Keyphasor)]
-        text = f"RMS, peak and crest factor over {pipeline.levels.window_s:g} s of {', '.join(vibration)}"
-        velocity = [
-            sensor.name for sensor in machine.sensors if isinstance(sensor, Accelerometer | VelocitySensor)
-        ]
-        if velocity:
-            low_hz, high_hz = pipeline.levels.velocity_band_hz
-            text += f"; velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(velocity)}"
-        yield "levels", text
+        yield "levels", _levels(machine, pipeline.levels)
     bank = pipeline.rotor_bank
     if bank is not None:
         text = (
@@ -191,6 +187,21 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         yield ROTOR_SYNCHRONOUS, _synchronous(machine, pipeline.rotor_synchronous)
     if pipeline.bearing is not None:
         yield BEARING, _bearing(pipeline.bearing)
+
+
+def _levels(machine: MachineFile, given: Levels) -> str:
+    casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
+    waveforms = [s.name for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
+    trends = [s.name for s in machine.sensors if isinstance(s, TrendValue)]
+    parts: list[str] = []
+    if waveforms:
+        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(waveforms)}")
+    if casing:
+        low_hz, high_hz = given.velocity_band_hz
+        parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
+    if trends:
+        parts.append(f"{', '.join(trends)} as they come, at most one value in {given.window_s:g} s")
+    return "; ".join(parts)
 
 
 def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
@@ -270,7 +281,7 @@ def _mode(mode: Mode) -> str:
     return f"{mode.name} ({differs}: {mode.severity})"
 
 
-_ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband", "delay")
+_ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband and delays")
 
 
 def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
@@ -278,23 +289,30 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
         latching = "; latching" if alarm.latching else ""
         if not isinstance(alarm, SetpointAlarm):
             evidence = f"{alarm.evidence_nats:g} nats at least" if alarm.evidence_nats else "none"
-            yield alarm.name, alarm.detector, "by mode", "by mode", "", f"{evidence}{latching}"
+            yield alarm.name, alarm.detector, "by mode", "by mode", f"{evidence}{latching}"
             continue
-        unit = {"velocity_rms": "mm/s", "crest_factor": ""}.get(
+        unit = {"velocity_rms": "mm/s", "crest_factor": "", "gap_voltage": "V"}.get(
             alarm.measure, machine.sensor(alarm.watched[0]).unit
         )
         watched = (
             alarm.sensor if isinstance(alarm, LevelAlarm) else f"{alarm.vote} of {', '.join(alarm.sensors)}"
         )
+        deadband = f"{alarm.deadband:g} {unit}".rstrip()
         multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
             alarm.name,
             f"{alarm.measure} of {watched}",
-            "-" if alarm.alert is None else f"{alarm.alert:g} {unit}".rstrip(),
-            "-" if alarm.danger is None else f"{alarm.danger:g} {unit}".rstrip(),
-            f"{alarm.deadband:g} {unit}".rstrip(),
-            f"on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",
+            _limits(alarm.alert_low, alarm.alert, unit),
+            _limits(alarm.danger_low, alarm.danger, unit),
+            f"{deadband}, on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",
         )
+
+
+def _limits(low: float | None, high: float | None, unit: str) -> str:
+    """Where a level begins: at and above ``high``, at and below ``low``, or at both ends of a window."""
+    if low is None:
+        return "-" if high is None else f"{high:g} {unit}".rstrip()
+    return f"<= {low:g} {unit}" if high is None else f"{low:g}..{high:g} {unit}"
 
 
 def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:

@@ -36,7 +36,14 @@ from daqsvc.settings.packing import Channel, Counter
 from daqsvc.settings.pipeline import ROTOR_BANK, Levels, Mode, Pipeline, RotorBank
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS, RotorSynchronous
 from daqsvc.settings.section import AngleDeg, DampingRatio, Name, Positive, Section
-from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, Sensor, VelocitySensor
+from daqsvc.settings.sensors import (
+    Accelerometer,
+    Keyphasor,
+    ProximityProbe,
+    Sensor,
+    TrendValue,
+    VelocitySensor,
+)
 from daqsvc.settings.store import Store
 
 if TYPE_CHECKING:
@@ -81,6 +88,7 @@ __all__ = [
     "SetpointAlarm",
     "Store",
     "Stream",
+    "TrendValue",
     "VelocitySensor",
     "VotingAlarm",
     "WatchedBearing",

@@ -24,18 +24,28 @@ def _not_zero(sensitivity_mv_per_unit: float) -> float:
     return sensitivity_mv_per_unit
 
 
-def _ordered_gap(limits_v: tuple[float, float]) -> tuple[float, float]:
-    if limits_v[0] >= limits_v[1]:
+def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] >= limits[1]:
         raise PydanticCustomError(
-            "gap_order",
-            "the lower limit of the gap voltage must come first",
+            "limit_order",
+            "the lower limit must come first",
             {
-                "remedy": f"write [{min(limits_v)}, {max(limits_v)}]"
-                if limits_v[0] > limits_v[1]
+                "remedy": f"write [{min(limits)}, {max(limits)}]"
+                if limits[0] > limits[1]
                 else "write two different limits, e.g. [-18.0, -2.0]"
             },
         )
-    return limits_v
+    return limits
+
+
+def _printable(unit: str) -> str:
+    if not unit.isprintable() or unit != unit.strip():
+        raise PydanticCustomError(
+            "unit_text",
+            "is no unit: it holds spaces at an end, or what cannot be printed",
+            {"remedy": 'write e.g. unit = "degC"'},
+        )
+    return unit
 
 
 class BaseSensor(Section):
@@ -69,7 +79,7 @@ class ProximityProbe(BaseSensor):
     unit: Annotated[Literal["um", "mm", "mil"], Field(description="unit of the position", examples=["um"])]
     gap_ok_v: Annotated[
         tuple[float, float],
-        AfterValidator(_ordered_gap),
+        AfterValidator(_ordered),
         Field(
             strict=False,
             description="OK limits of the mean gap voltage, in V",
@@ -113,11 +123,29 @@ class Keyphasor(BaseSensor):
     edge: Literal["rising", "falling"] = Field(default="rising", description="the edge that marks angle zero")
 
 
+class TrendValue(BaseSensor):
+    """A level that the device has measured itself, e.g. an RMS velocity, a temperature, a gap voltage."""
+
+    kind: ClassVar[str] = "a trend value"
+
+    type: Literal["trend"]
+    unit: Annotated[
+        str,
+        AfterValidator(_printable),
+        Field(min_length=1, max_length=16, description="unit of the value", examples=["mm/s"]),
+    ]
+    ok_between: Annotated[tuple[float, float], AfterValidator(_ordered), Field(strict=False)] | None = Field(
+        default=None,
+        description="OK limits, in its unit: beyond them the sensor is not believed",
+        examples=["[-40.0, 125.0]"],
+    )
+
+
 class _UntypedSensor(BaseSensor, extra="ignore"):
     """Stands for a sensor whose type is missing or unknown: the keys that depend on it go unchecked."""
 
     type: Annotated[
-        Literal["proximity", "accelerometer", "velocity", "keyphasor"],
+        Literal["proximity", "accelerometer", "velocity", "keyphasor", "trend"],
         Field(description="what kind of sensor it is", examples=["proximity"]),
     ]
     unit: Annotated[str, Field(description="unit of the samples", examples=["um"])]
@@ -128,6 +156,7 @@ _KINDS: dict[str, type[BaseSensor]] = {
     "accelerometer": Accelerometer,
     "velocity": VelocitySensor,
     "keyphasor": Keyphasor,
+    "trend": TrendValue,
 }
 
 
@@ -137,5 +166,6 @@ def _kind_of(table: Mapping[str, Any]) -> type[Section]:
 
 
 Sensor: TypeAlias = Annotated[
-    ProximityProbe | Accelerometer | VelocitySensor | Keyphasor, Kinds(_kind_of, tuple(_KINDS.values()))
+    ProximityProbe | Accelerometer | VelocitySensor | Keyphasor | TrendValue,
+    Kinds(_kind_of, tuple(_KINDS.values())),
 ]

@@ -52,7 +52,7 @@ ONE_VALUE = [
         'type = "proximty"',
         "sensors[0].type",
         '"proximty"',
-        '"velocity" or "keyphasor"',
+        '"keyphasor" or "trend"',
         'did you mean "proximity"',
     ),
     ('unit = "um"', 'unit = "g"', "sensors[0].unit", '"g"', '"um", "mm" or "mil"', 'unit = "um"'),
