@@ -124,7 +124,8 @@ class ReplayDriver:
             before = self._frames
             reason = await self._play(recording)
             played = self._frames > before
-            if reason == END_OF_FILE and self._at_end == "stop":
+            # One that breaks off, as after a power failure, ends there: tried again it would be played twice.
+            if self._at_end == "stop":
                 self.link.end(reason)
                 return None
             if reason != END_OF_FILE or not played:

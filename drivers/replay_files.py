@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import re
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -21,6 +22,7 @@ from can.io.generic import BinaryIOMessageReader, TextIOMessageReader
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.can_batches import Sorted, StreamFrames
+from drivers.can_errors import BUS_ERROR
 from drivers.frames import Decoded
 
 if TYPE_CHECKING:
@@ -118,6 +120,7 @@ class CanLog:
             ) from error
         self._messages: Iterator[can.Message] = iter(self._reader)
         self._ahead: can.Message | None = None
+        self._damage: RecordingError | None = None
 
     def _open(self) -> MessageReader:
         # Given only a path, python-can leaves a file open that it cannot make sense of.
@@ -128,14 +131,20 @@ class CanLog:
         mode: Literal["rt", "rb"] = "rt" if issubclass(reader, TextIOMessageReader) else "rb"
         opened = gzip.open(self._path, mode) if zipped else self._path.open(mode)  # noqa: SIM115 - by `_files`
         file: Any = self._files.enter_context(opened)
+        if reader is CanutilsLogReader:
+            file = _Candump(file)
         return reader(file)
 
     def read(self, span_ns: int) -> Sorted | None:
         """See `Recording.read`."""
         messages: list[can.Message] = []
         t_ns: list[int] = []
-        while len(messages) < PIECE_FRAMES:
-            message = self._ahead or self._next()
+        while len(messages) < PIECE_FRAMES and self._damage is None:
+            try:
+                message = self._ahead or self._next()
+            except RecordingError as error:
+                self._damage = error  # for the next read, after what came before it
+                break
             self._ahead = None
             if message is None:
                 break
@@ -145,18 +154,23 @@ class CanLog:
                 break
             messages.append(message)
             t_ns.append(at_ns)
-        self._frames += len(messages)
+        if self._damage is not None and not messages:
+            raise self._damage
         return self._sort(messages, np.array(t_ns, np.int64)) if messages else None
 
     def _next(self) -> can.Message | None:
         try:
             message = next(self._messages, None)
-            return None if message is None else _finite(message)
+            if message is None:
+                return None
+            _finite(message)
         except Exception as error:
             raise RecordingError(
                 f"{self._path} is damaged behind frame {self._frames}: {words(error)}; "
                 "the frames before that have been played"
             ) from error
+        self._frames += 1
+        return message
 
     def close(self) -> None:
         """See `Recording.close`."""
@@ -331,7 +345,7 @@ def candump_messages(text: str) -> tuple[list[can.Message], int]:
     """The frames in lines of a candump log, and how many lines are none."""
     messages: list[can.Message] = []
     malformed = 0
-    lines = io.StringIO(text)
+    lines: Any = _Candump(io.StringIO(text))
     while True:
         try:
             # A reader that has given up on a line goes on with the next one.
@@ -340,6 +354,23 @@ def candump_messages(text: str) -> tuple[list[can.Message], int]:
             malformed += 1
         else:
             return messages, malformed
+
+
+class _Candump:
+    """Lines of a candump log in which python-can knows every error frame as one, not only bus errors."""
+
+    _ERROR_FRAME = re.compile(r" ([2367ABEF][0-9A-F]{7})#", re.IGNORECASE)
+
+    def __init__(self, lines: io.TextIOBase) -> None:
+        self._lines = lines
+        self.close = lines.close
+
+    def __iter__(self) -> Iterator[str]:
+        return (self._ERROR_FRAME.sub(self._as_bus_error, line, count=1) for line in self._lines)
+
+    @staticmethod
+    def _as_bus_error(found: re.Match[str]) -> str:
+        return f" {int(found[1], 16) | BUS_ERROR:08X}#"
 
 
 def _finite(message: can.Message) -> can.Message:
