@@ -30,7 +30,7 @@ from daqsvc.publish.topics import Topics
 from daqsvc.self_check import SelfCheck, Vitals, conditions
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.publish.mqtt import MqttSettings
     from daqsvc.publish.sparkplug.settings import SparkplugSettings
+    from daqsvc.self_check import BusHealth
 
 logger = logging.getLogger(__name__)
 
@@ -87,6 +88,8 @@ class AlarmDesk:
         handling: what holds for all alarms.
         limits: how much the journal may keep.
         sparkplug: what the box is to Sparkplug, beside its own topics; None for nothing.
+        buses: the driver of each bus, by name.
+        bus_health: says how the buses stand.
     """
 
     def __init__(
@@ -100,6 +103,8 @@ class AlarmDesk:
         handling: AlarmHandling | None = None,
         limits: OutboxLimits | None = None,
         sparkplug: SparkplugSettings | None = None,
+        buses: Mapping[str, str] | None = None,
+        bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
     ) -> None:
         limits = limits or OutboxLimits()
         self.identity = identity
@@ -119,7 +124,8 @@ class AlarmDesk:
             else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock)
         )
         self._clock = clock
-        self._mqtt = mqtt
+        self._conditions = conditions(mqtt, buses or {})
+        self._bus_health = bus_health
         self._self_check = SelfCheck(store, limits.reserve_bytes)
         self._free_bytes: int | None = None
         self._under_way: set[asyncio.Future[Any]] = set()
@@ -145,7 +151,7 @@ class AlarmDesk:
             speakers: the detectors that will make statements, with the sensors that these rest on.
         """
         told = recall(await self.outbox.latest(), self.topics)
-        for event in self.manager.resume(told, speakers, conditions(self._mqtt)):
+        for event in self.manager.resume(told, speakers, self._conditions):
             self._post(event)
         if self.outbox.counters.quarantined or self.outbox.counters.vanished:
             # The broker still shows how the forgotten alarms stood.
@@ -296,6 +302,7 @@ class AlarmDesk:
             damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
+            buses=self._bus_health(),
         )
 
     async def _look_at_disk(self) -> None:

@@ -119,7 +119,7 @@ def _services(machine: MachineFile, mqtt: MqttSettings | None) -> Iterator[str]:
     yield from (f"detector-ok/{detector}" for detector in machine.detectors)
     handling = machine.alarm_handling
     yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
-    yield from conditions(mqtt)
+    yield from conditions(mqtt, {name: bus.driver for name, bus in machine.buses.items()})
 
 
 def _readings(machine: MachineFile) -> Iterator[Reading]:

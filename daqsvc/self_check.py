@@ -1,4 +1,4 @@
-"""What the service has to say about itself: certificates that end, a full disk, telemetry that is dropped.
+"""What the service has to say about itself: certificates, a full disk, dropped telemetry, buses that fail it.
 
 Each is a condition of the alarm manager: active while it stands, returned when it is over, like any alarm.
 """
@@ -6,8 +6,10 @@ Each is a condition of the alarm manager: active while it stands, returned when 
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from collections import defaultdict
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.alarms.states import Level
@@ -23,6 +25,10 @@ MIB = 1024 * 1024
 
 STORE = ("store/disk", "store/journal", "store/damage", "store/telemetry", "store/audit-log")
 """The conditions of the store."""
+
+BUS_OVERRUN = "bus-overrun/"
+BUS_CONTROLLER = "bus-controller/"
+"""How the names of the conditions of a bus begin."""
 
 CERTIFICATE = "certificate/"
 BROKER = "broker"
@@ -47,6 +53,20 @@ class Condition(NamedTuple):
     sentence: str
 
 
+class BusHealth(NamedTuple):
+    """How a bus stands, and what has befallen it so far.
+
+    Attributes:
+        overruns: what was lost because a buffer between the bus and this process was full.
+        bus_off: how often its controller took itself off the bus.
+        state: state of the controller; None for a bus that has none.
+    """
+
+    overruns: int
+    bus_off: int
+    state: Literal["error-active", "error-warning", "error-passive", "bus-off"] | None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vitals:
     """What is looked at.
@@ -65,6 +85,7 @@ class Vitals:
         damaged: corrupt files set aside, and messages that a file no longer knew, so far.
         telemetry_dropped: telemetry messages dropped so far.
         unwritten: commands so far that were refused because the audit log could not be written.
+        buses: how each bus stands, by name.
     """
 
     now_ns: int
@@ -80,15 +101,19 @@ class Vitals:
     damaged: int
     telemetry_dropped: int
     unwritten: int
+    buses: Mapping[str, BusHealth] = field(default_factory=dict)
 
 
-def conditions(mqtt: MqttSettings | None) -> list[str]:
+def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProxyType({})) -> list[str]:
     """The names of all that can be said, so that people may act on it before it is.
 
     Args:
         mqtt: how to reach the broker; None without one.
+        buses: the driver of each bus, by name.
     """
     found = list(STORE)
+    found += [f"{BUS_OVERRUN}{bus}" for bus, driver in buses.items() if driver in {"can", "serial"}]
+    found += [f"{BUS_CONTROLLER}{bus}" for bus, driver in buses.items() if driver == "can"]
     if mqtt is not None and mqtt.tls:
         files = {BROKER: True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
         found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
@@ -111,6 +136,8 @@ class SelfCheck:
         self._lost = _Happening()
         self._unwritten = _Happening()
         self._damaged = _Happening()
+        self._overruns: defaultdict[str, _Happening] = defaultdict(_Happening)
+        self._bus_off: defaultdict[str, _Happening] = defaultdict(_Happening)
         self._write_errors = 0
         self._unwritable = False
 
@@ -142,6 +169,16 @@ class SelfCheck:
         yield self._damage(vitals)
         yield self._dropped(vitals)
         yield self._audit(vitals)
+        yield from self._buses(vitals)
+
+    def _buses(self, vitals: Vitals) -> Iterator[Condition]:
+        for bus, health in vitals.buses.items():
+            yield self._overrun(bus, health, vitals.now_ns)
+            if health.state is not None:
+                yield self._controller(bus, health, vitals.now_ns)
+        for name in sorted(vitals.conditions_told):
+            if name.startswith((BUS_OVERRUN, BUS_CONTROLLER)) and name.partition("/")[2] not in vitals.buses:
+                yield Condition(name, Level.NORMAL, "there is no such bus any more")
 
     def _certificate(self, name: str, left_ns: int, end_ns: int) -> Condition:
         condition = f"{CERTIFICATE}{name}"
@@ -205,6 +242,30 @@ class SelfCheck:
             return Condition("store/audit-log", Level.NORMAL, "the audit log takes what comes")
         sentence = f"the audit log in {self._store} cannot be written, and commands are refused: make room"
         return Condition("store/audit-log", Level.ALERT, sentence)
+
+    def _overrun(self, bus: str, health: BusHealth, now_ns: int) -> Condition:
+        name = f"{BUS_OVERRUN}{bus}"
+        if not self._overruns[bus].goes_on(health.overruns, now_ns):
+            return Condition(name, Level.NORMAL, f"no buffer of bus {bus} overflows")
+        # No count: it would be another sentence each time.
+        sentence = (
+            f"what bus {bus} carries is lost, because a buffer of this machine or of its adapter overflows: "
+            "relieve the machine, or enlarge the buffer (CAN: receive_buffer_bytes)"
+        )
+        return Condition(name, Level.ALERT, sentence)
+
+    def _controller(self, bus: str, health: BusHealth, now_ns: int) -> Condition:
+        name = f"{BUS_CONTROLLER}{bus}"
+        went_off = self._bus_off[bus].goes_on(health.bus_off, now_ns)
+        look = "look at wiring, termination and bit rate"
+        if health.state == "bus-off":
+            return Condition(name, Level.DANGER, f"the controller of bus {bus} is bus-off: {look}")
+        if went_off:
+            sentence = f"the controller of bus {bus} went bus-off within the last minute: {look}"
+            return Condition(name, Level.DANGER, sentence)
+        if health.state == "error-passive":
+            return Condition(name, Level.ALERT, f"the controller of bus {bus} is error-passive: {look}")
+        return Condition(name, Level.NORMAL, f"the controller of bus {bus} is sound")
 
 
 class _Happening:

@@ -22,7 +22,9 @@ from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
+from daqsvc.self_check import BusHealth
 from daqsvc.settings.alignment import Grid
+from drivers.can_errors import CanCounters
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
@@ -131,6 +133,8 @@ class Service:
             handling=alarm_handling(machine),
             limits=outbox_limits(machine),
             sparkplug=sparkplug_settings(machine, store),
+            buses={name: bus.driver for name, bus in machine.buses.items()},
+            bus_health=self._bus_health,
         )
         self.control = ControlServer(
             store, machine.machine.name, self.desk.obey, lambda: self.desk.outbox.counters.waiting
@@ -222,6 +226,14 @@ class Service:
         if self.publisher is not None:
             payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
             self.publisher.telemetry(f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload)
+
+    def _bus_health(self) -> dict[str, BusHealth]:
+        found: dict[str, BusHealth] = {}
+        for driver in self.drivers:
+            counters = driver.counters
+            state = counters.controller_state if isinstance(counters, CanCounters) else None
+            found[driver.name] = BusHealth(counters.overruns, counters.bus_off, state)
+        return found
 
     async def _tell_status(self) -> None:
         while True:

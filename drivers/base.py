@@ -104,6 +104,11 @@ class BusCounters:
     reader_failures: int = 0
     unknown_ids: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def overruns(self) -> int:
+        """What was lost to full buffers between the bus and this process, as far as that is known."""
+        return 0
+
 
 class Driver(Protocol):
     """One link, kept up.

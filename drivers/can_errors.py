@@ -101,6 +101,11 @@ class CanCounters(BusCounters):
     tx_errors: int = 0
     rx_errors: int = 0
 
+    @property
+    def overruns(self) -> int:
+        """See `drivers.base.BusCounters`: frames that the kernel dropped, and overflows before it."""
+        return self.frames_overrun + self.rx_overflows
+
     def take(self, found: ErrorCounts) -> None:
         """Add what error frames said."""
         for name, count in found.counts.items():

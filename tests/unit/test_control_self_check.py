@@ -9,7 +9,10 @@ import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import Level
-from daqsvc.self_check import MIB, NS_PER_DAY, SelfCheck, Vitals
+from daqsvc.self_check import MIB, NS_PER_DAY, BusHealth, SelfCheck, Vitals, conditions
+from drivers.base import BusCounters
+from drivers.can_errors import CanCounters
+from drivers.serial_port import SerialCounters
 
 HOUR_NS = 3600 * NS_PER_S
 NOW_NS = 1_795_264_095 * NS_PER_S
@@ -137,3 +140,61 @@ def test_the_disk_is_asked_for_what_the_service_may_use(tmp_path: Path) -> None:
     assert SelfCheck(tmp_path, 0).free_bytes() > 0
     with pytest.raises(OSError, match="none"):
         SelfCheck(tmp_path / "none", 0).free_bytes()
+
+
+def test_what_a_bus_loses_to_a_full_buffer_is_one_alarm() -> None:
+    check = self_check()
+
+    def overrun(t_s: int, **overruns: int) -> dict[str, tuple[Level, str]]:
+        buses = {name: BusHealth(count, 0, None) for name, count in overruns.items()}
+        return look(check, now_ns=t_s * NS_PER_S, buses=buses)
+
+    assert overrun(0, can0=0, can1=0)["bus-overrun/can0"] == (Level.NORMAL, "no buffer of bus can0 overflows")
+    found = [
+        overrun(t_s, can0=count, can1=0) for t_s, count in ((1, 40), (30, 40), (60, 41), (119, 41), (121, 41))
+    ]
+    assert [f["bus-overrun/can0"][0] for f in found] == [*[Level.ALERT] * 4, Level.NORMAL]
+    assert {f["bus-overrun/can1"][0] for f in found} == {Level.NORMAL}
+    assert len({f["bus-overrun/can0"][1] for f in found[:4]}) == 1, "nothing new is said"
+    assert "bus-controller/can0" not in found[0], "it has none"
+
+
+def test_a_controller_that_leaves_the_bus_is_dangerous_and_one_near_it_is_told() -> None:
+    check = self_check()
+    stages = [
+        (0, 0, "error-active", Level.NORMAL, "is sound"),
+        (1, 0, "error-warning", Level.NORMAL, "is sound"),
+        (2, 0, "error-passive", Level.ALERT, "is error-passive: look at wiring, termination and bit rate"),
+        (3, 1, "bus-off", Level.DANGER, "is bus-off: look at wiring, termination and bit rate"),
+        (300, 1, "bus-off", Level.DANGER, "is bus-off"),
+        (301, 2, "error-active", Level.DANGER, "went bus-off within the last minute"),
+        (362, 2, "error-active", Level.NORMAL, "is sound"),
+    ]
+    for t_s, bus_off, state, level, words in stages:
+        health = BusHealth(0, bus_off, state)  # type: ignore[arg-type]
+        found = look(check, now_ns=t_s * NS_PER_S, buses={"can0": health})["bus-controller/can0"]
+        assert found[0] is level, state
+        assert words in found[1]
+
+
+def test_a_bus_that_is_no_longer_there_has_no_alarm() -> None:
+    told = frozenset({"bus-overrun/can1", "bus-controller/can1", "bus-overrun/can0"})
+    found = look(self_check(), conditions_told=told, buses={"can0": BusHealth(0, 0, "error-active")})
+    gone = (Level.NORMAL, "there is no such bus any more")
+    assert found["bus-overrun/can1"] == found["bus-controller/can1"] == gone
+    assert found["bus-overrun/can0"] != gone
+
+
+def test_the_alarms_of_a_bus_are_known_before_they_are_raised() -> None:
+    buses = {"can0": "can", "tty": "serial", "plc": "modbus", "log": "replay"}
+    assert set(conditions(None, buses)) - set(conditions(None)) == {
+        "bus-overrun/can0",
+        "bus-controller/can0",
+        "bus-overrun/tty",
+    }
+
+
+def test_every_kind_of_bus_says_what_its_buffers_lost() -> None:
+    assert BusCounters().overruns == 0
+    assert CanCounters(frames_overrun=7, rx_overflows=2).overruns == 9
+    assert SerialCounters(overruns=5).overruns == 5

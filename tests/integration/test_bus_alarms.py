@@ -1,0 +1,45 @@
+"""What a bus loses, and a controller that goes off it, reach whoever takes the alarms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from live_service import running
+from machine_files import MACHINES
+
+from daqsvc.alarms.states import Level
+from daqsvc.settings import parse_machine_file
+from drivers.can_batches import Sorted
+from drivers.can_errors import ErrorCounts
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.service import Service
+    from drivers.can_bus import CanDriver
+
+MOTOR = MACHINES / "motor-accelerometer.toml"
+
+
+def how(service: Service, alarm: str) -> tuple[Level, str]:
+    status = service.desk.manager.alarms[alarm]
+    return status.level, status.message
+
+
+async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -> None:
+    text = MOTOR.read_text().replace('interface = "socketcan"', 'interface = "virtual"')
+    machine = parse_machine_file(text.partition("[mqtt]")[0], MOTOR)
+    async with running(machine, tmp_path / "store") as service:
+        driver: CanDriver = service.drivers[0]  # type: ignore[assignment]
+        service.desk.tick()
+        assert "bus-overrun/can0" not in service.desk.manager.alarms, "nothing has happened"
+        driver.take(Sorted(notes={"frames_overrun": 3}))
+        driver.take(Sorted(errors=ErrorCounts({"bus_off": 1}, "bus-off")))
+        service.desk.tick()
+        level, message = how(service, "bus-overrun/can0")
+        assert level is Level.ALERT
+        assert "what bus can0 carries is lost" in message
+        assert how(service, "bus-controller/can0")[0] is Level.DANGER
+        driver.take(Sorted(errors=ErrorCounts({"restarts": 1}, "error-active")))
+        service.desk.tick()
+        assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"
