@@ -19,6 +19,7 @@ from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
+from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.store_argument import store_directory
 
 if TYPE_CHECKING:
@@ -194,6 +195,7 @@ def commands() -> dict[str, Command]:
         "analyze": AnalyzeCommand(load, prepare_kernel_cache),
         "calibrate": CalibrateCommand(load, prepare_kernel_cache),
         "detectability": DetectabilityCommand(load, prepare_kernel_cache),
+        "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):
         try:

@@ -16,7 +16,18 @@ CONFIG = Path(__file__).parents[2] / "config" / "machines"
 README = CONFIG.parents[1] / "README.md"
 STOP_S = 2.0
 PEOPLE = ("alarms", "ack", "reset", "shelve", "unshelve", "bypass", "unbypass")
-VERBS = ("run", "check", *PEOPLE, "analyze", "calibrate", "detectability", "demo", "reproduce", "sim")
+VERBS = (
+    "run",
+    "check",
+    *PEOPLE,
+    "analyze",
+    "calibrate",
+    "detectability",
+    "record",
+    "demo",
+    "reproduce",
+    "sim",
+)
 
 
 def daqsvc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

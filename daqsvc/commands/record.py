@@ -1,0 +1,173 @@
+"""``daqsvc record FILE --bus NAME --out LOG``: a one-off recording of a CAN bus."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.commands.option_types import positive
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+
+    from daqsvc.settings import MachineFile
+    from drivers.base import Driver
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_MISUSED = 2
+
+ENDINGS = (".blf", ".asc", ".log")
+
+
+class RecordCommand:
+    """``daqsvc record FILE --bus NAME --out LOG``.
+
+    Args:
+        load: reads a machine file; None after its errors have been printed.
+        start_logging: of the service.
+    """
+
+    help = "record what comes over a CAN bus in a log file, until Ctrl-C"
+    description = (
+        "Record every frame that comes over a CAN bus in one log file, without the rest of the service. "
+        "SIGINT (Ctrl-C) or SIGTERM end it. At the end print as JSON what was recorded, and what the streams "
+        'of the machine file make of it. The file can be replayed (driver = "replay") or opened by any tool '
+        "that reads CAN logs."
+    )
+
+    def __init__(
+        self, load: Callable[[Path], MachineFile | None], start_logging: Callable[..., None]
+    ) -> None:
+        self._load = load
+        self._start_logging = start_logging
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("file", type=Path, metavar="FILE", help="the machine file (TOML)")
+        parser.add_argument("--bus", metavar="NAME", help="the bus (default: the only CAN bus of the file)")
+        parser.add_argument(
+            "--out",
+            type=Path,
+            required=True,
+            metavar="LOG",
+            help="the new log file; its ending says the format: .blf, .asc, or .log of candump",
+        )
+        parser.add_argument(
+            "--duration", type=positive, metavar="S", help="seconds to record for (default: until stopped)"
+        )
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        self._start_logging(verbose=False)
+        machine = self._load(arguments.file)
+        if machine is None:
+            return EXIT_MISUSED
+        try:
+            bus = _bus(machine, arguments.bus)
+            _check_new(arguments.out)
+        except _MisuseError as error:
+            return _say(error, EXIT_MISUSED)
+        from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.assembly_drivers import AssemblyError, bus_driver  # noqa: PLC0415
+        from drivers.base import DeviceAbsentError  # noqa: PLC0415
+        from drivers.frames import LayoutError  # noqa: PLC0415
+
+        there = _logs(arguments.out)
+        try:
+            changed = {"record": {"file": arguments.out}}
+            driver = bus_driver(machine, bus, SystemClock(), lambda _block: None, changed)
+            asyncio.run(_run_until_stopped(driver, arguments.duration))
+        except (AssemblyError, DeviceAbsentError, LayoutError) as error:
+            return _say(error, EXIT_FAILED)
+        files = sorted(_logs(arguments.out) - there)
+        summary = _summary(bus, driver, files)
+        print(json.dumps(summary))  # noqa: T201 - this is what the verb is for
+        if summary["frames_unrecorded"]:
+            return _say(
+                f"{summary['frames_unrecorded']} frames could not be recorded in {arguments.out}", EXIT_FAILED
+            )
+        if not files:
+            return _say(
+                f"{driver.link.name} has carried no frame, so there is no {arguments.out}; "
+                f"its state at the end: {driver.link.reason or 'up'}",
+                EXIT_FAILED,
+            )
+        return EXIT_OK
+
+
+class _MisuseError(Exception):
+    """The arguments do not fit the machine file or the disk."""
+
+
+def _bus(machine: MachineFile, name: str | None) -> str:
+    can_buses = [key for key, bus in machine.buses.items() if bus.driver == "can"]
+    there = f"CAN buses of {machine.path} are {', '.join(can_buses)}" if can_buses else "there is none"
+    if name is None:
+        if len(can_buses) != 1:
+            raise _MisuseError(f"--bus: say which CAN bus to record; {there}")
+        return can_buses[0]
+    if name not in can_buses:
+        raise _MisuseError(f"--bus {name}: {machine.path} has no CAN bus of this name; {there}")
+    return name
+
+
+def _check_new(log: Path) -> None:
+    if log.suffix.lower() not in ENDINGS:
+        raise _MisuseError(
+            f"--out {log}: ends in none of {', '.join(ENDINGS)}, which say the format; add one"
+        )
+    if log.exists():
+        raise _MisuseError(f"--out {log}: is there already; give another name, or take it away first")
+    if not log.parent.is_dir():
+        raise _MisuseError(f"--out {log}: there is no folder {log.parent}; make it first")
+
+
+def _logs(log: Path) -> set[Path]:
+    """The file, and the files that go on with it where the disk refused for a while."""
+    return {
+        path for path in log.parent.iterdir() if path.name.startswith(log.stem) and path.suffix == log.suffix
+    }
+
+
+async def _run_until_stopped(driver: Driver, duration_s: float | None) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+    running = asyncio.create_task(driver.run(), name="record")
+    stopped = asyncio.create_task(stop.wait(), name="stop")
+    await asyncio.wait({running, stopped}, timeout=duration_s, return_when=asyncio.FIRST_COMPLETED)
+    for task in (stopped, running):
+        task.cancel()
+    ended = await asyncio.gather(running, stopped, return_exceptions=True)
+    if isinstance(ended[0], Exception):
+        raise ended[0]
+
+
+def _summary(bus: str, driver: Driver, files: list[Path]) -> dict[str, Any]:
+    counters = asdict(driver.counters)
+    return {
+        "bus": bus,
+        "files": [str(path) for path in files],
+        "bytes": sum(path.stat().st_size for path in files),
+        "frames_recorded": counters.pop("frames_recorded"),
+        "frames_unrecorded": counters.pop("frames_unrecorded"),
+        "losses": driver.link.losses,
+        **counters,
+        "streams": {
+            name: {"samples_received": stream.samples_received, "samples_lost": stream.samples_lost}
+            for name, (stream, _) in driver.streams.items()
+        },
+    }
+
+
+def _say(what: object, code: int) -> int:
+    print(f"daqsvc: {what}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    return code

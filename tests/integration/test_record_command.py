@@ -1,0 +1,162 @@
+"""``daqsvc record`` on the virtual bus between processes, stopped and killed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import can
+import pytest
+from can_recordings import numbers
+
+from sim_hw.bus_socket import UnixBus
+from sim_hw.bus_socket_hub import Hub
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+RIG = Path(__file__).parents[2] / "config" / "machines" / "virtual-rig.toml"
+PATIENCE_S = 60.0
+FRAMES = 300
+
+
+def eventually(true: Callable[[], bool], what: str) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < until_s, what
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    text = RIG.read_text(encoding="utf-8").replace("/tmp/daqsvc-can0", str(tmp_path / "bus"))  # noqa: S108
+    path = tmp_path / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[UnixBus]:
+    hub = Hub(str(tmp_path / "bus"))
+    hub.start()
+    try:
+        with UnixBus(str(tmp_path / "bus"), fd=True, hub="join") as end:
+            yield end
+    finally:
+        hub.stop()
+
+
+@contextlib.contextmanager
+def recording(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "daqsvc", "record", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def refused(*arguments: str | Path) -> str:
+    command = [sys.executable, "-m", "daqsvc", "record", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    return done.stderr
+
+
+def send(bus: UnixBus, first: int, frames: int) -> None:
+    for number in range(first, first + frames):
+        bus.send(can.Message(arbitration_id=0x300, is_extended_id=False, data=number.to_bytes(8, "little")))
+
+
+def send_until_it_is_recorded(bus: UnixBus, log: Path) -> int:
+    """Send frames of number 0 until one is in the file: then the recorder listens. How many were sent."""
+    sent = 0
+
+    def arrived() -> bool:
+        nonlocal sent
+        send(bus, 0, 1)
+        sent += 1
+        return log.exists() and log.stat().st_size > 0
+
+    eventually(arrived, "nothing is recorded")
+    return sent
+
+
+@pytest.mark.parametrize("ending", [".blf", ".asc", ".log"])
+def test_what_is_recorded_is_printed_when_it_is_stopped(
+    bus: UnixBus, machine: Path, tmp_path: Path, ending: str
+) -> None:
+    log = tmp_path / f"run{ending}"
+    with recording(machine, "--out", log) as process:
+        sent = send_until_it_is_recorded(bus, log)
+        send(bus, 1, FRAMES)
+        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        process.send_signal(signal.SIGTERM)
+        output, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    summary = json.loads(output)
+    found = numbers(log)
+    assert [number for number in found if number] == list(range(1, FRAMES + 1))
+    assert len(found) <= sent + FRAMES
+    assert (summary["bus"], summary["files"]) == ("can0", [str(log)])
+    assert (summary["frames_recorded"], summary["frames_unrecorded"]) == (len(found), 0)
+    assert summary["bytes"] == log.stat().st_size
+    assert summary["frames_unknown"] == len(found)
+    assert summary["streams"]["shaft"] == {"samples_received": 0, "samples_lost": 0}
+
+
+@pytest.mark.parametrize("ending", [".blf", ".asc", ".log"])
+def test_a_recorder_that_is_killed_leaves_what_it_has_written(
+    bus: UnixBus, machine: Path, tmp_path: Path, ending: str
+) -> None:
+    log = tmp_path / f"run{ending}"
+    with recording(machine, "--bus", "can0", "--out", log) as process:
+        send_until_it_is_recorded(bus, log)
+        send(bus, 1, FRAMES)
+        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        process.kill()
+    with can.LogReader(log) as reader:
+        times = [message.timestamp for message in reader]
+    assert [number for number in numbers(log) if number] == list(range(1, FRAMES + 1))
+    assert times == sorted(times)
+    if ending != ".asc":
+        assert abs(times[0] - log.stat().st_mtime) < PATIENCE_S, "the file does not say when it was recorded"
+
+
+def _last(log: Path) -> int:
+    """The last number in a file that is being written; its end may be half a line."""
+    try:
+        return numbers(log)[-1]
+    except (IndexError, ValueError):
+        return -1
+
+
+def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_path: Path) -> None:
+    with recording(machine, "--out", tmp_path / "run.log", "--duration", "0.5") as process:
+        output, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "has carried no frame" in said
+    assert json.loads(output)["files"] == []
+    assert not (tmp_path / "run.log").exists()
+    assert bus.recv(0) is None
+
+
+def test_what_cannot_be_recorded_is_said_in_one_line(machine: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken.blf"
+    taken.write_bytes(b"")
+    assert "is there already" in refused(machine, "--out", taken)
+    assert "ends in none of .blf, .asc, .log" in refused(machine, "--out", tmp_path / "run.mf4")
+    assert "there is no folder" in refused(machine, "--out", tmp_path / "nowhere" / "run.log")
+    assert "has no CAN bus of this name; CAN buses" in refused(
+        machine, "--bus", "can1", "--out", tmp_path / "run.log"
+    )
+    modbus = RIG.parent / "modbus-gap-voltages.toml"
+    assert "there is none" in refused(modbus, "--out", tmp_path / "run.log")
