@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from can_standin import StandInBus
@@ -68,7 +69,24 @@ class StandInSocketCan:
             return reader
 
         port = port_on("stand-in", self.time, deliver, start, 1 << 20)
-        return CanDriver(port, open_source=open_end)
+        return CanDriver(self.changed(port), open_source=open_end)
+
+    def changed(self, port: BusPort) -> BusPort:
+        return port
 
 
-TRANSPORTS = {StandInSocketCan.name: StandInSocketCan}
+class RecordedStandInSocketCan(StandInSocketCan):
+    """The same while it is recorded, which nobody above the driver may notice."""
+
+    name = "recorded SocketCAN stand-in"
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._folder = folder
+
+    def changed(self, port: BusPort) -> BusPort:
+        record = {"folder": self._folder, "format": "candump", "file_mb": 1, "keep_mb": 2}
+        return replace(port, options={**port.options, "record": record})
+
+
+TRANSPORTS = {made.name: made for made in (StandInSocketCan, RecordedStandInSocketCan)}
