@@ -30,7 +30,7 @@ from drivers.modbus_layouts import (
     in_units,
     sample_record,
 )
-from drivers.registers import RegisterField, RegisterRecord, Run, plan_runs
+from drivers.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
 from drivers.replay_files import ColumnLayout
 from drivers.serial_lines import LineLayout
 
@@ -112,13 +112,10 @@ def modbus_layout(machine: MachineFile, stream: str) -> ModbusLayout:
     layout: ModbusLayout
     if isinstance(given, RegistersLayout):
         fields = tuple(_register_field(c, c.address) for c in given.channels)
-        runs = plan_runs(
-            [field.run for field in fields],
-            max_gap=given.max_gap,
-            max_count=given.max_count,
-            forbidden=[Run(first, last - first + 1) for first, last in given.forbidden],
-        )
-        layout = Trend(given.unit, given.table, RegisterRecord(fields, runs))
+        forbidden = tuple(Run(first, last - first + 1) for first, last in given.forbidden)
+        limits = RunLimits(given.max_gap, given.max_count, forbidden)
+        runs = plan_runs([field.run for field in fields], limits)
+        layout = Trend(given.unit, given.table, RegisterRecord(fields, runs), limits)
     elif isinstance(given, FifoLayout | RingLayout | WaveformLayout):
         layout = _sampled_layout(given, rate_hz)
     else:

@@ -17,7 +17,7 @@ from drivers.keeping import Attempt, keep_up
 from drivers.modbus_client import LineOptions, ModbusClient
 from drivers.modbus_line import ModbusLine, Patience, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
-from drivers.modbus_sampling import reader_for
+from drivers.modbus_sampling import readers_for
 from drivers.registers import Run
 from drivers.tty import Character, CharacterFormat
 
@@ -59,13 +59,14 @@ class ModbusDriver:
         kind = "Modbus TCP" if self._options.transport == "tcp" else "Modbus RTU"
         self.link = Link(f"{kind} bus {port.name!r} ({self._options.where})")
         self._characters = CharacterFormat(self.link.name, Character(8, self._options.parity))
-        self._readers = {spec.name: reader_for(spec, port, self.counters) for spec in port.streams}
+        self._readers = readers_for(port, self.counters)
         self._line: ModbusLine | None = None
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
         """See `drivers.base.Driver.streams`."""
-        return {name: reader.state for name, reader in self._readers.items()}
+        states = {name: state for reader in self._readers for name, state in reader.streams.items()}
+        return {spec.name: states[spec.name] for spec in self._port.streams}
 
     async def write(self, unit: int, address: int, values: Sequence[int]) -> None:
         """Write holding registers that the machine file allows to write.
@@ -91,7 +92,7 @@ class ModbusDriver:
             await keep_up(self.link, self._port, self._attempt, absent="does not answer")
         finally:
             self.link.stop()
-            for reader in self._readers.values():
+            for reader in self._readers:
                 reader.flush()
 
     async def _attempt(self) -> Attempt:
@@ -121,8 +122,10 @@ class ModbusDriver:
                 heard=self._heard,
             )
             reading = [
-                asyncio.create_task(reader.run(line), name=f"modbus-reader {self.name} {name}")
-                for name, reader in self._readers.items()
+                asyncio.create_task(
+                    reader.run(line), name=f"modbus-reader {self.name} {' '.join(reader.streams)}"
+                )
+                for reader in self._readers
             ]
             waited_for: set[asyncio.Future[Any]] = {line.lost, *reading}
             ended, _ = await asyncio.wait(waited_for, return_when=asyncio.FIRST_COMPLETED)

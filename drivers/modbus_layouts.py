@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from drivers.frames import LayoutError
 from drivers.modbus_replies import FIFO_REGISTERS, READ_HOLDING, READ_INPUT
-from drivers.registers import RegisterRecord, Run
+from drivers.registers import RegisterRecord, Run, RunLimits, plan_runs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -29,11 +30,13 @@ class Trend:
         unit: address of the unit.
         table: where the registers are.
         record: the quantities; each of its runs is a request.
+        limits: how registers may be read together with those of other streams; None if they must not be.
     """
 
     unit: int
     table: Table
     record: RegisterRecord
+    limits: RunLimits | None = None
 
 
 @dataclass(frozen=True)
@@ -225,6 +228,27 @@ ModbusLayout: TypeAlias = Trend | Fifo | Ring | Waveform
 def in_units(layout: ModbusLayout, conversion: Mapping[str, tuple[float, float]]) -> ModbusLayout:
     """The same layout in physical units; see `RegisterRecord.in_units`."""
     return replace(layout, record=layout.record.in_units(conversion))
+
+
+def shared_runs(layouts: Sequence[Trend]) -> tuple[Run, ...] | None:
+    """The requests that read the registers of several streams of one unit and table together.
+
+    Args:
+        layouts: of the streams; what one of them must not read is not read for the others either.
+
+    Returns:
+        None if that saves no request, or cannot be.
+    """
+    if len(layouts) < 2 or any(layout.limits is None for layout in layouts):
+        return None
+    limits = reduce(RunLimits.both, [layout.limits for layout in layouts if layout.limits is not None])
+    wanted = [field.run for layout in layouts for field in layout.record.fields]
+    try:
+        runs = plan_runs(wanted, limits)
+    except LayoutError:  # one stream reads what another one must not, or together it is too much at once
+        return None
+    apart = sum(len(layout.record.runs) for layout in layouts)
+    return runs if len(runs) < apart else None
 
 
 def sample_record(fields: Sequence[RegisterField]) -> RegisterRecord:

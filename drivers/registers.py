@@ -56,6 +56,32 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
+class RunLimits:
+    """What requests may do.
+
+    Attributes:
+        max_gap: registers nobody wants that one merge may read.
+        max_count: registers in a request, at most; the protocol allows 125.
+        forbidden: registers that must not be read.
+    """
+
+    max_gap: int = 0
+    max_count: int = 125
+    forbidden: tuple[Run, ...] = ()
+
+    def both(self, other: RunLimits) -> RunLimits:
+        """What these and the other limits allow."""
+        return RunLimits(
+            min(self.max_gap, other.max_gap),
+            min(self.max_count, other.max_count),
+            self.forbidden + other.forbidden,
+        )
+
+
+ANY_RUN = RunLimits()
+
+
+@dataclass(frozen=True, slots=True)
 class RegisterField:
     """One quantity in registers: physical = raw * scale + offset.
 
@@ -273,23 +299,15 @@ def _bytes_of(field: RegisterField, values: NDArray[np.float64]) -> NDArray[np.u
     return np.ascontiguousarray(numbers).view(np.uint8).reshape(len(values), -1)
 
 
-def plan_runs(
-    wanted: Sequence[Run],
-    *,
-    max_gap: int = 0,
-    max_count: int = 125,
-    forbidden: Sequence[Run] = (),
-) -> tuple[Run, ...]:
+def plan_runs(wanted: Sequence[Run], limits: RunLimits = ANY_RUN) -> tuple[Run, ...]:
     """Few requests that read every wanted register exactly once.
 
-    Neighbours are merged where that reads at most ``max_gap`` registers nobody wants and none that is
-    forbidden. What lies together (registers of one number, or of numbers that share one) stays together.
+    Neighbours are merged where the limits allow it. What lies together (registers of one number, or of
+    numbers that share one) stays together.
 
     Args:
         wanted: registers to read, in any order; they may overlap.
-        max_gap: unwanted registers that one merge may read.
-        max_count: registers in a request, at most; the protocol allows 125.
-        forbidden: registers that must not be read.
+        limits: what the requests may do.
 
     Returns:
         The requests, by address.
@@ -304,20 +322,20 @@ def plan_runs(
             run = Run(last.address, max(last.end, run.end) - last.address)  # noqa: PLW2901 - it has grown
         together.append(run)
     for run in together:
-        if run.count > max_count:
+        if run.count > limits.max_count:
             raise LayoutError(
                 f"registers {run.address} to {run.end - 1} belong together, and a request takes "
-                f"{max_count}; raise max_count (up to 125)"
+                f"{limits.max_count}; raise max_count (up to 125)"
             )
-        _refuse_forbidden(run, forbidden)
+        _refuse_forbidden(run, limits.forbidden)
     runs: list[Run] = together[:1]
     for before, run in pairwise(together):
         gap = Run(before.end, run.address - before.end)
         merged = Run(runs[-1].address, run.end - runs[-1].address)
         if (
-            gap.count <= max_gap
-            and merged.count <= max_count
-            and not any(_overlap(gap, f) for f in forbidden)
+            gap.count <= limits.max_gap
+            and merged.count <= limits.max_count
+            and not any(_overlap(gap, f) for f in limits.forbidden)
         ):
             runs[-1] = merged
         else:

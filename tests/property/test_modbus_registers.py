@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.frames import LayoutError
-from drivers.registers import RegisterField, RegisterRecord, Run, plan_runs
+from drivers.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
 
 FORMATS = {
     "int16": "h",
@@ -148,7 +148,7 @@ def wish(draw):
 def test_a_plan_reads_what_is_wanted_once_and_nothing_forbidden(given_wish):
     wanted, forbidden, max_gap, max_count = given_wish
     try:
-        runs = plan_runs(wanted, max_gap=max_gap, max_count=max_count, forbidden=forbidden)
+        runs = plan_runs(wanted, RunLimits(max_gap, max_count, tuple(forbidden)))
     except LayoutError as error:  # a long chain of numbers that share registers
         assert "belong together" in str(error)  # noqa: PT017
         return
@@ -173,4 +173,4 @@ def test_a_plan_reads_what_is_wanted_once_and_nothing_forbidden(given_wish):
 
 def test_a_forbidden_register_that_is_wanted_is_refused():
     with pytest.raises(LayoutError, match="registers 5 to 6 are wanted, but 6 to 9 are forbidden"):
-        plan_runs([Run(5, 2)], forbidden=[Run(6, 4)])
+        plan_runs([Run(5, 2)], RunLimits(forbidden=(Run(6, 4),)))
