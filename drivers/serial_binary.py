@@ -10,21 +10,25 @@ with the id only where several streams share a port, and the payload as a `Frame
 from __future__ import annotations
 
 import binascii
+from abc import ABC, abstractmethod
 from itertools import repeat
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from cobs import cobs
 
 from drivers.frames import LayoutError
-from drivers.serial_framing import Found, Frames, Pieces
+from drivers.serial_framing import DelimitedFraming, Found, Frames
+from drivers.serial_kernels import CRC_BYTES, Step, crcs_match, gather, hunt, unstuff
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
     from drivers.frames import FrameLayout
+    from drivers.serial_framing import Pieces
+    from drivers.serial_kernels import Hunted
 
 CrcName = Literal["none", "ibm-3740", "xmodem"]
 CrcOrder = Literal["big", "little"]
@@ -32,8 +36,26 @@ CrcOrder = Literal["big", "little"]
 CRC_INITIAL: Mapping[CrcName, int] = {"ibm-3740": 0xFFFF, "xmodem": 0x0000}
 """Both are the polynomial 0x1021, most significant bit first (CCITT); they begin differently."""
 
-CRC_BYTES = 2
+NO_CRC = -1
 DELIMITER = b"\0"
+
+
+class Bodies(NamedTuple):
+    """Where the bodies of frames are.
+
+    Attributes:
+        buffer: uint8, with all of them in it.
+        starts: int64 ``[n]``, where each begins in the buffer.
+        lengths: int64 ``[n]``, bytes of each; 0 or less for what is no frame.
+        intact: bool ``[n]``, whether its CRC matches.
+        ends: int64 ``[n]``, see `Frames`.
+    """
+
+    buffer: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    intact: NDArray[np.bool_]
+    ends: NDArray[np.int64]
 
 
 class BodyCodec:
@@ -63,10 +85,10 @@ class BodyCodec:
                 f"{len(layouts)} streams share a serial port without stream ids; set stream_ids, or keep one"
             )
         self._ids = ids
-        self._initial = CRC_INITIAL.get(crc)
+        self._initial = CRC_INITIAL.get(crc, NO_CRC)
         self._swap = crc_order == "little"
         self._head = 1 if ids else 0
-        self._tail = 0 if self._initial is None else CRC_BYTES
+        self._tail = CRC_BYTES if self.checked else 0
         self._layouts = dict(layouts)
         self._by_id: dict[int, str] = {}
         for name, layout in layouts.items():
@@ -76,38 +98,31 @@ class BodyCodec:
             if other != name:
                 raise LayoutError(f"streams {other!r} and {name!r} share id {layout.frame_id}")
         self.longest = max(self.length(name) for name in layouts)
+        self._by_first_byte = np.full(256, -1 if ids else self.longest, np.int64)
+        for key, name in self._by_id.items():
+            self._by_first_byte[key] = self.length(name)
 
     @property
     def checked(self) -> bool:
         """Whether bodies end with a CRC."""
-        return self._initial is not None
+        return self._initial != NO_CRC
 
     def length(self, stream: str) -> int:
         """Bytes of a body of that stream."""
         return self._head + self._layouts[stream].length + self._tail
 
-    def stream_of(self, body: bytes) -> str | None:
-        """The stream that a body says it belongs to; None if there is no such stream."""
-        return self._by_id.get(body[0] if self._ids else 0)
+    def intact(
+        self, buffer: NDArray[np.uint8], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Whether the CRC of each body matches, bool ``[n]``; True if there is none. See `Bodies`."""
+        if not self.checked:
+            return np.ones(len(starts), np.bool_)
+        return crcs_match(buffer, starts, lengths, self._initial, self._swap)
 
-    def is_intact(self, body: bytes) -> bool:
-        """Whether the CRC matches; True if there is none."""
-        if self._initial is None:
-            return True
-        if self._swap:
-            body = body[:-2] + body[:-3:-1]
-        # The CRC of what is followed by its own CRC, high byte first, is zero.
-        return binascii.crc_hqx(body, self._initial) == 0
-
-    def intact(self, bodies: Sequence[bytes]) -> NDArray[np.bool_]:
-        """`is_intact` of many bodies."""
-        if self._initial is None:
-            return np.ones(len(bodies), np.bool_)
-        if self._swap:
-            bodies = [body[:-2] + body[:-3:-1] for body in bodies]
-        residues = map(binascii.crc_hqx, bodies, repeat(self._initial))
-        matches: NDArray[np.bool_] = np.fromiter(residues, np.uint16, len(bodies)) == 0
-        return matches
+    def hunt(self, buffer: NDArray[np.uint8], word: NDArray[np.uint8], step: Step) -> Hunted:
+        """The bodies behind sync words; see `drivers.serial_kernels.hunt`."""
+        limits = min(map(self.length, self._layouts)), self.longest
+        return hunt(buffer, word, self._by_first_byte, limits, self._initial, self._swap, step)
 
     def encode(
         self,
@@ -121,46 +136,34 @@ class BodyCodec:
         layout = self._layouts[stream]
         head = bytes([layout.frame_id]) if self._ids else b""
         bodies = [head + payload.tobytes() for payload in layout.encode(first_index, samples, clip=clip)]
-        if self._initial is None:
+        if not self.checked:
             return bodies
         order: CrcOrder = "little" if self._swap else "big"
         crcs = map(binascii.crc_hqx, bodies, repeat(self._initial))
         return [body + crc.to_bytes(CRC_BYTES, order) for body, crc in zip(bodies, crcs, strict=True)]
 
-    def sort(
-        self, bodies: list[bytes], intact: NDArray[np.bool_], ends: NDArray[np.int64], found: Found
-    ) -> NDArray[np.bool_]:
+    def sort(self, bodies: Bodies, found: Found) -> NDArray[np.bool_]:
         """Decode bodies into ``found``, by stream.
 
         Args:
-            bodies: as they came; an empty one is no frame.
-            intact: bool ``[n]``, whether the CRC of each matches.
-            ends: int64 ``[n]``, see `Frames`.
+            bodies: as they came.
             found: where to put frames, unknown ids and wrong lengths.
 
         Returns:
             bool ``[n]``, False for bodies that are no frame at all: neither length nor CRC speak for them.
         """
-        n = len(bodies)
-        sound = intact.copy() if self.checked else np.zeros(n, np.bool_)
-        lengths = np.fromiter(map(len, bodies), np.int64, n)
-        sound &= lengths > 0
-        ids = np.zeros(n, np.int64)
-        if self._ids:
-            ids[:] = [body[0] if body else -1 for body in bodies]
-        strays = np.ones(n, np.bool_)
+        buffer, starts, lengths, intact, ends = bodies
+        sound = intact & (lengths > 0) if self.checked else np.zeros(len(ends), np.bool_)
+        ids = np.where(lengths > 0, buffer[starts], -1) if self._ids else np.zeros(len(ends), np.int64)
+        strays = np.ones(len(ends), np.bool_)
         for key, name in self._by_id.items():
+            layout = self._layouts[name]
             mine = (ids == key) & (lengths == self.length(name))
             if not mine.any():
                 continue
             strays &= ~mine
-            chosen = bodies if mine.all() else [bodies[k] for k in np.flatnonzero(mine).tolist()]
-            raw = np.frombuffer(b"".join(chosen), np.uint8).reshape(len(chosen), -1)
-            decoded = self._layouts[name].decode(raw[:, self._head : raw.shape[1] - self._tail])
-            found.frames[name] = Frames(
-                decoded._replace(intact=decoded.intact & intact[mine]),
-                ends[mine],
-            )
+            decoded = layout.decode(gather(buffer, starts[mine] + self._head, layout.length))
+            found.frames[name] = Frames(decoded._replace(intact=decoded.intact & intact[mine]), ends[mine])
         for k in np.flatnonzero(strays & sound).tolist():
             owner = self._by_id.get(int(ids[k]))
             if owner is None:
@@ -170,11 +173,8 @@ class BodyCodec:
         return ~strays | sound
 
 
-class CobsFraming:
-    """Bodies encoded by Consistent Overhead Byte Stuffing, each followed by a zero byte.
-
-    Garbage costs only the frames it touches: the next zero byte is a fresh start, wherever it is.
-    (S. Cheshire and M. Baker, Consistent Overhead Byte Stuffing, IEEE/ACM Trans. Networking 7, 1999.)
+class _BinaryFraming(ABC):
+    """What wraps bodies for the wire.
 
     Args:
         codec: what the bodies are.
@@ -182,13 +182,10 @@ class CobsFraming:
 
     def __init__(self, codec: BodyCodec) -> None:
         self._codec = codec
-        self._pieces = Pieces(DELIMITER, codec.longest + -(-codec.longest // 254) + 1)
-        self._astray = False
 
-    def restart(self) -> None:
-        """See `Framing.restart`."""
-        self._pieces.restart()
-        self._astray = False
+    @abstractmethod
+    def _wrap(self, body: bytes) -> bytes:
+        """All that goes over the wire for a body."""
 
     def encode(
         self,
@@ -200,33 +197,35 @@ class CobsFraming:
     ) -> list[bytes]:
         """See `Framing.encode`."""
         bodies = self._codec.encode(stream, first_index, samples, clip=clip)
-        return [cobs.encode(body) + DELIMITER for body in bodies]
-
-    def cut(self, data: bytes) -> Found:
-        """See `Framing.cut`."""
-        found = Found()
-        pieces, ends, cut_off = self._pieces.split(data, found)
-        overlong = found.malformed > 0
-        if not all(pieces):  # delimiters side by side
-            cut_off &= bool(pieces[0])
-            full = [k for k, piece in enumerate(pieces) if piece]
-            pieces, ends = [pieces[k] for k in full], ends[full]
-        if pieces:
-            try:
-                bodies = list(map(cobs.decode, pieces))
-            except cobs.DecodeError:
-                bodies = [_decoded(piece) for piece in pieces]
-            in_step = self._codec.sort(bodies, self._codec.intact(bodies), ends, found)
-            found.garbage_bytes += sum(len(pieces[k]) + 1 for k in np.flatnonzero(~in_step).tolist())
-            # The end of a frame that began before the port was opened is no fault.
-            self._astray = found.keep_step(
-                in_step[1:] if cut_off and not in_step[0] else in_step, self._astray
-            )
-        self._astray |= overlong
-        return found
+        return [self._wrap(body) for body in bodies]
 
 
-class SyncFraming:
+class CobsFraming(_BinaryFraming, DelimitedFraming):
+    """Bodies encoded by Consistent Overhead Byte Stuffing, each followed by a zero byte.
+
+    Garbage costs only the frames it touches: the next zero byte is a fresh start, wherever it is.
+    (S. Cheshire and M. Baker, Consistent Overhead Byte Stuffing, IEEE/ACM Trans. Networking 7, 1999.)
+
+    Args:
+        codec: what the bodies are.
+    """
+
+    def __init__(self, codec: BodyCodec) -> None:
+        _BinaryFraming.__init__(self, codec)
+        DelimitedFraming.__init__(self, DELIMITER, codec.longest + -(-codec.longest // 254) + 1)
+
+    def _wrap(self, body: bytes) -> bytes:
+        stuffed: bytes = cobs.encode(body)
+        return stuffed + DELIMITER
+
+    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
+        buffer, starts, stops, ends = pieces
+        lengths = unstuff(buffer, starts, stops)
+        intact = self._codec.intact(buffer, starts + 1, lengths)
+        return self._codec.sort(Bodies(buffer, starts + 1, lengths, intact, ends), found)
+
+
+class SyncFraming(_BinaryFraming):
     """Bodies of fixed length, each behind a sync word, with nothing between them.
 
     The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches, or,
@@ -242,96 +241,28 @@ class SyncFraming:
     def __init__(self, codec: BodyCodec, sync: bytes) -> None:
         if not sync:
             raise LayoutError("the sync word is empty; give the bytes that each frame begins with")
-        self._codec = codec
-        self._sync = sync
-        self._longest = len(sync) + codec.longest
+        super().__init__(codec)
+        self._sync = np.frombuffer(sync, np.uint8).copy()
         self.restart()
 
     def restart(self) -> None:
         """See `Framing.restart`."""
-        self._rest = b""
-        self._taken = 0
-        self._tried = 0
-        self._fresh = True
-        self._astray = False
+        self._rest = np.empty(0, np.uint8)
+        self._step = Step()
 
-    def encode(
-        self,
-        stream: str,
-        first_index: NDArray[np.int64],
-        samples: NDArray[np.float64] | NDArray[np.float32],
-        *,
-        clip: bool = False,
-    ) -> list[bytes]:
-        """See `Framing.encode`."""
-        bodies = self._codec.encode(stream, first_index, samples, clip=clip)
-        return [self._sync + body for body in bodies]
+    def _wrap(self, body: bytes) -> bytes:
+        return self._sync.tobytes() + body
 
     def cut(self, data: bytes) -> Found:
         """See `Framing.cut`."""
-        found = Found()
         kept = len(self._rest)
-        buffer = self._rest + data
-        width = len(self._sync)
-        follows = b"" if self._codec.checked else self._sync
-        bodies: list[bytes] = []
-        intact: list[bool] = []
-        ends: list[int] = []
-        taken = self._taken  # what is before this is in a frame, or counted
-        at = resume = self._tried
-        while (at := buffer.find(self._sync, at)) >= 0:
-            end = self._end(buffer, at)
-            if end is None:
-                at += 1
-                continue
-            if end + len(follows) > len(buffer):
-                break
-            body = buffer[at + width : end]
-            good = self._codec.is_intact(body) and buffer.startswith(follows, end)
-            if good:
-                if at > taken:
-                    self._count_garbage(at - taken, found)
-                found.resyncs += self._astray
-                self._fresh = self._astray = False
-                resume = end
-            if good or (at == taken and not self._fresh and not self._astray):
-                # A frame, or a corrupt one in the place where one is due.
-                bodies.append(body)
-                intact.append(good)
-                ends.append(end - kept)
-                taken = end
-            # What is no frame may have one inside, if bytes are missing.
-            at = end if good else at + 1
-        if at < 0:  # no sync word ahead, unless the last bytes begin one
-            at = max(resume, len(buffer) - width + 1)
-        if at - taken > 2 * self._longest:
-            self._count_garbage(at - taken, found)
-            taken = at
-        start = min(at, taken)
-        self._rest, self._taken, self._tried = buffer[start:], taken - start, at - start
-        if bodies:
-            self._codec.sort(bodies, np.array(intact), np.array(ends, np.int64), found)
+        buffer = np.concatenate([self._rest, np.frombuffer(data, np.uint8)])
+        hunted = self._codec.hunt(buffer, self._sync, self._step)
+        found = Found(garbage_bytes=hunted.garbage_bytes, malformed=hunted.malformed, resyncs=hunted.resyncs)
+        taken, tried, *state = hunted.step
+        start = min(taken, tried)
+        self._rest, self._step = buffer[start:].copy(), Step(taken - start, tried - start, *state)
+        if len(hunted.ends):
+            lengths = hunted.ends - hunted.starts
+            self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, hunted.ends - kept), found)
         return found
-
-    def _count_garbage(self, length: int, found: Found) -> None:
-        found.garbage_bytes += length
-        if not self._fresh:  # the end of a frame that began before the port was opened is no fault
-            found.malformed += not self._astray
-            self._astray = True
-
-    def _end(self, buffer: bytes, at: int) -> int | None:
-        """Where a frame that begins at ``at`` would end; None if no stream has such a frame."""
-        head = buffer[at + len(self._sync) : at + len(self._sync) + 1]
-        if not head:
-            return at + self._longest
-        stream = self._codec.stream_of(head)
-        return None if stream is None else at + len(self._sync) + self._codec.length(stream)
-
-
-def _decoded(piece: bytes) -> bytes:
-    """A piece without its stuffing; empty if it is no COBS."""
-    try:
-        body: bytes = cobs.decode(piece)
-    except cobs.DecodeError:
-        return b""
-    return body

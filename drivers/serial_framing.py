@@ -1,13 +1,13 @@
 """Frames out of a stream of bytes: what every framing of a serial port has in common.
 
 A byte stream has no frames of its own. A framing cuts it into frames, finds its feet again after garbage,
-and says how much of it was garbage. Python handles whole frames, never their bytes or samples: cutting, CRC
-and COBS run in C, and all frames of a batch are decoded as arrays. The virtual bus wraps its frames with
-the same objects.
+and says how much of it was garbage. All frames of a batch are cut, checked and decoded as arrays; no Python
+runs per frame. The virtual bus wraps its frames with the same objects.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -108,40 +108,103 @@ class Framing(Protocol):
         ...
 
 
-class Pieces:
-    """Cuts bytes at a delimiter and keeps what is incomplete, up to a length.
+class Pieces(NamedTuple):
+    """Stretches of bytes between delimiters.
 
-    Args:
-        delimiter: the byte between pieces.
-        longest: bytes of the longest piece that can be a frame; what is longer is garbage.
+    Attributes:
+        buffer: uint8, the bytes; whoever is given the pieces may change it.
+        starts: int64 ``[n]``, where each piece begins in the buffer.
+        stops: int64 ``[n]``, one past its last byte.
+        ends: int64 ``[n]``, one past its delimiter, in the bytes given to `Framing.cut`.
     """
 
-    def __init__(self, delimiter: bytes, longest: int) -> None:
-        self._delimiter = delimiter
+    buffer: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    stops: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Bytes of each piece, int64 ``[n]``."""
+        return self.stops - self.starts
+
+    def keep(self, chosen: NDArray[np.bool_] | slice) -> Pieces:
+        """Some of them."""
+        return Pieces(self.buffer, self.starts[chosen], self.stops[chosen], self.ends[chosen])
+
+
+class DelimitedFraming(ABC):
+    """Frames with a delimiter behind each: wherever one stands is a fresh start, whatever was before it.
+
+    Args:
+        delimiter: the byte behind each frame.
+        longest: bytes of the longest piece that can be a frame; what is longer is garbage.
+        padding: a byte that may stand before the delimiter and is no part of the frame.
+        whole: whether a frame shows that its beginning is missing.
+    """
+
+    def __init__(self, delimiter: bytes, longest: int, padding: bytes = b"", *, whole: bool = True) -> None:
+        self._delimiter = ord(delimiter)
         self._longest = longest
+        self._padding = padding
+        self._whole = whole
         self.restart()
 
     def restart(self) -> None:
-        """Forget what is incomplete; the next piece may be the end of one that began before."""
-        self._rest = b""
+        """See `Framing.restart`; the next piece may be the end of one that began before."""
+        self._rest = np.empty(0, np.uint8)
         self._cut_off = True
+        self._astray = False
 
-    def split(self, data: bytes, found: Found) -> tuple[list[bytes], NDArray[np.int64], bool]:
-        """The pieces that are complete now, without their delimiters; overlong ones are counted in ``found``.
+    def cut(self, data: bytes) -> Found:
+        """See `Framing.cut`."""
+        found = Found()
+        pieces, cut_off = self._split(data, found)
+        overlong = found.malformed > 0
+        if cut_off and not self._whole:
+            found.garbage_bytes += int((pieces.lengths[:1] + 1).sum())
+            pieces, cut_off = pieces.keep(slice(1, None)), False
+        full = pieces.lengths > 0
+        if not full.all():  # delimiters side by side
+            cut_off &= bool(full[0])
+            pieces = pieces.keep(full)
+        if len(pieces.ends):
+            in_step = self._sort(pieces, found)
+            found.garbage_bytes += int((pieces.lengths[~in_step] + 1).sum())
+            # The end of a frame that began before the port was opened is no fault.
+            skipped = int(cut_off and not in_step[0])
+            self._astray = found.keep_step(in_step[skipped:], self._astray)
+        self._astray |= overlong
+        return found
+
+    @abstractmethod
+    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
+        """Put the frames in pieces, none of them empty, into ``found``.
 
         Returns:
-            The pieces; int64 ``[n]``, where each ends in ``data``; and whether the first one's beginning may
-            be missing.
+            bool ``[n]``, which pieces are frames at all, be they corrupt.
+        """
+
+    def _split(self, data: bytes, found: Found) -> tuple[Pieces, bool]:
+        """The pieces that are complete now; what is not is kept, or counted in ``found`` if it is overlong.
+
+        Returns:
+            The pieces, and whether the first one's beginning may be missing.
         """
         kept = len(self._rest)
-        pieces = (self._rest + data).split(self._delimiter)
-        self._rest = pieces.pop()
-        ends = np.cumsum(np.fromiter(map(len, pieces), np.int64, len(pieces)) + 1) - kept
+        buffer = np.concatenate([self._rest, np.frombuffer(data, np.uint8)])
+        ends = np.flatnonzero(buffer == self._delimiter) + 1
+        starts = np.concatenate(([0], ends))
+        self._rest = buffer[starts[-1] :].copy()
         cut_off = self._cut_off
-        self._cut_off = cut_off and not pieces
+        self._cut_off = cut_off and not len(ends)
         if len(self._rest) > self._longest:
             found.garbage_bytes += len(self._rest)
             found.malformed += not self._cut_off
-            self._rest = b""
+            self._rest = self._rest[:0]
             self._cut_off = True
-        return pieces, ends, cut_off
+        stops = ends - 1
+        for byte in self._padding:
+            while (padded := (stops > starts[:-1]) & (buffer[stops - 1] == byte)).any():
+                stops = stops - padded
+        return Pieces(buffer, starts[:-1], stops, ends - kept), cut_off

@@ -17,17 +17,20 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from drivers.frames import Decoded, LayoutError
-from drivers.serial_framing import Found, Frames, Pieces
+from drivers.serial_framing import DelimitedFraming, Frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from drivers.serial_framing import Found, Pieces
+
 Checksum = Literal["none", "xor", "crc16"]
 TimeUnit = Literal["s", "ms", "us"]
 
 NEWLINE = b"\n"
+RETURN = b"\r"
 LONGEST_LINE = 1024
 """Bytes; a line that is longer is garbage."""
 
@@ -201,7 +204,7 @@ class DeviceTime:
         return counts
 
 
-class LineFraming:
+class LineFraming(DelimitedFraming):
     """Lines of text, each one sample; a line that cannot be read costs itself only.
 
     Args:
@@ -241,14 +244,9 @@ class LineFraming:
         self._times = {
             name: DeviceTime(rates_hz[name]) for name, layout in layouts.items() if layout.time is not None
         }
-        self._pieces = Pieces(delimiter, LONGEST_LINE)
-        self._end = b"\r\n" if delimiter == NEWLINE else delimiter
-        self._astray = False
-
-    def restart(self) -> None:
-        """See `drivers.serial_framing.Framing.restart`."""
-        self._pieces.restart()
-        self._astray = False
+        self._end = RETURN + NEWLINE if delimiter == NEWLINE else delimiter
+        # Without a checksum nothing shows whether the beginning of a line is missing, e.g. a digit.
+        super().__init__(delimiter, LONGEST_LINE, RETURN, whole=checksum != "none")
 
     def encode(
         self,
@@ -272,31 +270,10 @@ class LineFraming:
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
-    def cut(self, data: bytes) -> Found:
-        """See `drivers.serial_framing.Framing.cut`."""
-        found = Found()
-        pieces, ends, cut_off = self._pieces.split(data, found)
-        overlong = found.malformed > 0
-        if cut_off and pieces and self._checksum == "none":
-            # Nothing shows whether the beginning of this line is missing, e.g. a digit.
-            found.garbage_bytes += len(pieces[0]) + 1
-            pieces, ends, cut_off = pieces[1:], ends[1:], False
-        lines = [piece.rstrip(b"\r") for piece in pieces]
-        if not all(lines):
-            full = [k for k, line in enumerate(lines) if line]
-            cut_off &= bool(lines[0])
-            lines, ends = [lines[k] for k in full], ends[full]
-        if lines:
-            in_step = self._sort(lines, ends, found)
-            found.garbage_bytes += sum(len(lines[k]) + 1 for k in np.flatnonzero(~in_step).tolist())
-            self._astray = found.keep_step(
-                in_step[1:] if cut_off and not in_step[0] else in_step, self._astray
-            )
-        self._astray |= overlong
-        return found
-
-    def _sort(self, lines: list[bytes], ends: NDArray[np.int64], found: Found) -> NDArray[np.bool_]:
+    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
         """Read lines into ``found``, by stream; returns which of them were lines at all."""
+        buffer, starts, stops, ends = pieces
+        lines = [buffer[a:b].tobytes() for a, b in zip(starts.tolist(), stops.tolist(), strict=True)]
         texts, intact = self._check(lines)
         in_step = np.zeros(len(lines), np.bool_)
         chosen: dict[str, list[int]] = defaultdict(list)

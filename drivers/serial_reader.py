@@ -1,7 +1,8 @@
-"""The thread that reads an open serial port.
+"""The two threads of an open serial port.
 
-It takes bytes from the port's file descriptor, gathers them into batches, and hands each to the event loop
-with its frames found and decoded. When the event loop cannot keep up the thread waits.
+One takes bytes from the port's file descriptor and gathers them into batches. The other finds and decodes the
+frames of each batch, mostly without the interpreter's lock, and hands them to the event loop; meanwhile the
+first one reads on. When the event loop cannot keep up they wait.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ import errno
 import fcntl
 import logging
 import os
+import queue
 import select
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Callable
 
     import serial
     from numpy.typing import NDArray
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 POLL_MS = 50
-GATHER_NS = 2_000_000
+GATHER_NS = 5_000_000
 """How long bytes are gathered into one batch: one turn of the event loop then serves them all."""
 
 READ_BYTES = 65_536
@@ -90,10 +94,13 @@ class _HungUpError(Exception):
 class SerialReader(threading.Thread):
     """Reads one open port until told to stop or the port fails; `ended` then holds the reason.
 
+    It brings the thread that cuts what it has read. Whatever the event loop is told goes through that one, so
+    it is told in order.
+
     Args:
         name: what a person calls the port.
         device: the open port, in non-blocking mode.
-        framing: cuts what is read into frames; used by this thread alone.
+        framing: cuts what is read into frames; used by the cutting thread alone.
         taker: who is given the frames.
         clock: stamps arrivals.
         loop: where the taker lives.
@@ -120,8 +127,15 @@ class SerialReader(threading.Thread):
         self._loop = loop
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._cutter = threading.Thread(target=self._cut_on, name=f"cutter of {name}", daemon=True)
         self._line_errors = _line_errors(self._fd)
         self._line_errors_due_ns = 0
+
+    def start(self) -> None:
+        """Start both threads."""
+        self._cutter.start()
+        super().start()
 
     def run(self) -> None:
         """Read until `close` is called or the port fails."""
@@ -133,9 +147,9 @@ class SerialReader(threading.Thread):
             reason = f"{error}"
         except Exception as error:
             logger.exception("the %s failed", self.name)
-            self._post(self._taker.note, "reader_failures")
-            reason = f"its reader failed: {error or type(error).__name__}"
-        self._post(self._end, reason)
+            reason = self._failed(error)
+        self._jobs.put(partial(self._post, self._end, reason))
+        self._jobs.put(None)
 
     def close(self) -> None:
         """Stop reading and close the port; may take a while, as closing a port may."""
@@ -143,10 +157,27 @@ class SerialReader(threading.Thread):
         self.join(SHUTDOWN_S)
         if self.is_alive():
             logger.warning("the %s hangs in the port and is left behind", self.name)
+            self._jobs.put(None)
+        self._cutter.join(SHUTDOWN_S)
         close_port(self._device)
 
+    def _cut_on(self) -> None:
+        """Do what the reading thread asks for, in turn."""
+        try:
+            while (job := self._jobs.get()) is not None:
+                job()
+        except Exception as error:
+            logger.exception("the %s failed", self._cutter.name)
+            self._stopping.set()
+            self._post(self._end, self._failed(error))
+
+    def _failed(self, error: Exception) -> str:
+        """Count a failure of one of the threads, and say it in words."""
+        self._post(self._taker.note, "reader_failures")
+        return f"its reader failed: {error or type(error).__name__}"
+
     def _drain(self) -> None:
-        """Gather what comes within 2 ms, or a batch of it, and hand it over.
+        """Gather what comes within 5 ms, or a batch of it, and have it cut.
 
         Raises:
             _HungUpError: the port is gone; what was read before has been handed over.
@@ -155,7 +186,7 @@ class SerialReader(threading.Thread):
         if not self._poll.poll(POLL_MS):
             # Asked before the port was: whatever came until then has been seen by now.
             self._look_at_line(asked_ns)
-            self._post(self._taker.tick, asked_ns)
+            self._jobs.put(partial(self._post, self._taker.tick, asked_ns))
             return
         chunks: list[bytes] = []
         arrival_ns: list[int] = []
@@ -176,8 +207,8 @@ class SerialReader(threading.Thread):
             left_ms = (until_ns - time.monotonic_ns()) // 1_000_000
             if left_ms <= 0 or not self._poll.poll(left_ms):
                 break
-        if chunks:
-            self._hand_over(self._cut(chunks, arrival_ns))
+        if chunks and self._may_hand_over():
+            self._jobs.put(partial(self._cut, chunks, arrival_ns))
         if failure is not None:
             raise failure
         self._look_at_line(asked_ns)
@@ -199,8 +230,8 @@ class SerialReader(threading.Thread):
             raise _HungUpError("it has hung up (unplugged, or its device was reset)")
         return chunk
 
-    def _cut(self, chunks: list[bytes], arrival_ns: list[int]) -> Batch:
-        """Find and decode the frames in what was read."""
+    def _cut(self, chunks: list[bytes], arrival_ns: list[int]) -> None:
+        """Find and decode the frames in what was read, and hand them to the event loop."""
         found = self._framing.cut(b"".join(chunks))
         ends = np.cumsum([len(chunk) for chunk in chunks])
         at = np.array(arrival_ns, np.int64)
@@ -209,7 +240,7 @@ class SerialReader(threading.Thread):
             name: at[np.searchsorted(ends, frames.ends, "left").clip(0, len(at) - 1)]
             for name, frames in found.frames.items()
         }
-        return Batch(int(ends[-1]), found, arrivals)
+        self._post(self._take, Batch(int(ends[-1]), found, arrivals))
 
     def _look_at_line(self, now_ns: int) -> None:
         """Count what the UART has found wrong since the last look."""
@@ -224,13 +255,15 @@ class SerialReader(threading.Thread):
             if later != earlier:
                 self._post(self._taker.note, name, (later - earlier) % 2**32)
 
-    def _hand_over(self, batch: Batch) -> None:
-        if not self._under_way.acquire(blocking=False):
-            self._post(self._taker.note, "stalls")
-            while not self._under_way.acquire(timeout=POLL_MS / 1000):
-                if self._stopping.is_set():
-                    return
-        self._post(self._take, batch)
+    def _may_hand_over(self) -> bool:
+        """Wait until the event loop has room for another batch; False if the wait was ended by `close`."""
+        if self._under_way.acquire(blocking=False):
+            return True
+        self._post(self._taker.note, "stalls")
+        while not self._under_way.acquire(timeout=POLL_MS / 1000):
+            if self._stopping.is_set():
+                return False
+        return True
 
     def _take(self, batch: Batch) -> None:
         self._under_way.release()
