@@ -73,7 +73,7 @@ class RotorSignals:
         if kind != "proximity":
             raise SignalError(
                 f"sensor {sensor.name!r} is of type {kind!r}, and a rotor scenario gives proximity probes "
-                "and keyphasors; choose the streams that hold those with --stream"
+                "and keyphasors; choose the streams that hold those with --stream, or play a --recording"
             )
         stated = getattr(sensor, "angle_deg", None)
         angle_deg = self._angles_deg.setdefault(
@@ -133,7 +133,7 @@ class BearingSignals:
         if kind != "accelerometer":
             raise SignalError(
                 f"sensor {sensor.name!r} is of type {kind!r}, and a bearing scenario gives accelerometers; "
-                "choose the streams that hold those with --stream"
+                "choose the streams that hold those with --stream, or play a --recording"
             )
         if rate_hz not in self._runs:
             self._runs[rate_hz] = self._scenario.accelerations(rate_hz, self._seed, self._snr_db)

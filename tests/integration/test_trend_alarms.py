@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import json
 import struct
+import sys
 
-from brokers import eventually
+import numpy as np
+from brokers import PATIENCE_S, eventually
 from live_service import running
 from machine_files import MACHINES, changed
 
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.alarms.status import AlarmStatus
-from daqsvc.settings import parse_machine_file
+from daqsvc.settings import load_machine_file
 from sim_hw.nodes.modbus_node import Answer, ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -20,7 +24,7 @@ AXIAL, RADIAL, TEMPERATURE = 17, 21, 19
 UNHEARD = AlarmStatus(AlarmState.NORMAL, Level.NORMAL, None, None, "")
 
 
-def pump(folder, *more):
+def pump(folder):
     """The pump on a line of this test, ten values a second and short delays; and the place of that line."""
     link = folder / "ttyUSB0"
     text, _ = changed(
@@ -28,13 +32,14 @@ def pump(folder, *more):
         ("/dev/ttyUSB0", str(link)),
         ("timeout_ms = 500.0", "timeout_ms = 50.0\ndemotion_s = 0.2"),
         ("[pipeline.levels]", "[pipeline.levels]\nwindow_s = 0.1\n"),
-        *more,
     )
     for old, new in [("rate_hz = 1.0", "rate_hz = 10.0"), ("on_delay_s = 5.0", "on_delay_s = 0.2")]:
         text = text.replace(old, new)
     for delay in ("on_delay_s = 10.0", "off_delay_s = 10.0"):
         text = text.replace(delay, delay.replace("10.0", "0.3"))
-    return parse_machine_file(text, PUMP), link
+    path = folder / "pump.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_machine_file(path), link
 
 
 class Sensor:
@@ -143,3 +148,22 @@ async def test_a_temperature_leaves_its_window_both_ways_and_a_broken_sensor_say
             lambda: alarm("de-temperature").state is AlarmState.ACTIVE_UNACKNOWLEDGED, "it freezes"
         )
         assert "is 1 degC, lower alert limit 2 degC" in alarm("de-temperature").message
+
+
+async def test_the_simulator_plays_a_trend_that_raises_an_alarm_and_returns_it(tmp_path):
+    machine, link = pump(tmp_path)
+    names = [sensor.name for sensor in machine.sensors]
+    trend = np.tile([1.1, 1.2, 45.0, 0.9, 1.0, 40.0], (45, 1))
+    trend[10:25, names.index("nde-radial")] = 4.7
+    np.savetxt(tmp_path / "trend.csv", trend, fmt="%.3f", delimiter=",", header=",".join(names), comments="")
+    playing = ["sim", machine.path, "--recording", tmp_path / "trend.csv", "--fs", "10", "--link", link]
+    async with running(machine, tmp_path / "store") as service:
+        sim = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "daqsvc", *playing, stdout=asyncio.subprocess.PIPE
+        )
+        async with asyncio.timeout(PATIENCE_S):
+            output, _ = await sim.communicate()
+        assert sim.returncode == 0
+        assert json.loads(output)["complete"]
+        alarm = service.desk.manager.alarms["nde-vibration"]
+        assert alarm.state is AlarmState.RETURNED_UNACKNOWLEDGED

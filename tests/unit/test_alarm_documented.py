@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -14,7 +15,9 @@ from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.conditions import RESERVED
 from daqsvc.alarms.diagram import state_diagram
 from daqsvc.alarms.states import AlarmState, moves
-from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, StartUp, VotingAlarm
+from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, Measure, StartUp, VotingAlarm
+from daqsvc.settings.pipeline import Levels
+from daqsvc.settings.sensors import TrendValue
 
 TEXT = (Path(__file__).parents[2] / "docs" / "alarms.md").read_text(encoding="utf-8")
 
@@ -52,8 +55,8 @@ def test_every_state_verb_and_own_alarm_is_explained(word):
 
 
 def test_the_example_is_valid_has_every_key_and_the_defaults():
-    (example,) = map(tomllib.loads, fenced("toml"))
-    level, vote, detector = example["alarms"]
+    example, _ = map(tomllib.loads, fenced("toml"))
+    level, vote, both_sides, detector = example["alarms"]
     assert LevelAlarm.model_validate(level).trip_multiply == 2.0
     assert VotingAlarm.model_validate(vote).vote == 2
     assert DiagnosisAlarm.model_validate(detector).evidence_nats == 18.0
@@ -62,4 +65,21 @@ def test_the_example_is_valid_has_every_key_and_the_defaults():
     assert handling == AlarmHandling().model_dump(exclude={"start_up"})
     assert set(start_up) == set(StartUp.model_fields)
     assert StartUp.model_validate(start_up).at_most_s == StartUp.model_fields["at_most_s"].default
-    assert set(level) | {"sensors", "vote"} == set(LevelAlarm.model_fields) | set(VotingAlarm.model_fields)
+    assert LevelAlarm.model_validate(both_sides).setpoints == {
+        "danger_low": 5.0,
+        "alert_low": 10.0,
+        "alert": 65.0,
+        "danger": 75.0,
+    }
+    named = {*level, *both_sides, "sensors", "vote"}
+    assert named == set(LevelAlarm.model_fields) | set(VotingAlarm.model_fields)
+
+
+def test_every_measure_is_in_the_table_and_the_trend_value_has_every_key():
+    table = "".join(re.findall(r"^\| `.*`.*\|$", TEXT.split("| `measure` |")[1], re.MULTILINE))
+    assert all(f"`{measure}`" in table for measure in get_args(Measure))
+    _, example = map(tomllib.loads, fenced("toml"))
+    (sensor,) = example["sensors"]
+    assert TrendValue.model_validate(sensor).ok_between == (-40.0, 125.0)
+    assert set(sensor) == set(TrendValue.model_fields) - {"sensitivity_mv_per_unit", "zero_v"}
+    assert Levels.model_validate(example["pipeline"]["levels"]) == Levels()
