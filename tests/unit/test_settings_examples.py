@@ -206,7 +206,7 @@ def test_cantools_is_only_needed_for_dbc_files(monkeypatch):
     for name in ("cantools", "cantools.database", "cantools.database.errors"):
         monkeypatch.setitem(sys.modules, name, None)
     for path in EXAMPLES:
-        if path != TRIAXIAL:
+        if "\ndbc = " not in path.read_text(encoding="utf-8"):
             load_machine_file(path)
     (problem,) = problems_of(TRIAXIAL.read_text(encoding="utf-8"), TRIAXIAL)
     assert problem.key == "streams.housing.layout.dbc"
