@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -118,9 +119,9 @@ class BearingScenario(_Table):
 
         # The machine is linear: its vibration is what it does when healthy, and what the damage adds.
         y = run("healthy", level, calm)
-        ends = [*(d.at_s for d in self.damage[1:]), self.duration_s]
-        for damage, end_s, rng in zip(self.damage, ends, of_damage, strict=True):
-            part = slice(round(damage.at_s * rate_hz), round(end_s * rate_hz))
+        borders_s = [*(damage.at_s for damage in self.damage), self.duration_s]
+        for damage, (from_s, to_s), rng in zip(self.damage, pairwise(borders_s), of_damage, strict=True):
+            part = slice(round(from_s * rate_hz), round(to_s * rate_hz))
             y[part] += run(damage.part, _SILENT, rng)[part]
         return Run(rotor_m_s2=y[:, 0], housing_m_s2=y[:, 1])
 

@@ -3,9 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daqsvc.settings.sensors import Accelerometer
 from sim_hw.link_faults import LinkFaults
 from sim_hw.scenario import ScenarioError, builtin_scenarios, load_scenario
+from sim_hw.scenario_bearing import BearingScenario, Damage
+from sim_hw.sim_command_signals import BearingSignals
 
+ACCELEROMETER = Accelerometer(name="a", stream="s", channel="c", type="accelerometer", unit="m/s2")
 PLANT = '[plant]\nkind = "rotor"\n'
 SHORT = f"""
 title = "A short one"
@@ -167,3 +171,17 @@ def test_an_unknown_name_is_answered_with_the_known_ones():
         load_scenario("papper")
     with pytest.raises(ScenarioError, match="cannot be read"):
         load_scenario("/")
+
+
+def test_a_bearing_that_stays_healthy_and_one_whose_damage_lies_beyond_the_end():
+    healthy = BearingScenario.model_validate(
+        {"title": "", "duration_s": 0.5, "plant": {"kind": "bearing"}, "damage": []}
+    )
+    run = healthy.accelerations(2000.0)
+    assert len(run.rotor_m_s2) == len(run.housing_m_s2) == 1000
+    damaged = healthy.model_copy(update={"damage": (Damage(part="inner", at_s=0.3),)})
+    spalled = damaged.accelerations(2000.0)
+    onset = 600
+    assert np.array_equal(spalled.rotor_m_s2[:onset], run.rotor_m_s2[:onset])
+    assert not np.array_equal(spalled.rotor_m_s2[onset:], run.rotor_m_s2[onset:])
+    assert len(BearingSignals(damaged, 0.3).of(ACCELEROMETER, 2000.0)) == onset, "played to before the damage"
