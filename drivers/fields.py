@@ -104,11 +104,14 @@ class RawValues:
     Args:
         cells: the fields.
         valid: for each, the least and the largest raw value that is a measurement; None where all are.
+
+    Attributes:
+        all_measured: whether all raw values of all of them are measurements.
     """
 
     def __init__(self, cells: Sequence[Field], valid: Sequence[tuple[float, float] | None]) -> None:
         n = len(cells)
-        self._all_measured = not any(valid)
+        self.all_measured = not any(valid)
         self._measured = np.array([given or (-np.inf, np.inf) for given in valid], np.float64).reshape(n, 2).T
         self._least, self._largest, self._no_value = np.empty(n), np.empty(n), np.full(n, np.nan)
         for k, (cell, (low, high)) in enumerate(zip(cells, self._measured.T.tolist(), strict=True)):
@@ -122,7 +125,7 @@ class RawValues:
 
     def leave_out_absent(self, raw: NDArray[np.float64]) -> None:
         """Put NaN in place of raw values ``[n, cells]`` that are no measurements."""
-        if not self._all_measured:
+        if not self.all_measured:
             low, high = self._measured
             raw[(raw < low) | (raw > high)] = np.nan
 

@@ -19,7 +19,7 @@ from cobs import cobs
 
 from drivers.frames import LayoutError
 from drivers.serial_framing import DelimitedFraming, Found, Frames
-from drivers.serial_kernels import CRC_BYTES, Step, crcs_match, gather, hunt, unstuff
+from drivers.serial_kernels import CRC_BYTES, Step, crcs_match, gather, hunt, in_units, unstuff
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -162,7 +162,7 @@ class BodyCodec:
             if not mine.any():
                 continue
             strays &= ~mine
-            decoded = layout.decode(gather(buffer, starts[mine] + self._head, layout.length))
+            decoded = layout.decode(gather(buffer, starts[mine] + self._head, layout.length), in_units)
             found.frames[name] = Frames(decoded._replace(intact=decoded.intact & intact[mine]), ends[mine])
         for k in np.flatnonzero(strays & sound).tolist():
             owner = self._by_id.get(int(ids[k]))

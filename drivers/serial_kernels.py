@@ -1,4 +1,4 @@
-"""Compiled loops over the bytes of a serial port: CRC-16, the stuffing of COBS, and the hunt for sync words.
+"""Compiled loops over what a serial port brings: CRC-16, the stuffing of COBS, sync words, physical units.
 
 Each goes over a whole batch without the interpreter and without its lock. What they compute is what
 `binascii.crc_hqx` and the library `cobs` compute; those write the frames of the virtual bus, and are what the
@@ -8,7 +8,7 @@ tests hold these against.
 from __future__ import annotations
 
 import binascii
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -150,6 +150,18 @@ def gather(buffer: Bytes, starts: Places, length: int) -> Bytes:
         for i, byte in enumerate(buffer[starts[k] : starts[k] + length]):
             rows[k, i] = byte
     return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def in_units(
+    raw: NDArray[Any], scale: NDArray[np.float64], offset: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Raw numbers ``[n, fields]`` in physical units, float32 ``[n, fields]``; see `FrameLayout.decode`."""
+    values = np.empty(raw.shape, np.float32)
+    for k in range(raw.shape[0]):
+        for i in range(raw.shape[1]):
+            values[k, i] = np.float64(raw[k, i]) * scale[i] + offset[i]
+    return values
 
 
 class Step(NamedTuple):

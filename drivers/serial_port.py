@@ -15,6 +15,7 @@ import termios
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import serial
 
 from daqsvc.acquisition.assembler import StreamAssembler
@@ -104,6 +105,7 @@ class SerialDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
+            await in_thread(_warm, self._port.options, self._port.streams, patience_s=SHUTDOWN_S)
             await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
@@ -227,6 +229,15 @@ def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -
     if options["framing"] == "sync":
         return SyncFraming(codec, bytes.fromhex(options["sync_word"]))
     return CobsFraming(codec)
+
+
+def _warm(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> None:
+    """Have the loops that the streams need compiled, before their data come in."""
+    framing = framing_of(options, streams)
+    for spec in streams:
+        shape = (3, spec.layout.samples_per_frame, len(spec.layout.channels))
+        frames = framing.encode(spec.name, np.zeros(3, np.int64), np.zeros(shape), clip=True)
+        framing.cut(b"".join(frames))
 
 
 def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:

@@ -10,7 +10,8 @@ from cobs import cobs
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.serial_kernels import crc16, crcs_match, gather, unstuff
+from drivers.frames import FrameLayout
+from drivers.serial_kernels import crc16, crcs_match, gather, in_units, unstuff
 
 # Runs without a zero around 254 bytes are where the codes of COBS are special.
 RUNS = st.lists(
@@ -91,3 +92,34 @@ def test_what_is_too_short_for_a_crc_matches_none() -> None:
 def test_rows_are_gathered_from_wherever_they_begin() -> None:
     buffer = np.arange(20, dtype=np.uint8)
     assert gather(buffer, np.array([16, 0, 3]), 4).tolist() == [[16, 17, 18, 19], [0, 1, 2, 3], [3, 4, 5, 6]]
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+@pytest.mark.parametrize(
+    ("bits", "kind"),
+    [
+        (8, "signed"),
+        (16, "unsigned"),
+        (16, "signed"),
+        (24, "signed"),
+        (32, "unsigned"),
+        (32, "float"),
+        (64, "float"),
+    ],
+)
+@given(data=st.binary(min_size=48, max_size=48))
+def test_values_in_units_are_those_of_the_arrays(bits, kind, order, data: bytes) -> None:
+    layout = FrameLayout.plain(
+        frame_id=0,
+        length=24,
+        channels=[("x", bits, kind, 0.37, -1.5)],
+        samples_per_frame=128 // bits,
+        counter_byte=0,
+        counter_bits=32,
+        first_byte=4,
+        byte_order=order,
+    )
+    payloads = np.frombuffer(data, np.uint8).reshape(2, 24)
+    got, want = layout.decode(payloads, in_units), layout.decode(payloads)
+    assert got.counter.tolist() == want.counter.tolist()
+    np.testing.assert_array_equal(got.samples, want.samples)
