@@ -13,6 +13,7 @@ from daqsvc import assembly, assembly_drivers, cli
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.levels import LevelDetector
+from daqsvc.diagnosis.trends import TrendDetector
 from daqsvc.settings import load_machine_file, parse_machine_file
 from drivers.frames import FrameLayout
 
@@ -40,7 +41,7 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     assert [driver.name for driver in made] == list(machine.buses)
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
     detectors = assembly.detectors(machine)
-    watched = any(isinstance(detector, LevelDetector) for detector in detectors)
+    watched = any(isinstance(detector, LevelDetector | TrendDetector) for detector in detectors)
     assert watched == (machine.pipeline.levels is not None)
     assert [rule.alarm for rule in alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
     for detector in detectors:
