@@ -64,7 +64,7 @@ class CanRecorder:
         self._counters = counters
         self._lock = threading.Lock()
         self._held = 0
-        self._given_up = False
+        self._closed = False
         self._too_slow = False
         self._queue: queue.SimpleQueue[CanBatch | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_all, name=f"can-recorder {link_name}", daemon=True)
@@ -84,14 +84,15 @@ class CanRecorder:
         if not frames:
             return
         with self._lock:
-            fits = self._held + frames <= MOST_FRAMES_HELD and not self._given_up
-            if fits:
-                self._held += frames
-            else:
+            too_many = self._held + frames > MOST_FRAMES_HELD
+            left_out = too_many or self._closed
+            if left_out:
                 self._counters.frames_unrecorded += frames
-        if fits:
+            else:
+                self._held += frames
+        if not left_out:
             self._queue.put(batch.kept())
-        elif not self._too_slow:
+        elif too_many and not self._too_slow:
             self._too_slow = True
             logger.warning(
                 "%s: its frames come faster than they can be recorded in %s; those left out are counted in "
@@ -105,28 +106,30 @@ class CanRecorder:
         self._queue.put(None)
         self._thread.join(PATIENCE_S)
         with self._lock:
-            self._given_up = True
+            self._closed = True
             left, self._held = self._held, 0
             self._counters.frames_unrecorded += left
         if self._thread.is_alive():
             logger.warning(
-                "%s: the disk of %s hangs; the recording is left behind with %d frames unrecorded",
+                "%s: its last %d frames could not be recorded in %s within %g s and are given up; the disk "
+                "hangs or is too slow",
                 self._link_name,
-                self._logs.place,
                 left,
+                self._logs.place,
+                PATIENCE_S,
             )
 
     def _write_all(self) -> None:
-        while True:
+        while not self._closed:
             try:
                 batch = self._queue.get(timeout=IDLE_S)
             except queue.Empty:
                 self._flush()
                 continue
             if batch is None:
+                self._flush()
                 break
             self._write(batch)
-        self._flush()
         self._end_log()
 
     def _write(self, batch: CanBatch) -> None:
@@ -155,7 +158,6 @@ class CanRecorder:
             return
         try:
             self._log.flush()
-            full = self._log.size >= self._logs.file_bytes or self._log.deleted
         except Exception as error:  # noqa: BLE001 - as above
             self._fail(error)
             return
@@ -170,7 +172,7 @@ class CanRecorder:
                 self._missing,
             )
             self._failed_ns, self._missing = None, 0
-        if full:
+        if self._log.size >= self._logs.file_bytes or self._log.deleted:
             self._end_log()
 
     def _fail(self, error: Exception) -> None:
@@ -192,7 +194,7 @@ class CanRecorder:
         """Count frames that are held no longer; not those that were given up meanwhile."""
         self._missing += unrecorded
         with self._lock:
-            if not self._given_up:
+            if not self._closed:
                 self._held -= recorded + unrecorded
                 self._counters.frames_recorded += recorded
                 self._counters.frames_unrecorded += unrecorded

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import signal
 import sys
 from dataclasses import asdict
@@ -131,9 +132,8 @@ def _check_new(log: Path) -> None:
 
 def _logs(log: Path) -> set[Path]:
     """The file, and the files that go on with it where the disk refused for a while."""
-    return {
-        path for path in log.parent.iterdir() if path.name.startswith(log.stem) and path.suffix == log.suffix
-    }
+    names = re.compile(re.escape(log.stem) + r"(-\d+)?" + re.escape(log.suffix))
+    return {path for path in log.parent.iterdir() if names.fullmatch(path.name)}
 
 
 async def _run_until_stopped(driver: Driver, duration_s: float | None) -> None:
