@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from brokers import running_mosquitto
+from sim_processes import BAD_LINK
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
@@ -57,3 +58,11 @@ def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
     """A broker that has just been started."""
     with running_mosquitto(tmp_path) as broker:
         yield broker
+
+
+@pytest.fixture
+def bad_link(tmp_path: Path) -> Path:
+    """A scenario for ``daqsvc sim`` in which a lot goes wrong with the link."""
+    path = tmp_path / "bad-link.toml"
+    path.write_text(BAD_LINK, encoding="utf-8")
+    return path

@@ -1,105 +1,40 @@
-"""``daqsvc sim`` as a process of its own, and what clients make of what it plays."""
+"""``daqsvc sim`` on the virtual CAN bus, and what clients make of what it plays."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import re
 import shlex
 import signal
-import subprocess
-import sys
 import time
-from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from brokers import Consumer, Mosquitto, eventually, free_port, running_mosquitto
+from brokers import Consumer, eventually
 from live_service import running
+from machine_files import MOTOR
+from sim_processes import (
+    DOCUMENTATION,
+    PATIENCE_S,
+    PER_FRAME,
+    SCENARIOS,
+    VIRTUAL_RIG,
+    process,
+    summary_of,
+)
 
 from daqsvc import assembly_drivers
-from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings import parse_machine_file
 from sim_hw.bus_socket import UnixBus
 from sim_hw.scenario import load_any_scenario
+from sim_hw.sim_command_signals import BearingSignals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-VIRTUAL_RIG = ROOT / "config" / "machines" / "virtual-rig.toml"
-DOCUMENTATION = ROOT / "docs" / "virtual-bus.md"
-BAD_BUS = ROOT / "config" / "scenarios" / "bad-bus.toml"
-PATIENCE_S = 60.0
-PER_FRAME = 10
-
-FAULTS = """
-title = "A healthy rotor on a bad bus"
-revolutions = 70.0
-samples_per_rev = 64
-[plant]
-kind = "rotor"
-[[fault]]
-kind = "drift"
-ppm = 60.0
-[[fault]]
-kind = "link"
-from_s = 1.0
-to_s = 5.0
-drop = 0.08
-duplicate = 0.08
-corrupt = 0.08
-[[fault]]
-kind = "delay"
-from_s = 2.0
-to_s = 4.0
-delay_ms = 2.0
-jitter_ms = 3.0
-[[fault]]
-kind = "silence"
-from_s = 5.2
-to_s = 5.6
-"""
-BABBLE = """
-[[fault]]
-kind = "babble"
-from_s = 3.0
-to_s = 4.0
-rate_hz = 400.0
-"""
-
-
-@pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    path = tmp_path / "faults.toml"
-    path.write_text(FAULTS + BABBLE)
-    return path
-
-
-@contextlib.contextmanager
-def process(verb: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """A ``daqsvc`` that is ended with the test, however that ends."""
-    running = subprocess.Popen(
-        [sys.executable, "-m", "daqsvc", verb, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.kill()
-        running.communicate()
-
-
-async def summary_of(sim: subprocess.Popen[str]) -> dict[str, Any]:
-    """What a simulator says at its end."""
-    output, errors = await asyncio.to_thread(sim.communicate, timeout=PATIENCE_S)
-    assert sim.returncode == 0, errors
-    return json.loads(output)
+    from brokers import Mosquitto
 
 
 def documented(verb: str, places: dict[str, Path]) -> list[str]:
@@ -116,12 +51,6 @@ def rig_file(folder: Path, path: Path, port: int) -> Path:
     return file
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    with running_mosquitto(tmp_path) as broker:
-        yield broker
-
-
 def status_of(consumer: Consumer) -> dict[str, Any]:
     found = consumer.on("/status")
     return found[-1].payload["figures"] if found else {}
@@ -133,14 +62,14 @@ def figures(consumer: Consumer, group: str, name: str, figure: str) -> Any:
 
 @pytest.mark.mosquitto
 async def test_run_counts_to_the_sample_what_sim_has_sent_and_spoilt(
-    tmp_path: Path, scenario: Path, broker: Mosquitto
+    tmp_path: Path, bad_link: Path, mosquitto: Mosquitto
 ) -> None:
-    machine = rig_file(tmp_path, tmp_path / "can0", broker.port)
-    async with Consumer(broker.port) as consumer:
+    machine = rig_file(tmp_path, tmp_path / "can0", mosquitto.port)
+    async with Consumer(mosquitto.port) as consumer:
         places = {
             "config/machines/virtual-rig.toml": machine,
             "/tmp/daqsvc-virtual": tmp_path / "store",  # noqa: S108
-            "paper": scenario,
+            "paper": bad_link,
         }
         with process(*documented("run", places)) as service:
             await eventually(lambda: figures(consumer, "buses", "can0", "up") == 1, "the bus is up")
@@ -176,11 +105,11 @@ async def test_run_counts_to_the_sample_what_sim_has_sent_and_spoilt(
 
 @pytest.mark.mosquitto
 async def test_a_bus_that_is_killed_comes_back_and_the_books_still_close(
-    tmp_path: Path, broker: Mosquitto
+    tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
     path = tmp_path / "can0"
-    machine = rig_file(tmp_path, path, broker.port)
-    async with Consumer(broker.port) as consumer:
+    machine = rig_file(tmp_path, path, mosquitto.port)
+    async with Consumer(mosquitto.port) as consumer:
         with (
             process("sim", "--bus", path) as hub,
             process("run", machine, "--store", tmp_path / "store"),
@@ -271,173 +200,25 @@ def test_a_recording_is_played_by_the_names_of_the_sensors(tmp_path: Path) -> No
     assert json.loads(output)["streams"]["shaft"]["samples_sent"] == 640
 
 
-SERIAL = """
-[buses.probes]
-driver = "serial"
-port = "{port}"
-baud = 921600
-framing = "cobs"
-[streams.shaft]
-bus = "probes"
-rate_hz = 640.0
-[streams.shaft.layout]
-payload_length = 64
-counter = {{ byte = 0, bits = 32, counts = "samples" }}
-first_byte = 4
-samples_per_frame = 10
-channels = [
-  {{ name = "x", type = "int16", scale = 0.001 }},
-  {{ name = "y", type = "int16", scale = 0.001 }},
-  {{ name = "kph", type = "int16", scale = 0.001 }},
-]
-"""
-
-
-def machine_text(buses: str) -> str:
-    """The virtual rig on other buses."""
-    text = VIRTUAL_RIG.read_text()
-    before, rest = text.split("[buses.can0]", 1)
-    _, after = rest.split("[[sensors]]", 1)
-    return re.sub(r"\[mqtt\].*", "", before + buses + "[[sensors]]" + after, flags=re.DOTALL)
-
-
-@pytest.fixture
-def serial_file(tmp_path: Path) -> Path:
-    file = tmp_path / "serial.toml"
-    file.write_text(machine_text(SERIAL.format(port=tmp_path / "ttyProbes")))
-    return file
-
-
-async def test_a_serial_device_behind_a_pseudo_terminal(
-    tmp_path: Path, scenario: Path, serial_file: Path
-) -> None:
-    file, machine = serial_file, load_machine_file(serial_file)
+async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) -> None:
+    path, damage = tmp_path / "can0", tmp_path / "damage.toml"
+    damage.write_text((SCENARIOS / "bearing-damage.toml").read_text().replace("at_s = 10.0", "at_s = 1.0"))
+    text = MOTOR.read_text().partition("[mqtt]")[0]
+    text = text.replace('"socketcan"', '"unixbus"').replace('channel = "can0"', f'channel = "{path}"')
+    file = tmp_path / "motor.toml"
+    file.write_text(text)
+    machine = parse_machine_file(text, file)
     async with running(machine, tmp_path / "store") as service:
-        with process("sim", file, "--scenario", scenario) as sim:
+        await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
+        with process("sim", file, "--scenario", damage, "--seed", 7, "--duration", 3) as sim:
             summary = await summary_of(sim)
-        sent = summary["streams"]["shaft"]
-        counted = service.figures()["streams"]["shaft"]
-    assert summary["buses"] == {"probes": str(tmp_path / "ttyProbes")}
-    assert sent["injected"]["silenced"] > 10
-    assert sent["frames_unsent"] == 0
-    assert counted["samples_received"] + counted["samples_lost"] == sent["samples_sent"] == 4480
-    injected = sent["injected"]
-    lost = injected["dropped"] + injected["silenced"] + injected["corrupted"]
-    assert counted["samples_lost"] == PER_FRAME * lost
-    assert counted["frames_duplicate"] == injected["duplicated"]
-    assert not (tmp_path / "ttyProbes").is_symlink()
-
-
-MODBUS = """
-[buses.line]
-driver = "modbus"
-transport = "{transport}"
-{place}
-timeout_ms = 300.0
-[streams.shaft]
-bus = "line"
-rate_hz = 640.0
-[streams.shaft.layout]
-way = "ring"
-unit = 1
-count = {{ address = 0, bits = 32 }}
-address = 16
-depth = 16384
-poll_ms = 20.0
-channels = [
-  {{ name = "x", place = 0, type = "int16", scale = 0.001 }},
-  {{ name = "y", place = 1, type = "int16", scale = 0.001 }},
-  {{ name = "kph", place = 2, type = "int16", scale = 0.001 }},
-]
-"""
-BAD_REPLIES = """
-title = "A healthy rotor behind a bad line"
-revolutions = 70.0
-[plant]
-kind = "rotor"
-[[fault]]
-kind = "link"
-from_s = 1.0
-to_s = 6.0
-drop = 0.03
-corrupt = 0.03
-[[fault]]
-kind = "delay"
-from_s = 2.0
-to_s = 4.0
-delay_ms = 5.0
-"""
-
-
-@pytest.fixture(params=["tcp", "rtu"])
-def modbus_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    (tmp_path / "replies.toml").write_text(BAD_REPLIES)
-    place = {
-        "tcp": f'host = "127.0.0.1"\ntcp_port = {free_port()}',
-        "rtu": f'serial_port = "{tmp_path / "ttyLine"}"\nbaud = 115200\nparity = "none"',
-    }[request.param]
-    file = tmp_path / "modbus.toml"
-    file.write_text(machine_text(MODBUS.format(transport=request.param, place=place)))
-    return file
-
-
-async def test_a_modbus_unit_hands_out_every_sample_however_bad_its_replies(
-    tmp_path: Path, modbus_file: Path
-) -> None:
-    machine = load_machine_file(modbus_file)
-    async with running(machine, tmp_path / "store") as service:
-        with process("sim", modbus_file, "--scenario", tmp_path / "replies.toml") as sim:
-            summary = await summary_of(sim)
-        sent = summary["streams"]["shaft"]
-        counted = service.figures()["streams"]["shaft"]
-    injected = sent["injected"]
-    assert injected.keys() >= {"dropped", "corrupted", "delayed"}
-    # The ring holds 25 s: what is not read by one request is read by the next.
-    assert counted["samples_lost"] == 0
-    assert counted["samples_received"] == sent["samples_sent"] == 4480
-
-
-def test_every_scenario_that_comes_along_can_be_read_and_says_what_goes_wrong() -> None:
-    every = {path.stem: load_any_scenario(path) for path in BAD_BUS.parent.glob("*.toml")}
-    assert set(every) == {"bad-bus", "bearing-damage"}
-    faults = every["bad-bus"].node_faults()
-    assert faults is not None
-    counts = faults.plan(19_200, 640.0, samples_per_frame=PER_FRAME, length=64).injected()
-    nothing = [name for name, count in asdict(counts).items() if not count]
-    assert not nothing
-    # The documentation has each of them.
-    table = DOCUMENTATION.read_text().split("| `kind` |")[1]
-    named = re.findall(r"^\| `([a-z-]+)` \|", table, flags=re.MULTILINE)
-    assert sorted(named) == sorted({fault.kind for fault in every["bad-bus"].fault})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((), "name a machine file or a scenario to play, or a bus to run"),
-        (("paper", "--fs", "100"), "--fs goes with a recording"),
-        (("paper", "--port", "70000"), "70000 is not a TCP port"),
-        (
-            ("nothing",),
-            "there is no scenario 'nothing': neither a file nor one of healthy",
-        ),
-        ((VIRTUAL_RIG, "--stream", "wave"), "has no stream 'wave'; there are shaft"),
-        ((ROOT / "config" / "scenarios" / "bearing-damage.toml",), "a bearing needs sensors"),
-        (
-            (VIRTUAL_RIG, "--scenario", ROOT / "config" / "scenarios" / "bearing-damage.toml"),
-            "sensor 'probe-x' is of type 'proximity', and a bearing scenario gives accelerometers",
-        ),
-        (
-            (ROOT / "config" / "machines" / "motor-accelerometer.toml",),
-            "sensor 'accel-de' is of type 'accelerometer', and a rotor scenario gives proximity probes",
-        ),
-        ((VIRTUAL_RIG, "--bus", "/nowhere/can0", "--duration", "1"), "no bus can be made at /nowhere/can0"),
-    ],
-)
-def test_what_cannot_be_played_says_why(arguments: tuple[object, ...], message: str) -> None:
-    with process("sim", *arguments) as sim:
-        output, errors = sim.communicate(timeout=PATIENCE_S)
-    assert sim.returncode in {1, 2}
-    assert message in errors
-    assert "Traceback" not in errors
-    assert output == ""
+        sent = summary["streams"]["drive-end"]["samples_sent"]
+        ring = service.rings["drive-end"]
+        await eventually(lambda: ring.end_index == sent, "every sample has come")
+        counted = service.figures()["streams"]["drive-end"]
+        received = ring.read(0, sent)[:, 0]
+    assert sent == 36_000
+    assert (counted["samples_received"], counted["samples_lost"]) == (sent, 0)
+    played = BearingSignals(load_any_scenario(damage), 3.0, 7).of(machine.sensor("accel-de"), 12_000.0)
+    largest_g = 2**15 * 0.0005
+    np.testing.assert_allclose(received, np.clip(played, -largest_g, largest_g), atol=0.00051)
