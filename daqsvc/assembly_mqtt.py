@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, get_args
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.expected import handling_conditions
-from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings, MqttSettings, Reading
+from daqsvc.diagnosis.pipeline import SILENT_PERIODS
+from daqsvc.publish.settings import STALE_S, CommandSettings, HomeAssistantSettings, MqttSettings, Reading
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.self_check import conditions
@@ -127,7 +129,7 @@ def _readings(machine: MachineFile) -> Iterator[Reading]:
     pipeline = machine.pipeline
     if pipeline.levels is not None:
         for sensor in _measured(machine):
-            yield from _levels(sensor)
+            yield from _levels(sensor, machine.streams[sensor.stream].rate_hz)
     if pipeline.rotor_bank is not None:
         yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
         for mode in pipeline.rotor_bank.modes:
@@ -149,10 +151,11 @@ def _measured(machine: MachineFile) -> Iterator[Sensor]:
     return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
 
 
-def _levels(sensor: Sensor) -> Iterator[Reading]:
+def _levels(sensor: Sensor, rate_hz: float) -> Iterator[Reading]:
     detector = f"levels/{sensor.name}"
     if isinstance(sensor, TrendValue):
-        yield Reading(detector, "statistics", "value", sensor.unit)
+        stale_s = max(STALE_S, math.ceil(SILENT_PERIODS / rate_hz))
+        yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
         return
     yield Reading(detector, "statistics", "rms", sensor.unit)
     yield Reading(detector, "statistics", "peak", sensor.unit)

@@ -35,6 +35,7 @@ PLATFORMS = {
 }
 UNITS_OF_CLASS = {
     "voltage": {"V", "mV", "µV", "kV", "MV"},
+    "temperature": {"°C", "°F", "K"},
     "speed": {"mm/s", "m/s", "in/s", "ft/s", "km/h", "mm/d", "mm/h", "in/d", "in/h", "mph", "kn", "Beaufort"},
 }
 TEMPLATE = re.compile(

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from daqsvc.publish.settings import HomeAssistantSettings, Reading
     from daqsvc.publish.topics import Topics
 
-STALE_S = 120
-"""A figure that has not been told for so long is shown as unavailable."""
-
 _UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F"}
 """Units as Home Assistant writes them, where that differs."""
 
@@ -168,7 +165,7 @@ class Discovery:
             "state_class": "measurement",
             "state_topic": self.topics.diagnosis(self.settings.machine, reading.detector),
             "value_template": _pick(reading.kind, reading.key),
-            "expire_after": STALE_S,
+            "expire_after": reading.stale_s,
             "suggested_display_precision": _DIGITS.get(reading.unit, _DIGITS_OF_A_NUMBER),
         }
         made |= _in_home_assistant(reading.unit)

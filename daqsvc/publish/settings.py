@@ -28,6 +28,10 @@ class CommandSettings:
     max_bytes: int = 4096
 
 
+STALE_S = 120
+"""Unless its detector speaks more seldom, a figure is no longer true when it has not been told for so long."""
+
+
 @dataclass(frozen=True, slots=True)
 class Reading:
     """A figure of a detector's statements that is shown by itself.
@@ -37,12 +41,14 @@ class Reading:
         kind: where it stands in them.
         key: its name there, e.g. ``"rms"`` or ``"F1"``.
         unit: its unit as in the statements, e.g. ``"um"``; empty for none.
+        stale_s: a figure that has not been told for so long is no longer true.
     """
 
     detector: str
     kind: Literal["statistics", "probabilities"]
     key: str
     unit: str = ""
+    stale_s: int = STALE_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,6 +57,7 @@ def test_units_are_written_as_home_assistant_writes_them():
             Reading("d", "statistics", "rms", "um"),
             Reading("d", "statistics", "velocity_rms", "mm/s"),
             Reading("d", "statistics", "gap_voltage", "V"),
+            Reading("d", "statistics", "value", "degC"),
             Reading("d", "probabilities", "F1"),
         ),
     )
@@ -66,6 +67,7 @@ def test_units_are_written_as_home_assistant_writes_them():
         "d rms": ("µm", None),
         "d velocity rms": ("mm/s", "speed"),
         "d gap voltage": ("V", "voltage"),
+        "d value": ("°C", "temperature"),
         "d F1": (None, None),
     }
 

@@ -80,6 +80,15 @@ def test_a_pump_becomes_detectors_rules_and_readings():
     assert "sensor-ok/nde-radial" in told.services
 
 
+def test_a_value_a_minute_is_shown_until_it_is_missed():
+    text, _ = changed(PUMP, ("[pipeline]", MQTT))
+    machine = parse_machine_file(text.replace("rate_hz = 1.0", "rate_hz = 0.0166667"), PUMP)
+    stale_s = {reading.stale_s for reading in mqtt_settings(machine).home_assistant.readings}
+    assert stale_s == {210}
+    fast = mqtt_settings(parse_machine_file(text, PUMP)).home_assistant.readings
+    assert {reading.stale_s for reading in fast} == {120}
+
+
 def test_a_stream_may_have_waveforms_and_trend_values():
     text, _ = changed(GAPS, ('channel = "y"\nunit = "V"\nok_between', PROBE_Y))
     text = text.replace('name = "probe-y"\ntype = "trend"', 'name = "probe-y"\ntype = "proximity"')
