@@ -11,7 +11,8 @@ import contextlib
 import logging
 import termios
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU
@@ -93,6 +94,30 @@ class LineOptions:
         return max(round(3.5 * BITS_PER_CHARACTER * NS_PER_S / self.baud), 1_750_000)
 
 
+class _Request(NamedTuple):
+    """A request as it is sent.
+
+    Attributes:
+        unit: address of the unit.
+        pdu: function and data.
+        data_bytes: bytes of register data in the reply, see `Expected`.
+    """
+
+    unit: int
+    pdu: bytes
+    data_bytes: int | None
+
+
+def _encoded(request: ModbusPDU, data_bytes: int | None = None) -> _Request:
+    return _Request(request.dev_id, bytes([request.function_code]) + request.encode(), data_bytes)
+
+
+@lru_cache(maxsize=1024)
+def _read_request(unit: int, function: int, address: int, count: int) -> _Request:
+    """A read; what is polled is asked for in the same bytes every time."""
+    return _encoded(_READS[function](address=address, count=count, dev_id=unit), 2 * count)
+
+
 class ModbusClient:
     """One connection, one request at a time. Connect again with a new client.
 
@@ -160,28 +185,26 @@ class ModbusClient:
             NoReplyError: no sound reply came in time.
             RefusedError: the unit answers with an exception.
         """
-        return await self._ask(_READS[function](address=address, count=count, dev_id=unit), 2 * count)
+        return await self._ask(_read_request(unit, function, address, count))
 
     async def read_fifo(self, unit: int, address: int) -> bytes:
         """Read a FIFO queue (function 24); see `read` for what is returned and raised."""
-        return await self._ask(ReadFifoQueueRequest(address=address, dev_id=unit), None)
+        return await self._ask(_encoded(ReadFifoQueueRequest(address=address, dev_id=unit)))
 
     async def write(self, unit: int, address: int, values: Sequence[int]) -> None:
         """Write holding registers (function 16); see `read` for what is raised."""
         request = WriteMultipleRegistersRequest(address=address, registers=list(values), dev_id=unit)
-        await self._ask(request, None)
+        await self._ask(_encoded(request))
 
-    async def _ask(self, request: ModbusPDU, data_bytes: int | None) -> bytes:
+    async def _ask(self, request: _Request) -> bytes:
         if not self._wire.is_active():
             raise LineLostError(self._wire.why_lost)
         self._counters.requests += 1
-        pdu = await self._wire.exchange(request, data_bytes)
+        pdu = await self._wire.exchange(request)
         self._counters.replies += 1
-        if pdu[0] != request.function_code:
+        if pdu[0] != request.pdu[0]:
             kind = self._counters.note_exception(pdu[1])
-            raise RefusedError(
-                f"unit {request.dev_id} refuses function {request.function_code}: {kind}", pdu[1]
-            )
+            raise RefusedError(f"unit {request.unit} refuses function {request.pdu[0]}: {kind}", pdu[1])
         return register_bytes(pdu)
 
 
@@ -203,6 +226,8 @@ class _Wire(ModbusProtocol):
         self._clock = clock
         self._counters = counters
         self._transaction = 0
+        self._deadline_s = 0.0
+        self._alarm: asyncio.TimerHandle | None = None
         self._expected: Expected | None = None
         self._reply: asyncio.Future[bytes] = self.loop.create_future()
 
@@ -210,12 +235,8 @@ class _Wire(ModbusProtocol):
         """Open the connection or the port."""
         self.transport, _ = await self.call_create()
 
-    async def exchange(self, request: ModbusPDU, data_bytes: int | None) -> bytes:
+    async def exchange(self, request: _Request) -> bytes:
         """Send a request and wait for its reply.
-
-        Args:
-            request: its unit and function tell which reply is waited for.
-            data_bytes: see `Expected`.
 
         Returns:
             PDU of the reply, or of the refusal.
@@ -226,16 +247,17 @@ class _Wire(ModbusProtocol):
         """
         if not self._serial:
             self._transaction = self._transaction % _LAST_TRANSACTION + 1
-            request.transaction_id = self._transaction
-        self._expected = Expected(request.dev_id, request.function_code, data_bytes, self._transaction)
+        unit, pdu, data_bytes = request
+        self._expected = Expected(unit, pdu[0], data_bytes, self._transaction)
         self._reply = self.loop.create_future()
-        timer = self.loop.call_later(self._timeout_s, self._give_up)
+        self._deadline_s = self.loop.time() + self._timeout_s
+        if self._alarm is None:
+            self._alarm = self.loop.call_at(self._deadline_s, self._look_at_the_clock)
         self._begin_anew()
         try:
-            self.transport.write(self._framer.buildFrame(request))  # type: ignore[attr-defined]
+            self.transport.write(self._framer.encode(pdu, unit, self._transaction))  # type: ignore[attr-defined]
             return await self._reply
         finally:
-            timer.cancel()
             if self._serial and self._expected is not None and self.recv_buffer:
                 self._counters.note(
                     "truncated"
@@ -307,9 +329,30 @@ class _Wire(ModbusProtocol):
             )
         self._expected = None
 
+    def close(self, reconnect: bool = False) -> None:  # noqa: FBT001, FBT002 - as pymodbus has it
+        """See `ModbusProtocol.close`."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        super().close(reconnect)
+
+    def _look_at_the_clock(self) -> None:
+        """Give a request up whose time is over.
+
+        One alarm goes on from request to request: one for each of thousands a second would mostly be
+        cancelled.
+        """
+        self._alarm = None
+        if not self._waits:
+            return
+        if self.loop.time() < self._deadline_s:
+            self._alarm = self.loop.call_at(self._deadline_s, self._look_at_the_clock)
+        else:
+            self._give_up()
+
     def _give_up(self) -> None:
-        """End the request without a reply: its time is over."""
-        if not self._waits or self._expected is None:
+        """End the request without a reply."""
+        if self._expected is None:
             return
         self._counters.timeouts += 1
         unit, where = self._expected.unit, self._options.where

@@ -6,6 +6,7 @@ that were asked for. Modbus Application Protocol 1.1b3; Modbus over serial line 
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 
-MBAP_BYTES = 7
+_MBAP = struct.Struct(">HHHB")
+MBAP_BYTES = _MBAP.size
 MAX_TCP_BYTES = 260
 MAX_RTU_BYTES = 256
 FIFO_REGISTERS = 31
@@ -123,9 +125,7 @@ def judge_tcp(data: bytes, expected: Expected | None) -> Verdict:  # noqa: PLR09
     """What stands at the head of the bytes received over TCP (MBAP frames)."""
     if len(data) < MBAP_BYTES:
         return Verdict()
-    transaction = int.from_bytes(data[:2], "big")
-    protocol = int.from_bytes(data[2:4], "big")
-    length = int.from_bytes(data[4:6], "big")
+    transaction, protocol, length, unit = _MBAP.unpack_from(data)
     if protocol != 0:
         # No length can be believed any more: nothing tells where the next frame begins.
         return Verdict(len(data), fault="wrong_protocol", final=True)
@@ -138,7 +138,7 @@ def judge_tcp(data: bytes, expected: Expected | None) -> Verdict:  # noqa: PLR09
         return Verdict()
     if expected is None or transaction != expected.transaction:
         return Verdict(end, fault="wrong_transaction")
-    if data[6] != expected.unit:
+    if unit != expected.unit:
         return Verdict(end, fault="wrong_unit")
     pdu = data[MBAP_BYTES:end]
     fault = judge_pdu(pdu, expected)

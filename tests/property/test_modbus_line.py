@@ -115,6 +115,31 @@ def test_late_replies_happen_and_are_counted():
     assert (counters.timeouts, counters.replies) == (1, 1)
 
 
+def test_every_request_has_its_whole_time_out_whenever_it_is_made():
+    # One alarm watches over all requests: what the one before left it at must not cut this one short.
+    delays_ns = iter([0, 95_000_000, 0, 101_000_000, 99_000_000])
+    counters = ModbusCounters()
+
+    async def main():
+        options = LineOptions(**options_of(serial=False), timeout_ns=TIMEOUT_NS)
+        client = ModbusClient(options, LoopClock(), counters)
+        async with responding(marked_units([1]), lambda *_: Answer(delay_ns=next(delays_ns)), serial=False):
+            await client.connect()
+            for late in (False, False, False, True, False):
+                begun_ns = LoopClock().monotonic_ns()
+                if late:
+                    with pytest.raises(NoReplyError):
+                        await client.read(1, 3, 5, 1)
+                    assert LoopClock().monotonic_ns() - begun_ns == pytest.approx(TIMEOUT_NS, abs=1000)
+                else:
+                    assert await client.read(1, 3, 5, 1) == register_of(1, 3, 5).to_bytes(2, "big")
+                await asyncio.sleep(0.07)
+            await client.close()
+
+    simulate(main)
+    assert (counters.timeouts, counters.replies) == (1, 4)
+
+
 FAULTS = {
     "silent": ("timeouts", "timeouts"),
     "wrong unit": ("replies_wrong_unit", "replies_wrong_unit"),
