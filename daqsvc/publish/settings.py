@@ -29,7 +29,7 @@ class CommandSettings:
 
 
 STALE_S = 120
-"""Unless its detector speaks more seldom, a figure is no longer true when it has not been told for so long."""
+"""A figure that has not been told for so long is no longer true, unless it is told more seldom."""
 
 
 @dataclass(frozen=True, slots=True)
