@@ -106,6 +106,7 @@ class SimCommand:
         from daqsvc.assembly_drivers import AssemblyError  # noqa: PLC0415
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
+        from drivers.frames import LayoutError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
         from sim_hw.sim_command_nodes import NodeError  # noqa: PLC0415
         from sim_hw.sim_command_signals import SignalError  # noqa: PLC0415
@@ -115,7 +116,15 @@ class SimCommand:
         except MachineFileError as error:
             _say(str(error))
             return EXIT_BAD_FILE
-        except (AssemblyError, NodeError, RecordingError, ScenarioError, SignalError, TimeoutError) as error:
+        except (
+            AssemblyError,
+            LayoutError,
+            NodeError,
+            RecordingError,
+            ScenarioError,
+            SignalError,
+            TimeoutError,
+        ) as error:
             _say(str(error))
             return EXIT_FAILED
 

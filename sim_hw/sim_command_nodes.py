@@ -132,11 +132,13 @@ class CanNodes:
             )
 
         nodes: dict[str, CanNode] = {}
+        opened: list[can.BusABC] = []
         try:
             for played in order.streams:
+                opened.append(await asyncio.to_thread(bus))
                 layout = assembly_drivers.frame_layout(order.machine, played.stream)
                 nodes[played.stream] = CanNode(
-                    await asyncio.to_thread(bus),
+                    opened[-1],
                     layout,
                     played.samples,
                     played.rate_hz,
@@ -145,12 +147,14 @@ class CanNodes:
                     clip=True,
                     reopen=bus,
                 )
-        except (can.CanError, OSError) as error:
-            for node in nodes.values():
-                node.close()
-            raise NodeError(
-                f"CAN bus {order.bus} ({interface} {channel}) cannot be opened: {error}"
-            ) from error
+        except BaseException as error:
+            for each in opened:
+                each.shutdown()
+            if isinstance(error, can.CanError | OSError):
+                raise NodeError(
+                    f"CAN bus {order.bus} ({interface} {channel}) cannot be opened: {error}"
+                ) from error
+            raise
         return cls(f"{interface} {channel}", nodes)
 
     async def ready(self) -> None:

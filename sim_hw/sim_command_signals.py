@@ -148,15 +148,16 @@ class RecordedSignals:
     """Channels of a recording, each for the sensor (or the stream's channel) of the same name.
 
     Args:
-        recording: in the sensors' units. It is played again from its beginning as often as it takes.
+        recording: in the sensors' units. It is played again from its beginning as often as it takes. NaN is
+            sent as what the layout has for a value that is not there, or refused if it has nothing.
         duration_s: how long to play; once through unless given.
     """
 
     def __init__(self, recording: Recording, duration_s: float | None = None) -> None:
-        if recording.nan_count or recording.infinity_count:
+        if recording.infinity_count:
             raise SignalError(
-                f"{recording.source} holds samples that are no numbers, which no device could send; cut them "
-                "out or interpolate them"
+                f"{recording.source} holds infinite samples, which no device could send; cut them out or "
+                "interpolate them"
             )
         self._recording = recording
         self._n = (

@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import signal
+import struct
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from brokers import Consumer, eventually
 from live_service import running
-from machine_files import MOTOR
+from machine_files import MACHINES, MOTOR
 from sim_processes import (
     DOCUMENTATION,
     PATIENCE_S,
@@ -222,3 +223,32 @@ async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) 
     played = BearingSignals(load_any_scenario(damage), 3.0, 7).of(machine.sensor("accel-de"), 12_000.0)
     largest_g = 2**15 * 0.0005
     np.testing.assert_allclose(received, np.clip(played, -largest_g, largest_g), atol=0.00051)
+
+
+def test_a_gap_in_a_recording_is_sent_as_not_available(tmp_path: Path) -> None:
+    lateral, vertical = np.linspace(-5.0, 5.0, 100), np.full(100, 9.8)
+    lateral[40:60] = np.nan
+    np.savez(tmp_path / "run.npz", l=lateral, v=vertical, fs=100.0)
+    path = tmp_path / "can0"
+    names = "accel-lateral=l,accel-vertical=v"
+    recording = ("--recording", tmp_path / "run.npz", "--map", names)
+    with (
+        UnixBus(str(path)) as client,
+        process("sim", MACHINES / "j1939-pgn61485.toml", "--bus", path, *recording, "--speed", 10) as sim,
+    ):
+        _, errors = sim.communicate(timeout=PATIENCE_S)
+        assert sim.returncode == 0, errors
+        raw = []
+        while (message := client.recv(0.2)) is not None:
+            raw.append(struct.unpack("<3H", message.data[:6]))
+    sent_lateral, _, sent_vertical = np.array(raw).T
+    assert (sent_lateral == 0xFFFF).tolist() == np.isnan(lateral).tolist()
+    assert sent_lateral[0] == 31_500  # (-5 m/s2 + 320 m/s2) / 0.01 m/s2
+    assert set(sent_vertical) == {32_980}
+    np.savez(tmp_path / "probes.npz", p=lateral, fs=640.0)
+    probes = ("--recording", tmp_path / "probes.npz", "--map", "probe-x=p,probe-y=p,keyphasor=p")
+    with process("sim", VIRTUAL_RIG, "--bus", path, *probes) as sim:
+        output, errors = sim.communicate(timeout=PATIENCE_S)
+    assert (sim.returncode, output) == (1, "")
+    assert "channel 'x': nan does not fit a 16-bit signed field" in errors
+    assert "Traceback" not in errors
