@@ -198,33 +198,40 @@ def test_the_oldest_files_make_room_and_no_others(tmp_path: Path, log_format: st
 
 
 class FullDisk:
-    """`os.pwrite` of a disk that is full after a while: it takes a part of what is written, then nothing."""
+    """`os.pwrite` of a disk that is full after a while: it takes half of what is written, then nothing.
 
-    def __init__(self, room: int) -> None:
-        self.room = room
+    Args:
+        writes: how many it takes whole before that.
+    """
+
+    def __init__(self, writes: int) -> None:
+        self.writes = writes
+        self._half = True
         self._write = os.pwrite
 
     def __call__(self, descriptor: int, data: memoryview, at: int) -> int:
         if at == 0 and len(data) == 144:
             return self._write(descriptor, data, at)  # the header of BLF is there already
-        if not self.room:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        written = self._write(descriptor, data[: self.room], at)
-        self.room -= written
-        return written
+        if self.writes > 0:
+            self.writes -= 1
+            return self._write(descriptor, data, at)
+        if self._half:
+            self._half = False
+            return self._write(descriptor, data[: len(data) // 2], at)
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize("log_format", FORMATS)
-@pytest.mark.parametrize("room", [3000, 0])
+@pytest.mark.parametrize("writes", [3, 0])
 def test_a_full_disk_costs_what_is_counted_and_is_said_once(
     tmp_path: Path,
     log_format: str,
-    room: int,
+    writes: int,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.WARNING)
-    disk = FullDisk(room)
+    disk = FullDisk(writes)
     monkeypatch.setattr(os, "pwrite", disk)
     clock = DrivenClock(wall_start_ns=1_790_000_000 * NS_PER_S)
     made, counters = recorder(LogFolder(tmp_path, "can0", log_format, file_bytes=1e9, keep_bytes=1e10), clock)
@@ -236,7 +243,7 @@ def test_a_full_disk_costs_what_is_counted_and_is_said_once(
     for k in range(100):
         if k == 80:
             assert counters.frames_unrecorded >= 1000
-            disk.room = 1 << 30
+            disk.writes = 1 << 30
         made.take(batch(100 * k, 100))
         clock.advance_to(clock.monotonic_ns() + NS_PER_S)
         settled(100 * (k + 1))
@@ -247,7 +254,8 @@ def test_a_full_disk_costs_what_is_counted_and_is_said_once(
     assert len(there) == counters.frames_recorded, "what is in the files is what is counted"
     assert there == sorted(set(there))
     assert there[-2000:] == list(range(8000, 10_000)), "it goes on when there is room"
-    assert len(files) == (2 if there[0] == 0 else 1), "nothing is left of files that could not be written"
+    assert there[:-2000] == list(range(100 * writes))
+    assert len(files) == (2 if writes else 1), "nothing is left of files that could not be written"
     assert [record.levelno for record in caplog.records] == [logging.WARNING] * 2
     away, back = (record.getMessage() for record in caplog.records)
     assert f"cannot be recorded in {tmp_path}: No space left on device" in away
