@@ -47,7 +47,7 @@ class Oil:
 
     def __init__(self):
         self.unit, self.silent, self.events, self._begin_ns = ModbusUnit(), False, [], 0
-        ring = SampleRing("trend", ("oil",), 64)
+        ring = SampleRing("trend", ("oil",), 16)
         port = BusPort(
             "mb",
             options_of(serial=True, timeout_ms=500.0),
