@@ -20,6 +20,7 @@ from drivers.can_record_formats import encoder_for
 from drivers.kernel_time import monotonic_minus_wall_ns
 
 if TYPE_CHECKING:
+    from daqsvc.acquisition.clock import Clock
     from drivers.base import BusPort
     from drivers.can_batches import CanBatch
     from drivers.can_errors import CanCounters
@@ -32,6 +33,9 @@ MOST_FRAMES_HELD = 1 << 16
 
 GATHERED_FRAMES = 8192
 RETRY_NS = NS_PER_S
+WELL_NS = 10 * NS_PER_S
+"""How long a disk must have taken everything to be well: a full one takes a little now and then."""
+
 IDLE_S = 0.5
 PATIENCE_S = 1.0
 """How long a disk may take to write the rest when the bus is closed."""
@@ -50,17 +54,17 @@ class CanRecorder:
         link_name: what a person calls the bus.
         interface: what logs call it.
         logs: where the recording goes.
-        port: the bus; its clock labels the frames.
+        clock: the service's clock; its wall time labels the frames.
         counters: what is counted on; these two figures are touched by nobody else.
     """
 
     def __init__(
-        self, link_name: str, interface: str, logs: Logs, port: BusPort, counters: CanCounters
+        self, link_name: str, interface: str, logs: Logs, clock: Clock, counters: CanCounters
     ) -> None:
         self._link_name = link_name
         self._interface = interface
         self._logs = logs
-        self._clock = port.clock
+        self._clock = clock
         self._counters = counters
         self._lock = threading.Lock()
         self._held = 0
@@ -72,6 +76,7 @@ class CanRecorder:
         self._pending = 0
         self._flushed_ns = 0
         self._failed_ns: int | None = None
+        self._well_since_ns: int | None = None
         self._missing = 0
 
     def start(self) -> None:
@@ -165,15 +170,21 @@ class CanRecorder:
         self._settle(recorded=self._pending)
         self._pending = 0
         if self._failed_ns is not None:
+            self._get_well(self._log)
+        if self._log.size >= self._logs.file_bytes or self._log.deleted:
+            self._end_log()
+
+    def _get_well(self, log: LogFile) -> None:
+        if self._well_since_ns is None:
+            self._well_since_ns = self._flushed_ns
+        if self._flushed_ns - self._well_since_ns >= WELL_NS:
             logger.warning(
                 "%s is recorded again in %s; %d frames are missing from the recording",
                 self._link_name,
-                self._log.path,
+                log.path,
                 self._missing,
             )
             self._failed_ns, self._missing = None, 0
-        if self._log.size >= self._logs.file_bytes or self._log.deleted:
-            self._end_log()
 
     def _fail(self, error: Exception) -> None:
         """Leave out what is not on disk yet; tried again in a new file, for this one may be the reason."""
@@ -185,7 +196,7 @@ class CanRecorder:
                 self._logs.place,
                 words(error),
             )
-        self._failed_ns = self._clock.monotonic_ns()
+        self._failed_ns, self._well_since_ns = self._clock.monotonic_ns(), None
         self._settle(unrecorded=self._pending)
         self._pending = 0
         self._end_log()
@@ -235,4 +246,4 @@ def recorder_of(port: BusPort, link_name: str, counters: CanCounters) -> CanReco
     channel = str(port.options.get("channel"))
     # Virtual buses are called by a path, which is no word of a log.
     interface = channel if _INTERFACE.fullmatch(channel) else port.name
-    return CanRecorder(link_name, interface, logs, port, counters)
+    return CanRecorder(link_name, interface, logs, port.clock, counters)

@@ -32,7 +32,6 @@ from can_standin import StandInBus, frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from drivers import can_record
-from drivers.base import BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_errors import CanCounters
 from drivers.can_record import CanRecorder
@@ -61,8 +60,7 @@ def folder(path: Path, log_format: str, **limits: float) -> dict[str, Any]:
 
 def recorder(logs: Logs, clock: Clock | None = None) -> tuple[CanRecorder, CanCounters]:
     counters = CanCounters()
-    port = BusPort("can0", {}, [], clock or SystemClock(), lambda _: None)
-    made = CanRecorder("CAN bus 'can0'", "can0", logs, port, counters)
+    made = CanRecorder("CAN bus 'can0'", "can0", logs, clock or SystemClock(), counters)
     made.start()
     return made, counters
 
@@ -285,6 +283,26 @@ async def test_files_that_the_system_limits_go_on_in_others(bus: StandInBus, tmp
     assert there[: len(there) - 1] == list(range(len(there) - 1))
     assert there[-1] == 0
     assert (tmp_path / "run.log").stat().st_size <= 50_000
+
+
+def test_a_disk_that_takes_a_little_now_and_then_is_spoken_of_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = FullDisk(0)
+    monkeypatch.setattr(os, "pwrite", disk)
+    clock = DrivenClock()
+    logs = LogFolder(tmp_path, "can0", "candump", file_bytes=1e9, keep_bytes=1e10)
+    made, counters = recorder(logs, clock)
+    for k in range(60):
+        if k % 4 == 3:
+            disk.writes += 1
+        made.take(batch(k, 1))
+        clock.advance_to(clock.monotonic_ns() + NS_PER_S)
+        while counters.frames_recorded + counters.frames_unrecorded <= k:
+            os.sched_yield()
+    made.close()
+    assert counters.frames_recorded == len(numbers(*tmp_path.iterdir())) == 15
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize("trouble", ["missing", "a file", "read-only"])
