@@ -1,0 +1,209 @@
+"""When polled samples were taken: what a block says, against what the device knows, in simulated time."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+
+import numpy as np
+import pytest
+from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
+
+from daqsvc.acquisition.alignment import AlignedSource, Aligner
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.samples import Quality, SampleBlock
+from drivers.modbus_layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
+from drivers.registers import RegisterField, RegisterRecord, Run
+from sim_hw.nodes.modbus_node import Answer
+from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
+
+SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
+LEAST_NS, MOST_NS = 1_000_000, 15_000_000
+"""Between which a reply takes its time."""
+
+
+def now_ns():
+    return LoopClock().monotonic_ns()
+
+
+def stated_ns(block):
+    return block.t_first_ns + block.period_ns * np.arange(len(block.samples))
+
+
+def told_truly(off_ns, told_ns):
+    """How often what is told of an error is true."""
+    return np.mean(np.abs(off_ns) <= told_ns)
+
+
+def waveforms(poll_ns, most_late_ns, seed, every_s, samples=200, rate_hz=2000.0, seconds=40.0):
+    """Blocks that a driver has fetched, and when the device had finished each, by number."""
+    rng = random.Random(seed)
+    layout = Waveform(1, "holding", 0, 100, samples, SAMPLE, poll_ns=poll_ns)
+    rig = Rig(
+        options_of(serial=False, timeout_ms=100.0, demote_after=30),
+        {"s": (layout, rate_hz)},
+        clock=LoopClock(),
+    )
+    ended_ns = []
+    faults = ["none"] * 30 + ["silent", "exception"]
+
+    async def main():
+        units = {1: ModbusUnit()}
+        store = store_for(units[1], layout)
+
+        def plan(*_):
+            return Answer(rng.choice(faults) if most_late_ns else "none", rng.randrange(most_late_ns + 1))
+
+        async with responding(units, plan, serial=False), rig.running():
+            while now_ns() < (1000 + seconds) * NS_PER_S:
+                await asyncio.sleep(every_s(rng))
+                number = len(ended_ns)
+                store.put(number * samples, encode(SAMPLE, ramp(samples, first=number * samples)))
+                ended_ns.append(now_ns())
+            await asyncio.sleep(1.0)
+
+    simulate(main)
+    for before, block in itertools.pairwise(rig.blocks["s"]):
+        assert block.first_index == before.end_index + block.lost_before
+    numbers = [int(b.samples[0, 0] + 30_000 * (b.samples[0, 1] - 100)) // samples for b in rig.blocks["s"]]
+    return rig, numbers, ended_ns
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_waveform_says_when_it_was_taken_and_how_sure_that_is(seed):
+    poll_ns, most_late_ns = 50_000_000, 20_000_000
+    rig, numbers, ended_ns = waveforms(poll_ns, most_late_ns, seed, lambda rng: rng.uniform(0.05, 1.5))
+    blocks = rig.blocks["s"]
+    assert len(blocks) > 20
+    span_ns = 200 * NS_PER_S / 2000.0
+    off_ns = np.array(
+        [b.t_first_ns + span_ns - ended_ns[number] for b, number in zip(blocks, numbers, strict=True)]
+    )
+    told_ns = np.array([b.t_error_ns for b in blocks])
+    assert (np.abs(off_ns) <= told_ns + 1).all()
+    # Half the time from one look to the next, a request's there and back included: not said to be more.
+    assert np.median(told_ns) <= (poll_ns + 2 * most_late_ns) / 2
+    assert (np.isfinite(told_ns) == [not b.quality & Quality.TIME_UNSETTLED for b in blocks]).all()
+    assert np.isfinite(told_ns).sum() >= len(blocks) - 1
+    time_base = rig.driver.streams["s"][1]
+    assert (time_base.settled, time_base.error_ns) == (True, told_ns[-1])
+
+
+def test_of_a_block_that_was_there_before_anybody_looked_nothing_is_known():
+    layout = Waveform(1, "holding", 0, 100, 200, SAMPLE, poll_ns=10_000_000)
+    rig = Rig(options_of(serial=False), {"s": (layout, 2000.0)}, clock=LoopClock())
+
+    async def main():
+        units = {1: ModbusUnit()}
+        store_for(units[1], layout).put(0, encode(SAMPLE, ramp(200)))
+        async with responding(units, lambda *_: Answer(), serial=False), rig.running():
+            await asyncio.sleep(1.0)
+
+    simulate(main)
+    (block,) = rig.blocks["s"]
+    assert block.t_error_ns == np.inf
+    assert block.quality & Quality.TIME_UNSETTLED
+    assert not rig.driver.streams["s"][1].settled
+
+
+def test_waveforms_are_put_on_the_grid_of_another_bus():
+    rate_hz = 1000.0
+    rig, _, _ = waveforms(2_000_000, 0, 1, lambda _: 2.0, samples=1000, rate_hz=rate_hz)
+    rows = []
+    sources = [AlignedSource("probes", ("x",), rate_hz), AlignedSource("s", ("x", "y"), rate_hz)]
+    aligner = Aligner("probes+s", sources, rows.append, max_error_ns=2_000_000)
+    period_ns = round(NS_PER_S / rate_hz)
+    still = np.zeros((100, 1), np.float32)
+    probes = [
+        SampleBlock(
+            "probes", 100 * k, still, 1000 * NS_PER_S + 100 * k * period_ns, period_ns, t_error_ns=1e3
+        )
+        for k in range(400)
+    ]
+    blocks = sorted(
+        [*probes, *rig.blocks["s"]], key=lambda block: block.t_first_ns + block.period_ns * len(block.samples)
+    )
+    for block in blocks:
+        aligner.accept(block)
+    there = np.concatenate([np.isfinite(row.samples).all(axis=1) for row in rows])
+    # A block a second long every two seconds, less what the filter cannot reach at its ends.
+    assert 0.4 < there.mean() < 0.5
+    assert aligner.counters["s"].rows_withheld == 0
+    assert max(row.error_ns[1] for row in rows[5:]) < 2.0 * 2_000_000
+
+
+def test_a_trend_is_no_surer_of_its_times_than_its_polls_are():
+    rng = random.Random(4)
+    layouts = {
+        name: Trend(unit, "holding", RegisterRecord((RegisterField("n", 0, "uint16"),), (Run(0, 1),)))
+        for name, unit in (("slow", 1), ("busy", 2))
+    }
+    streams = {"slow": (layouts["slow"], 20.0), "busy": (layouts["busy"], 31.0)}
+    rig = Rig(options_of(serial=True, timeout_ms=100.0), streams, clock=LoopClock())
+    units = {1: ModbusUnit(), 2: ModbusUnit()}
+    taken_ns = []
+
+    def plan(unit, _pdu):
+        if unit == 1:
+            units[1].put("holding", 0, len(taken_ns).to_bytes(2, "big"))
+            taken_ns.append(now_ns())
+        return Answer(delay_ns=rng.randrange(LEAST_NS, MOST_NS))
+
+    async def main():
+        async with responding(units, plan, serial=True), rig.running():
+            await asyncio.sleep(60.0)
+
+    simulate(main)
+    blocks = [block for block in rig.blocks["slow"] if np.isfinite(block.t_error_ns)]
+    numbers = np.concatenate([block.samples[:, 0] for block in blocks]).astype(int)
+    stated = np.concatenate([stated_ns(block) for block in blocks])
+    told_ns = np.concatenate([np.full(len(block.samples), block.t_error_ns) for block in blocks])
+    off_ns = stated - np.array(taken_ns)[numbers] - LEAST_NS
+    assert len(numbers) > 900
+    assert told_truly(off_ns, told_ns) >= 0.95
+    assert np.median(told_ns) < 3 * MOST_NS
+    # Without the lateness of the polls the error told would be that of the schedule, and false.
+    assert rig.driver.streams["slow"][1].jitter_ns > 5_000_000
+    assert rig.driver.streams["slow"][1].error_ns >= rig.driver.streams["slow"][1].jitter_ns
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        Fifo(1, 33, Count(0, 32), SAMPLE, poll_ns=20_000_000),
+        Ring(1, "holding", Count(0, 32), 100, 256, SAMPLE, poll_ns=20_000_000),
+    ],
+    ids=["fifo", "ring"],
+)
+def test_samples_that_the_device_counts_are_as_sure_as_is_told(layout):
+    rng = random.Random(5)
+    rate_hz = 200.0
+    rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, rate_hz)}, clock=LoopClock())
+    taken_ns = []
+
+    async def main():
+        units = {1: ModbusUnit()}
+        store = store_for(units[1], layout)
+        plan = lambda *_: Answer(delay_ns=rng.randrange(LEAST_NS, MOST_NS))  # noqa: E731
+        async with responding(units, plan, serial=False), rig.running():
+            for k in itertools.count():
+                await asyncio.sleep(
+                    max(0.0, 1000 + k / rate_hz * (1 + 50e-6) - asyncio.get_running_loop().time())
+                )
+                taken_ns.append(now_ns())
+                store.put(k, encode(SAMPLE, ramp(1, first=k)))
+                if k >= 30 * rate_hz:
+                    return
+
+    simulate(main)
+    assert rig.counters("s").samples_lost == 0
+    blocks = [block for block in rig.blocks["s"] if np.isfinite(block.t_error_ns)]
+    off_ns = np.array([b.t_first_ns - taken_ns[int(b.samples[0, 0])] for b in blocks])
+    told_ns = np.array([block.t_error_ns for block in blocks])
+    assert len(blocks) > 500
+    # From a sample to its earliest arrival: the quickest reply, and at most a period until it is asked for.
+    constant_ns = np.median(off_ns)
+    assert LEAST_NS <= constant_ns <= LEAST_NS + NS_PER_S / rate_hz
+    assert told_truly(off_ns - constant_ns, told_ns) >= 0.9
+    assert told_ns[-1] < 2_000_000
