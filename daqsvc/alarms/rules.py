@@ -26,6 +26,9 @@ UNDETERMINED = "undetermined"
 DEPARTURE = "departure"
 """The decision of a detector that sees a change, but not yet of what."""
 
+TOO_HIGH, TOO_LOW = "high", "low"
+"""What is found of a measure that can be either."""
+
 MACHINE_GROUP = "machine"
 """The first-out group of an alarm that names none: all alarms of the machine compete."""
 
@@ -263,6 +266,13 @@ class MeasureWatch:
             )
         return None
 
+    def side(self, value: float) -> str:
+        """Where the present level was reached, as an identity; empty if there is one side only."""
+        limit = self.monitor.reached(value)
+        if limit is None or self.setpoint.highest_low is None:
+            return ""
+        return TOO_LOW if limit.lower else TOO_HIGH
+
     def in_words(self, diagnosis: Diagnosis, sensor: str, value: float) -> str:
         """The value of ``sensor`` and the limit that makes the present level of it."""
         unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
@@ -290,14 +300,16 @@ class _LevelWatch:
         if found is None:
             return None
         level, value = found
-        return Finding(level, "", self._watch.in_words(diagnosis, self._sensor, value))
+        sentence = self._watch.in_words(diagnosis, self._sensor, value)
+        return Finding(level, self._watch.side(value), sentence)
 
     def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
         self._watch.monitor.hold()
 
-    def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
-        self._watch.monitor.resume(level)
-        return ""
+    def resume(self, level: Level, told: AlarmEvent) -> str:
+        sides = {TOO_LOW: True, TOO_HIGH: False}
+        self._watch.monitor.resume(level, lower=sides.get(told.found))
+        return told.found
 
 
 class _DecisionWatch:

@@ -134,13 +134,16 @@ class SetpointMonitor:
             comparator.update(value, elapsed_ns, factor)
         return self.level
 
-    def resume(self, level: Level) -> None:
+    def resume(self, level: Level, *, lower: bool | None = None) -> None:
         """Go on from a level that was reached before a restart; the delays begin anew.
 
-        Whether at an upper or at a lower limit is not told: the value must be clear of both.
+        Args:
+            level: the level.
+            lower: whether at a lower limit; None if nobody knows: then the value must be clear of both.
         """
         for comparator in self._comparators:
-            comparator.reached = level >= comparator.limit.level
+            side = lower is None or comparator.limit.lower is lower
+            comparator.reached = side and level >= comparator.limit.level
 
     def hold(self) -> None:
         """A value is missing: the level stays and the delays stand still until the next one."""

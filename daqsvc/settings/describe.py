@@ -200,7 +200,9 @@ def _levels(machine: MachineFile, given: Levels) -> str:
         low_hz, high_hz = given.velocity_band_hz
         parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
     if trends:
-        parts.append(f"{', '.join(trends)} as they come, at most one value in {given.window_s:g} s")
+        parts.append(
+            f"{', '.join(trends)} as they come, or averaged over {given.window_s:g} s if they are faster"
+        )
     return "; ".join(parts)
 
 

@@ -21,6 +21,8 @@ from daqsvc.publish.payloads import alarm_event, alarm_payload
 RULES = [
     LevelRule("level", "x", "rms", Setpoint(alert=4.0, danger=8.0, deadband=1.0)),
     LevelRule("level-latching", "x", "rms", Setpoint(alert=4.0, danger=8.0, deadband=1.0), latching=True),
+    LevelRule("window", "x", "rms", Setpoint(4.0, 8.0, 1.0, alert_low=-4.0, danger_low=-8.0)),
+    LevelRule("window-latching", "x", "rms", Setpoint(4.0, 8.0, 1.0, alert_low=-4.0), latching=True),
     DiagnosisRule("mode", "bank"),
     DiagnosisRule("mode-latching", "bank", latching=True),
 ]
@@ -28,7 +30,8 @@ SPEAKERS = {"levels/x": ("x",), "bank": ("x", "y")}
 MODES = {"N": "normal", "F1": "alert", "F2": "alert", "F3": "danger", "undetermined": "normal"}
 QUALITY = st.sampled_from(["good", "good", "good", "missing", "not_ok"])
 
-MEASURED = st.tuples(st.just("levels/x"), st.sampled_from([0.0, 3.5, 5.0, 7.5, 9.0, math.nan]), QUALITY)
+VALUES = [-9.0, -7.5, -5.0, -3.5, 0.0, 3.5, 5.0, 7.5, 9.0, math.nan]
+MEASURED = st.tuples(st.just("levels/x"), st.sampled_from(VALUES), QUALITY)
 DIAGNOSED = st.tuples(st.just("bank"), st.sampled_from(sorted(MODES)), QUALITY)
 ASKED = st.tuples(
     st.sampled_from([verb for verb in Verb if verb is not Verb.SHELVE]),
