@@ -148,6 +148,13 @@ class NodeFaults:
         """Only a link's faults, all the time."""
         return cls(link=[(EVER, link)], seed=link.seed)
 
+    @classmethod
+    def of(cls, faults: NodeFaults | LinkFaults | None) -> NodeFaults:
+        """What is given, as faults of a node: those of its link alone, or none."""
+        if isinstance(faults, NodeFaults):
+            return faults
+        return cls() if faults is None else cls.of_link(faults)
+
     @property
     def without_babble(self) -> NodeFaults:
         """The same, but for the babbling node: for the second and any other node on a bus."""

@@ -7,7 +7,7 @@ says in ``driver = "..."``: a callable that takes a `NodeOrder` and returns a `S
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -168,16 +168,7 @@ class CanNodes:
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `SimNode.figures`."""
-        return {
-            name: {
-                "samples_sent": node.samples_sent,
-                "frames_sent": node.frames_sent,
-                "frames_unsent": node.frames_unsent,
-                "send_retries": node.send_retries,
-                "injected": asdict(node.injected),
-            }
-            for name, node in self._nodes.items()
-        }
+        return {name: node.figures() for name, node in self._nodes.items()}
 
     async def close(self) -> None:
         """See `SimNode.close`."""

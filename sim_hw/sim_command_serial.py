@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,16 +82,7 @@ class SerialNodes:
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """See `sim_hw.sim_command_nodes.SimNode.figures`."""
-        return {
-            name: {
-                "samples_sent": node.samples_sent,
-                "frames_sent": node.injected.sent - node.frames_unheard,
-                "frames_unsent": node.frames_unheard,
-                "send_retries": node.send_retries,
-                "injected": asdict(node.injected),
-            }
-            for name, node in self._nodes.items()
-        }
+        return {name: node.figures() for name, node in self._nodes.items()}
 
     async def close(self) -> None:
         """See `sim_hw.sim_command_nodes.SimNode.close`."""

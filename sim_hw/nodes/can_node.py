@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import time
 from typing import TYPE_CHECKING
 
 import can
 import numpy as np
 
-from sim_hw.link_faults import Fault
 from sim_hw.node_faults import NodeFaults
+from sim_hw.nodes.planned_node import LinkLostError, PlannedNode
 from sim_hw.nodes.wire import check_samples
 
 if TYPE_CHECKING:
@@ -21,15 +20,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.frames import FrameLayout
-    from sim_hw.link_faults import FaultCounts, LinkFaults
-    from sim_hw.nodes.pacing import Pacer
+    from sim_hw.link_faults import LinkFaults
 
 logger = logging.getLogger(__name__)
 
-RETRY_S = 0.002
 
-
-class CanNode:
+class CanNode(PlannedNode):
     """Sends samples over a bus, each frame at the time its last sample is taken.
 
     All frames are made, and all faults planned, when the node is: playing only sends.
@@ -67,18 +63,15 @@ class CanNode:
         check_samples(samples, layout, rate_hz)
         self._bus = bus
         self._layout = layout
-        self._give_up_s = give_up_s
         self._reopen = reopen
-        if not isinstance(faults, NodeFaults):
-            faults = NodeFaults() if faults is None else NodeFaults.of_link(faults)
-        self._plan = faults.plan(
+        plan = NodeFaults.of(faults).plan(
             len(samples),
             rate_hz,
             samples_per_frame=layout.samples_per_frame,
             length=layout.length,
             first_index=first_index,
         )
-        schedule = self._plan.schedule
+        schedule = plan.schedule
         if not len(schedule.sample):
             raise ValueError(
                 f"the faults of frame {layout.frame_id:#x} leave none of it: the node is off all the time; "
@@ -86,64 +79,19 @@ class CanNode:
             )
         rows = schedule.sample[:, None] + np.arange(layout.samples_per_frame)
         payloads = layout.encode(schedule.count, samples[rows], clip=clip)
-        self._payloads = payloads[self._plan.frame] ^ self._plan.flips
-        # Asked for at every step of a paced run, so counted once.
-        makes_frame = (self._plan.fault != Fault.DUPLICATED) & (self._plan.fault != Fault.BABBLED)
-        self._frames_done = np.concatenate(([0], np.cumsum(makes_frame))).tolist()
-        self._played = 0
-        self._retries = 0
-        self._unsent = 0
+        super().__init__(plan, layout.samples_per_frame, give_up_s)
+        self._payloads = (payloads[plan.frame] ^ plan.flips).tobytes()
+        self._sends, self._babble_id = plan.sends.tolist(), plan.babble_id.tolist()
 
-    @property
-    def injected(self) -> FaultCounts:
-        """Frames played so far, and the faults that were really done to them."""
-        return self._plan.injected(self._played)
-
-    @property
-    def frames_sent(self) -> int:
-        """Frames handed to the bus so far, second copies and corrupted ones included."""
-        return self.injected.sent - self._unsent
-
-    @property
-    def frames_unsent(self) -> int:
-        """Frames that were lost because the bus was."""
-        return self._unsent
-
-    @property
-    def samples_sent(self) -> int:
-        """Samples, per channel, that were played so far, whatever the link did to them."""
-        frames: int = self._frames_done[self._played]
-        return frames * self._layout.samples_per_frame
-
-    @property
-    def send_retries(self) -> int:
-        """How often the bus refused a frame (its queue was full) and it was offered again."""
-        return self._retries
-
-    @property
-    def duration_ns(self) -> int:
-        """Simulated time from the first sample to the last frame."""
-        return int(self._plan.t_ns[-1])
-
-    async def play(self, pacer: Pacer) -> None:
-        """Send everything, as the pacer lets time pass.
-
-        Raises:
-            TimeoutError: the bus refused a frame for ``give_up_s``.
-        """
-        payloads = self._payloads.tobytes()
-        length = self._layout.length
-        plan = zip(
-            self._plan.t_ns.tolist(), self._plan.sends.tolist(), self._plan.babble_id.tolist(), strict=True
-        )
-        for i, (t_ns, sends, babble_id) in enumerate(plan):
-            await pacer.wait_until(t_ns)
-            if babble_id >= 0:
-                await self._send(can.Message(arbitration_id=babble_id, is_extended_id=False, check=False))
-            elif sends:
-                sent = await self._send(self._message(payloads[i * length : (i + 1) * length]))
-                self._unsent += not sent
-            self._played = i + 1
+    async def _do(self, event: int) -> None:
+        if self._babble_id[event] >= 0:
+            await self._send(
+                can.Message(arbitration_id=self._babble_id[event], is_extended_id=False, check=False)
+            )
+        elif self._sends[event]:
+            length = self._layout.length
+            payload = self._payloads[event * length : (event + 1) * length]
+            self._unsent += not await self._send(self._message(payload))
 
     def _message(self, payload: bytes) -> can.Message:
         return can.Message(
@@ -157,26 +105,24 @@ class CanNode:
 
     async def _send(self, message: can.Message) -> bool:
         """Put a frame on the bus; False if the bus is lost, and the frame with it."""
-        refused_since: float | None = None
-        while True:
-            try:
-                self._bus.send(message, timeout=0)
-            except can.CanOperationError as error:
-                if self._reopen is not None and error.error_code != errno.ENOBUFS:
-                    await self._open_again(self._reopen)
-                    return False
-                # A full queue (ENOBUFS) empties by itself.
-                now = time.monotonic()
-                refused_since = now if refused_since is None else refused_since
-                if now - refused_since > self._give_up_s:
-                    raise TimeoutError(
-                        f"{self._bus.channel_info} has refused frame {message.arbitration_id:#x} for "
-                        f"{self._give_up_s:g} s ({error}); is the interface up, and does anyone acknowledge?"
-                    ) from error
-                self._retries += 1
-                await asyncio.sleep(RETRY_S)
-            else:
-                return True
+        sent = await self._offer(lambda: self._refusal(message))
+        if not sent and self._reopen is not None:
+            await self._open_again(self._reopen)
+        return sent
+
+    def _refusal(self, message: can.Message) -> str:
+        """Why the bus does not take a frame for now; nothing if it does."""
+        try:
+            self._bus.send(message, timeout=0)
+        except can.CanOperationError as error:
+            # A full queue (ENOBUFS) empties by itself.
+            if self._reopen is not None and error.error_code != errno.ENOBUFS:
+                raise LinkLostError from error
+            return (
+                f"{self._bus.channel_info} has refused frame {message.arbitration_id:#x} for "
+                f"{self._give_up_s:g} s ({error}); is the interface up, and does anyone acknowledge?"
+            )
+        return ""
 
     async def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
         try:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim_hw.link_faults import Fault
 from sim_hw.node_faults import NodeFaults
+from sim_hw.nodes.planned_node import RETRY_S, LinkLostError, PlannedNode
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,17 +17,16 @@ if TYPE_CHECKING:
     from drivers.frames import FrameLayout
     from drivers.serial_framing import Framing
     from drivers.serial_lines import LineLayout
-    from sim_hw.link_faults import FaultCounts, LinkFaults
+    from sim_hw.link_faults import LinkFaults
     from sim_hw.node_faults_plan import NodePlan
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
-RETRY_S = 0.001
 DELIMITER_BYTES = 2
 """No bit of the last bytes of a frame is flipped: without its delimiter a frame would take the next along."""
 
 
-class SerialNode:
+class SerialNode(PlannedNode):
     """Sends samples over a serial cable, each frame at the time its last sample is taken.
 
     All frames are made, and all faults planned, when the node is: playing only sends. While the
@@ -65,23 +64,20 @@ class SerialNode:
         clip: bool = False,
         give_up_s: float = 10.0,
     ) -> None:
-        self._cable = cable
-        self._per_frame = layout.samples_per_frame
-        self._give_up_s = give_up_s
-        n = len(samples) // self._per_frame
+        per_frame = layout.samples_per_frame
+        n = len(samples) // per_frame
         if n == 0 or samples.ndim != 2 or samples.shape[1] != len(layout.channels):
             raise ValueError(
-                f"samples are {list(samples.shape)}; a frame of stream {stream!r} takes {self._per_frame} of "
+                f"samples are {list(samples.shape)}; a frame of stream {stream!r} takes {per_frame} of "
                 f"{', '.join(layout.channels)}"
             )
-        if not isinstance(faults, NodeFaults):
-            faults = NodeFaults() if faults is None else NodeFaults.of_link(faults)
+        own_faults = NodeFaults.of(faults).without_babble
 
         def planned(length: int) -> NodePlan:
-            return faults.without_babble.plan(
+            return own_faults.plan(
                 len(samples),
                 rate_hz,
-                samples_per_frame=self._per_frame,
+                samples_per_frame=per_frame,
                 length=length,
                 first_index=first_index,
             )
@@ -90,75 +86,38 @@ class SerialNode:
         schedule = planned(1).schedule
         if not len(schedule.sample):
             raise ValueError(f"the faults of stream {stream!r} leave no frame of it; end a brown-out earlier")
-        rows = schedule.sample[:, None] + np.arange(self._per_frame)
+        rows = schedule.sample[:, None] + np.arange(per_frame)
         frames = framing.encode(stream, schedule.count, samples[rows], clip=clip)
-        self._plan = planned(min(map(len, frames)) - DELIMITER_BYTES)
+        plan = planned(min(map(len, frames)) - DELIMITER_BYTES)
+        super().__init__(plan, per_frame, give_up_s)
+        self._cable = cable
+        self._sends = plan.sends.tolist()
         self._frames = [
             _flipped(frames[frame], flips) if fault == Fault.CORRUPTED else frames[frame]
-            for frame, fault, flips in zip(
-                self._plan.frame.tolist(), self._plan.fault.tolist(), self._plan.flips, strict=True
-            )
+            for frame, fault, flips in zip(plan.frame.tolist(), plan.fault.tolist(), plan.flips, strict=True)
         ]
-        self._played = 0
-        self._retries = 0
-        self._unheard = 0
-
-    @property
-    def injected(self) -> FaultCounts:
-        """Frames played so far, and the faults that were really done to them."""
-        return self._plan.injected(self._played)
-
-    @property
-    def samples_sent(self) -> int:
-        """Samples, per channel, that were played so far, whatever became of them."""
-        return self.injected.frames_in * self._per_frame
-
-    @property
-    def frames_unheard(self) -> int:
-        """Frames that were sent while the cable was out or nobody had the port open."""
-        return self._unheard
-
-    @property
-    def send_retries(self) -> int:
-        """How often the cable had no room for a frame and it was offered again."""
-        return self._retries
-
-    @property
-    def duration_ns(self) -> int:
-        """Simulated time from the first sample to the last frame."""
-        return int(self._plan.t_ns[-1])
 
     async def play(self, pacer: Pacer) -> None:
-        """Send everything, as the pacer lets time pass.
-
-        Raises:
-            TimeoutError: the port is open and has taken no byte for ``give_up_s``.
-        """
-        plan = zip(self._plan.t_ns.tolist(), self._plan.sends.tolist(), strict=True)
-        for k, (t_ns, sends) in enumerate(plan):
-            await pacer.wait_until(t_ns)
-            if sends:
-                await self._send(self._frames[k])
-            self._played = k + 1
+        """See `PlannedNode.play`; returns when all that was sent has gone, or nobody has the port open."""
+        await super().play(pacer)
         # A pseudo-terminal does not tell when it has room again.
         while self._cable.listening and not self._cable.flush():  # noqa: ASYNC110
             await asyncio.sleep(RETRY_S)
 
-    async def _send(self, frame: bytes) -> None:
-        refused_since: float | None = None
-        while not self._cable.send(frame):
-            if not self._cable.listening:
-                self._unheard += 1
-                return
-            now = time.monotonic()
-            refused_since = now if refused_since is None else refused_since
-            if now - refused_since > self._give_up_s:
-                raise TimeoutError(
-                    f"{self._cable.path} has taken no byte for {self._give_up_s:g} s although it is open; "
-                    "whoever has it open has stopped reading"
-                )
-            self._retries += 1
-            await asyncio.sleep(RETRY_S)
+    async def _do(self, event: int) -> None:
+        if self._sends[event]:
+            self._unsent += not await self._offer(lambda: self._refusal(self._frames[event]))
+
+    def _refusal(self, frame: bytes) -> str:
+        """Why the cable does not take a frame for now; nothing if it does."""
+        if self._cable.send(frame):
+            return ""
+        if not self._cable.listening:
+            raise LinkLostError
+        return (
+            f"{self._cable.path} has taken no byte for {self._give_up_s:g} s although it is open; "
+            "whoever has it open has stopped reading"
+        )
 
 
 def _flipped(frame: bytes, flips: NDArray[np.uint8]) -> bytes:

@@ -107,7 +107,7 @@ async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) ->
             for block in blocks[stream]:
                 took = sent[stream][block.first_index : block.end_index]
                 np.testing.assert_allclose(block.samples, took, atol=0.1 if stream == "shaft" else 1e-5)
-            assert nodes[stream].frames_unheard == 0
+            assert nodes[stream].frames_unsent == 0
 
 
 async def test_a_port_that_another_program_has_is_waited_for(tmp_path: Path) -> None:

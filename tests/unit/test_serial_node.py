@@ -40,7 +40,7 @@ async def test_what_is_sent_can_be_read_at_the_path(tmp_path: Path):
             heard += os.read(port, 100)
         assert heard == b"41,5\r\n42,6\r\n"
         os.close(port)
-    assert (device.samples_sent, device.frames_unheard, device.duration_ns) == (2, 0, 10_000_000)
+    assert (device.samples_sent, device.frames_unsent, device.duration_ns) == (2, 0, 10_000_000)
     assert not cable.path.is_symlink()
 
 
@@ -48,7 +48,7 @@ async def test_what_nobody_listens_to_is_gone(tmp_path: Path):
     with PseudoTerminal(tmp_path / "port") as cable:
         device = node(cable, np.zeros((3, 1)))
         await device.play(pacer())
-        assert device.frames_unheard == 3
+        assert device.frames_unsent == 3
         cable.unplug()
         assert not cable.listening
         with pytest.raises(OSError, match="is unplugged; plug it in"):
