@@ -108,7 +108,7 @@ class TrendDetector:
         self, channel: TrendChannel, samples: NDArray[np.float32], evidence: Evidence
     ) -> Diagnosis | None:
         """What is to be said of the next value; None while the last one still stands for a missing one."""
-        known = samples[np.isfinite(samples)].astype(np.float64)
+        known = samples[np.isfinite(samples)]
         if not len(known):
             self._missed[channel.sensor] += 1
             if self._missed[channel.sensor] <= BRIDGED:
@@ -125,7 +125,7 @@ class TrendDetector:
             channel.sensor,
             channel.limits,
             evidence,
-            {VALUE: float(known.mean())},
+            {VALUE: _as_read(known)},
             {VALUE: channel.unit} if channel.unit else {},
             "not_ok" if reason else "good",
             reason,
@@ -135,10 +135,15 @@ class TrendDetector:
         return self._statements.state(channel.sensor, channel.limits, evidence, {}, {}, "missing", reason)
 
 
-def _beyond_ok(channel: TrendChannel, known: NDArray[np.float64]) -> str:
+def _as_read(known: NDArray[np.float32]) -> float:
+    """The average to the seven digits of float32: 2.8 must reach a limit of 2.8, and 2.79999995 is less."""
+    return float(f"{known.mean(dtype=np.float64):.7g}")
+
+
+def _beyond_ok(channel: TrendChannel, known: NDArray[np.float32]) -> str:
     if channel.ok_between is None:
         return ""
-    low, high = channel.ok_between
+    low, high = np.array(channel.ok_between, np.float32)
     # One such value is enough: in an average with it, the others would be believed in vain.
     beyond = known[(known < low) | (known > high)]
     if not len(beyond):

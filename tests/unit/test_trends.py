@@ -42,6 +42,16 @@ def test_each_value_is_held_against_setpoints_on_both_sides():
     }
 
 
+@pytest.mark.parametrize("limit", [2.8, 4.5, 7.1, 0.1, -11.3, 65.535, 1013.25])
+def test_a_value_at_a_limit_has_reached_it(limit):
+    at = detector(limits=[Limits("value", limit, None)], ok_between=(limit - 0.5, limit))
+    (said,) = at.process(window([limit]))
+    assert (said.decision, said.quality, said.statistics) == ("alert", "good", {"value": limit})
+    below = detector(limits=[Limits("value", None, None, limit, None)], ok_between=(limit, limit + 0.5))
+    (said,) = below.process(window([limit]))
+    assert (said.decision, said.quality) == ("alert", "good")
+
+
 def test_a_value_that_stands_still_is_no_dead_sensor():
     said = detector().process(window([20.0] * 500))
     assert {d.quality for d in said} == {"good"}
