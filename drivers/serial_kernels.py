@@ -250,7 +250,7 @@ def hunt(
     n = 0
     while at + len(word) < len(buffer):
         length = lengths[buffer[at + len(word)]]
-        if not _stands_at(buffer, word, at) or length < 0:
+        if buffer[at] != word[0] or length < 0 or not _stands_at(buffer, word, at):
             at += 1
             continue
         start = at + len(word)

@@ -8,19 +8,20 @@ field that names the stream, and a checksum behind a ``*``.
 from __future__ import annotations
 
 import binascii
-from collections import defaultdict
+import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import repeat
-from typing import TYPE_CHECKING, Literal
+from functools import cached_property, reduce
+from operator import xor
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from drivers.frames import Decoded, LayoutError
 from drivers.serial_framing import DelimitedFraming, Frames
+from drivers.serial_line_kernels import HARD, OTHER, READ, check_lines, count_stamps, read_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -40,9 +41,28 @@ LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""
 
 DIGITS: Mapping[Checksum, int] = {"xor": 2, "crc16": 4}
-_NUMERIC = b"0123456789+-.eE "
+_SUMS: Mapping[Checksum, Callable[[bytes], int]] = {
+    "xor": lambda text: reduce(xor, text, 0),
+    "crc16": lambda text: binascii.crc_hqx(text, 0xFFFF),
+}
 _TRACKING = 0.05
 """Share of a stamp's deviation by which the device's sampling instants are corrected."""
+
+
+class Lines(NamedTuple):
+    """What lines say to one stream.
+
+    Attributes:
+        mine: bool ``[n]``, which of them are of the stream.
+        good: bool ``[n]``, which of those can be read.
+        places: float64 ``[good]``, their counters, or times in s.
+        samples: float32 ``[good, 1, channels]`` in physical units.
+    """
+
+    mine: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+    places: NDArray[np.float64]
+    samples: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -116,40 +136,36 @@ class LineLayout:
         return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
 
     @cached_property
-    def _picks(self) -> tuple[int, ...]:
-        return tuple(self.columns.index(name) for name in (self._place, *self.channels))
+    def _picks(self) -> NDArray[np.int64]:
+        return np.array([self.columns.index(name) for name in (self._place, *self.channels)], np.int64)
 
-    def read(self, rows: Iterable[Sequence[bytes]]) -> tuple[list[int] | list[float], NDArray[np.float32]]:
-        """Places and samples of rows of fields.
-
-        Returns:
-            Counters, or times in s; float32 ``[n, 1, channels]`` in physical units.
-
-        Raises:
-            ValueError: a row has the wrong number of fields, or a field is no number or does not fit.
-        """
-        picked: list[bytes] = []
-        for row in rows:
-            if len(row) != len(self.columns):
-                raise ValueError(f"{len(row)} fields instead of {len(self.columns)}")
-            picked += [row[k] for k in self._picks]
-        # What float() takes besides, "nan", "inf" and "1_0", no device means.
-        if b"".join(picked).translate(None, _NUMERIC):
-            raise ValueError("a field is no number")
-        width = len(self._picks)
-        values = np.array(list(map(float, picked)), np.float64).reshape(-1, width)[:, 1:]
+    def read(self, lines: Pieces) -> Lines:
+        """Read lines of any streams."""
+        buffer, starts, stops, _ = lines
+        prefix = np.frombuffer((self.prefix or "").encode("ascii"), np.uint8).copy()
+        states, values = read_lines(
+            buffer,
+            starts,
+            stops,
+            prefix,
+            ord(self.separator),
+            len(self.columns),
+            self._picks,
+            self.time is None,
+        )
+        for k in np.flatnonzero(states == HARD).tolist():
+            fields = buffer[starts[k] : stops[k]].tobytes().split(self.separator.encode("ascii"))
+            values[k] = [float(fields[pick + bool(self.prefix)]) for pick in self._picks.tolist()]
+        places = values[:, 0]
+        if self.time is None:
+            fits = (places >= 0) & (places < 2**self.counter_bits)
+        else:
+            places = places / UNITS_PER_S[self.time_unit]
+            fits = abs(places) <= LATEST_S
+        good = (states >= READ) & fits
         with np.errstate(over="ignore"):
-            samples = (values * self.scale + self.offset).astype(np.float32)[:, None, :]
-        if self.time is not None:
-            per_s = UNITS_PER_S[self.time_unit]
-            times = [float(field) / per_s for field in picked[::width]]
-            if max(map(abs, times)) > LATEST_S:
-                raise ValueError(f"a time is beyond {LATEST_S:g} s")
-            return times, samples
-        counters = list(map(int, picked[::width]))
-        if min(counters) < 0 or max(counters) >= 2**self.counter_bits:
-            raise ValueError(f"a counter does not fit {self.counter_bits} bits")
-        return counters, samples
+            samples = (values[good, 1:] * self.scale + self.offset).astype(np.float32)[:, None, :]
+        return Lines(states != OTHER, good, places[good], samples)
 
     def write(self, place: float, sample: NDArray[np.float64]) -> bytes:
         """One line without its checksum and end.
@@ -184,24 +200,11 @@ class DeviceTime:
 
     def __init__(self, rate_hz: float) -> None:
         self._period_s = 1.0 / rate_hz
-        self._count = 0
-        self._last_s: float | None = None
-        self._phase_s = 0.0
+        self._state = np.array([0.0, math.nan, 0.0])
 
-    def count(self, times_s: Iterable[float]) -> list[int]:
-        """The count of each sample, modulo ``2**TIME_COUNTER_BITS``."""
-        counts: list[int] = []
-        for time_s in times_s:
-            if self._last_s is None or time_s < self._last_s:
-                self._count, self._phase_s = 0, time_s
-            else:
-                steps = round((time_s - self._phase_s) / self._period_s)
-                self._count += max(steps, 0)
-                self._phase_s += steps * self._period_s
-                self._phase_s += _TRACKING * (time_s - self._phase_s)
-            self._last_s = time_s
-            counts.append(self._count % 2**TIME_COUNTER_BITS)
-        return counts
+    def count(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The count of each sample, modulo ``2**TIME_COUNTER_BITS``; both ``[n]``."""
+        return count_stamps(times_s, self._period_s, _TRACKING, self._state)
 
 
 class LineFraming(DelimitedFraming):
@@ -265,80 +268,37 @@ class LineFraming(DelimitedFraming):
         lines = [layout.write(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
         if self._checksum == "none":
             return [line + self._end for line in lines]
-        sums = self._sums([line[line[:1] in {b"$", b"!"} :] for line in lines])
+        sums = map(_SUMS[self._checksum], [line[line[:1] in {b"$", b"!"} :] for line in lines])
         digits = DIGITS[self._checksum]
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
     def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
-        """Read lines into ``found``, by stream; returns which of them were lines at all."""
-        buffer, starts, stops, ends = pieces
-        lines = [buffer[a:b].tobytes() for a, b in zip(starts.tolist(), stops.tolist(), strict=True)]
-        texts, intact = self._check(lines)
-        in_step = np.zeros(len(lines), np.bool_)
-        chosen: dict[str, list[int]] = defaultdict(list)
-        rows = [text.split(self._separator) for text in texts]
-        alone = self._by_prefix.get(None)
-        for k, row in enumerate(rows):
-            name = alone or self._by_prefix.get(row[0])
-            if name is not None:
-                chosen[name].append(k)
-            elif intact[k] and row[0].isascii() and row[0].decode("ascii").isprintable():
-                found.note_unknown(row[0].decode("ascii"))
-                in_step[k] = True
-        for name, picked in chosen.items():
-            start = 0 if alone else 1
-            good, read = self._read(self._layouts[name], picked, [rows[k][start:] for k in picked])
-            if read is None:
+        intact = np.ones(len(pieces.ends), np.bool_)
+        if self._checksum != "none":
+            digits = DIGITS[self._checksum]
+            texts, intact = check_lines(pieces.buffer, pieces.starts, pieces.stops, digits)
+            pieces = pieces._replace(stops=texts)
+        in_step = np.zeros(len(pieces.ends), np.bool_)
+        strays = intact.copy()
+        for name, layout in self._layouts.items():
+            mine, good, places, samples = layout.read(pieces)
+            strays &= ~mine
+            in_step |= good
+            if not good.any():
                 continue
-            in_step[good] = True
-            places, samples = read
             sound = intact[good]
-            counter = np.zeros(len(good), np.int64)
             if name in self._times:
                 # A stamp that is not to be trusted must not move the time of those behind it.
-                trusted = np.flatnonzero(sound)
-                counter[trusted] = self._times[name].count(places[k] for k in trusted.tolist())
+                counter = np.zeros(len(sound), np.int64)
+                counter[sound] = self._times[name].count(places[sound])
             else:
-                counter[:] = places
-            found.frames[name] = Frames(Decoded(counter, samples, sound), ends[good])
+                counter = places.astype(np.int64)
+            found.frames[name] = Frames(Decoded(counter, samples, sound), pieces.ends[good])
+        for k in np.flatnonzero(strays).tolist():
+            text = pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes()
+            prefix = text.partition(self._separator)[0]
+            if prefix.isascii() and prefix.decode("ascii").isprintable():
+                found.note_unknown(prefix.decode("ascii"))
+                in_step[k] = True
         return in_step
-
-    @staticmethod
-    def _read(
-        layout: LineLayout, picked: list[int], rows: list[list[bytes]]
-    ) -> tuple[list[int], tuple[list[int] | list[float], NDArray[np.float32]] | None]:
-        """Read the rows that can be read, all at once if that is all of them."""
-        try:
-            return picked, layout.read(rows)
-        except ValueError:
-            good: list[int] = []
-            kept: list[list[bytes]] = []
-            for k, row in zip(picked, rows, strict=True):
-                try:
-                    layout.read([row])
-                except ValueError:
-                    continue
-                good.append(k)
-                kept.append(row)
-            return good, layout.read(kept) if kept else None
-
-    def _check(self, lines: list[bytes]) -> tuple[list[bytes], NDArray[np.bool_]]:
-        """Take the checksums off; returns the texts, and whether each matches."""
-        if self._checksum == "none":
-            return lines, np.ones(len(lines), np.bool_)
-        digits = DIGITS[self._checksum]
-        parts = [line.rpartition(b"*") for line in lines]
-        summed = [text[text[:1] in {b"$", b"!"} :] for text, _, _ in parts]
-        right = [b"%0*X" % (digits, value) for value in self._sums(summed)]
-        sent = [value.upper() for _, _, value in parts]
-        intact = np.fromiter((a == b for a, b in zip(sent, right, strict=True)), np.bool_, len(lines))
-        return [text for text, _, _ in parts], intact
-
-    def _sums(self, texts: list[bytes]) -> list[int]:
-        if self._checksum == "crc16":
-            return list(map(binascii.crc_hqx, texts, repeat(0xFFFF)))
-        # A zero in front keeps every stretch that is combined from being empty, and changes no sum.
-        flat = np.frombuffer(b"\0" + b"\0".join(texts), np.uint8)
-        starts = np.cumsum([0, *(len(text) + 1 for text in texts[:-1])])
-        return [int(value) for value in np.bitwise_xor.reduceat(flat, starts)]
