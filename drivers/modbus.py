@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
 from drivers.keeping import Attempt, keep_up
-from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_client import ModbusClient
 from drivers.modbus_line import ModbusLine, Patience, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
 from drivers.modbus_sampling import readers_for
+from drivers.modbus_wire import LineOptions
 from drivers.registers import Run
 from drivers.tty import Character, CharacterFormat
 

@@ -9,7 +9,6 @@ devices' counters. A port that goes away, because it was unplugged, is opened ag
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import termios
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from drivers.keeping import Attempt, in_thread, keep_up
 from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial_lines import TIME_COUNTER_BITS, LineFraming, LineLayout
 from drivers.serial_reader import SHUTDOWN_S, Batch, SerialReader, close_port
-from drivers.tty import Character, CharacterFormat
+from drivers.tty import Character, CharacterFormat, why_not_open
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -132,7 +131,7 @@ class SerialDriver:
             )
         except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
             self.counters.open_failures += 1
-            self.link.down(f"it cannot be opened: {_why_not_open(error, self._port.options)}")
+            self.link.down(f"it cannot be opened: {why_not_open(error, self._port.options['port'], 'port')}")
             return None
 
     async def _receive(self, device: serial.Serial) -> str:
@@ -277,14 +276,3 @@ def _open_port(options: Mapping[str, Any], characters: CharacterFormat) -> seria
         except (OSError, ValueError) as error:
             logger.info("%s has no low-latency mode: %s", options["port"], error)
     return device
-
-
-def _why_not_open(error: Exception, options: Mapping[str, Any]) -> str:
-    number = getattr(error, "errno", None)
-    if "exclusively lock" in f"{error}" or number in {errno.EBUSY, errno.EAGAIN}:
-        return "another program has it open; stop that program"
-    if number == errno.ENOENT:
-        return f"there is no {options['port']}; plug the device in, or correct port"
-    if number in {errno.EACCES, errno.EPERM}:
-        return "permission denied; make the service's user a member of the group dialout"
-    return f"{error}" or type(error).__name__

@@ -1,7 +1,8 @@
-"""Serial ports that have no UART: what a pseudo-terminal cannot carry is left out when it is opened."""
+"""Opening serial ports: why one cannot be opened, and what those cannot carry that have no UART."""
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import stat
@@ -76,3 +77,21 @@ def is_pseudo_terminal(port: str | Path) -> bool:
     except (OSError, ValueError):  # whoever opens it says what is wrong with it
         return False
     return stat.S_ISCHR(status.st_mode) and os.major(status.st_rdev) in PSEUDO_TERMINAL_MAJORS
+
+
+def why_not_open(error: Exception, port: str, key: str) -> str:
+    """Why a serial port cannot be opened, and what to do.
+
+    Args:
+        error: what opening it raised.
+        port: path of its device.
+        key: what the machine file calls it.
+    """
+    number = getattr(error, "errno", None)
+    if "exclusively lock" in f"{error}" or number in {errno.EBUSY, errno.EAGAIN}:
+        return "another program has it open; stop that program"
+    if number == errno.ENOENT:
+        return f"there is no {port}; plug the device in, or correct {key}"
+    if number in {errno.EACCES, errno.EPERM}:
+        return "permission denied; make the service's user a member of the group dialout"
+    return f"{error}" or type(error).__name__

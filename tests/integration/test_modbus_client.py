@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 import struct
 
 import pytest
+import serial
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_client import ModbusClient
 from drivers.modbus_outcomes import LineLostError, ModbusCounters, NoReplyError
+from drivers.modbus_wire import LineOptions
+from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 TIMEOUT_NS = 50_000_000
 
@@ -94,12 +98,41 @@ async def test_a_connection_that_is_closed_ends_the_request_at_once():
     assert counters.timeouts == 0
 
 
-async def test_why_nobody_can_be_reached_is_told():
-    async with far_end() as (client, _counters):
-        taken = client._options
+@contextlib.contextmanager
+def nobody(tmp_path):
+    """A TCP port that somebody has, and on which nobody listens."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield LineOptions("tcp", host="127.0.0.1", tcp_port=taken.getsockname()[1])
+
+
+@contextlib.contextmanager
+def unplugged(tmp_path):
+    yield LineOptions("rtu", serial_port=str(tmp_path / "ttyUSB0"))
+
+
+@contextlib.contextmanager
+def in_use(tmp_path):
+    with PseudoTerminal(tmp_path / "port"), serial.Serial(str(tmp_path / "port"), exclusive=True):
+        yield LineOptions("rtu", serial_port=str(tmp_path / "port"), parity="none")
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (
+            nobody,
+            r"127\.0\.0\.1:\d+ cannot be opened: nobody listens there; start the server, or correct host",
+        ),
+        (unplugged, r"cannot be opened: there is no .*ttyUSB0; plug the device in, or correct serial_port"),
+        (in_use, r"cannot be opened: another program has it open; stop that program"),
+    ],
+)
+async def test_why_a_line_cannot_be_opened_is_told_with_what_to_do(line, why, tmp_path):
     counters = ModbusCounters()
-    gone = ModbusClient(taken, SystemClock(), counters)
-    with pytest.raises(LineLostError, match=r"127\.0\.0\.1:\d+ cannot be opened: .*Connect call failed"):
-        await gone.connect()
+    with line(tmp_path) as options:
+        client = ModbusClient(options, SystemClock(), counters)
+        with pytest.raises(LineLostError, match=why):
+            await client.connect()
+        await client.close()
     assert counters.open_failures == 1
-    await gone.close()

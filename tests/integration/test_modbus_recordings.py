@@ -12,7 +12,7 @@ import pytest
 from pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_client import ModbusClient
 from drivers.modbus_outcomes import ModbusCounters, RefusedError
 from drivers.modbus_replies import (
     EXCEPTIONS,
@@ -22,6 +22,7 @@ from drivers.modbus_replies import (
     judge_tcp,
     register_bytes,
 )
+from drivers.modbus_wire import LineOptions
 from sim_hw.nodes.modbus_node import ModbusTcpServer, ModbusWire
 
 if TYPE_CHECKING:

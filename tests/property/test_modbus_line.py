@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus_client import LineOptions, ModbusClient
+from drivers.modbus_client import ModbusClient
 from drivers.modbus_layouts import Count, Ring, Trend, sample_record
 from drivers.modbus_line import ModbusLine, Patience, UnitSetAsideError
 from drivers.modbus_outcomes import ModbusCounters, NoReplyError, RefusedError
+from drivers.modbus_wire import LineOptions
 from drivers.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
