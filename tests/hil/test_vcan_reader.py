@@ -132,6 +132,7 @@ def test_an_interface_that_goes_down_gives_what_it_had_and_then_the_reason(vcan:
     with vcan.sender() as sender:
         for k in range(5):
             sender.send(frame_bytes(k, b""))
+        time.sleep(0.05)  # what still is on its way to the socket goes down with the interface
         vcan.down()
     assert source.read(0.1).ids.tolist() == list(range(5))
     with pytest.raises(OSError, match="Network is down") as raised:
