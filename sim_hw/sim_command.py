@@ -13,8 +13,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.recording.channels import channel_map, sampling_rate_hz
-from sim_hw.demo import arguments as arguments_of
+from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 EXIT_FAILED = 1
 EXIT_BAD_FILE = 2
 SCENARIO = "paper"
+OF_RECORDINGS = ("map", "fs")
+OF_PLANTS = ("seed", "snr_db")
+"""Options that go with the one or the other; a scenario's faults go with both."""
 DEFAULT_BUS = "daqsvc-can0"
 """Name of the virtual bus below the folder for temporary files, where none is given."""
 
@@ -55,21 +57,9 @@ class SimCommand:
         play.add_argument(
             "--scenario", metavar="NAME|FILE", help=f"scenario for a machine file (default: {SCENARIO})"
         )
-        play.add_argument("--seed", type=arguments_of.whole, metavar="N", help="of everything random")
-        play.add_argument("--snr-db", type=arguments_of.decibels, metavar="DB", help="of the sensors")
-        play.add_argument(
-            "--recording", type=Path, metavar="FILE", help="play a measured recording instead of a plant"
-        )
-        play.add_argument(
-            "--map",
-            type=channel_map,
-            metavar="SENSOR=VARIABLE,...",
-            help="which variable of the recording is which sensor",
-        )
-        play.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
-        play.add_argument(
-            "--duration", type=arguments_of.positive, metavar="S", help="seconds to play, instead of all"
-        )
+        add_random(play)
+        add_recording(play)
+        play.add_argument("--duration", type=positive, metavar="S", help="seconds to play, instead of all")
         play.add_argument(
             "--stream", action="append", metavar="NAME", help="play only this stream (may be repeated)"
         )
@@ -84,13 +74,7 @@ class SimCommand:
             "--link", type=Path, metavar="PATH", help="link to the pseudo-terminal of a serial port"
         )
         where.add_argument("--port", type=_port, metavar="N", help="TCP port of a Modbus server")
-        where.add_argument(
-            "--speed",
-            type=arguments_of.positive,
-            default=1.0,
-            metavar="N",
-            help="N times as fast as real time (default: 1); daqsvc run knows the sampling rate, and needs 1",
-        )
+        add_speed(where, "; daqsvc run knows the sampling rate, and needs 1")
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
@@ -143,16 +127,7 @@ def _misuse(arguments: argparse.Namespace) -> str | None:
         if arguments.bus is None:
             return "name a machine file or a scenario to play, or a bus to run (--bus PATH)"
         return None
-    if arguments.recording is None:
-        for name in ("map", "fs"):
-            if getattr(arguments, name) is not None:
-                return f"--{name} goes with a recording; give that with --recording, or leave --{name} out"
-    else:
-        for name in ("seed", "snr_db"):
-            if getattr(arguments, name) is not None:
-                option = name.replace("_", "-")
-                return f"--{option} goes with a plant, and --recording plays none; leave one of the two out"
-    return None
+    return misplaced(arguments, OF_RECORDINGS, OF_PLANTS)
 
 
 async def _simulate(arguments: argparse.Namespace) -> int:
@@ -285,7 +260,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _port(text: str) -> int:
-    port = arguments_of.whole(text)
+    port = whole(text)
     if not 0 < port < 2**16:
         raise argparse.ArgumentTypeError(f"{text} is not a TCP port; give one from 1 to 65535")
     return port

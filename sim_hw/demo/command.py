@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.recording.channels import channel_map, sampling_rate_hz
-from sim_hw.demo import arguments as arguments_of
+from sim_hw.arguments import add_random, add_recording, add_speed, positive
+from sim_hw.demo.arguments import broker_url, misuse
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
@@ -48,31 +49,8 @@ class DemoCommand:
             metavar="NAME|FILE",
             help="a built-in scenario (paper, healthy, link-faults) or a scenario file (default: paper)",
         )
-        what.add_argument(
-            "--seed",
-            type=arguments_of.whole,
-            metavar="N",
-            help="seed of everything random (default: the scenario's)",
-        )
-        what.add_argument(
-            "--snr-db",
-            type=arguments_of.decibels,
-            metavar="DB",
-            help="signal to noise of the probes (default: the scenario's)",
-        )
-        what.add_argument(
-            "--recording",
-            type=Path,
-            metavar="FILE",
-            help="play a measured recording (.npz, .mat, .csv[.gz], .wav, .parquet) instead of a scenario",
-        )
-        what.add_argument(
-            "--map",
-            type=channel_map,
-            metavar="NAME=VARIABLE,...",
-            help="which variables of the recording to play, and as which sensors (default: all of them)",
-        )
-        what.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
+        add_random(what)
+        add_recording(what)
         what.add_argument("--unit", choices=UNITS, help="unit of the recording's channels (default: g)")
         what.add_argument(
             "--baseline",
@@ -91,21 +69,15 @@ class DemoCommand:
         )
         what.add_argument(
             "--speed-rpm",
-            type=arguments_of.positive,
+            type=positive,
             metavar="N",
             help="speed of the shaft in the recording, right to 1 %%; with --bearing",
         )
         how = parser.add_argument_group("how to play it")
-        how.add_argument(
-            "--speed",
-            type=arguments_of.positive,
-            default=1.0,
-            metavar="N",
-            help="N times as fast as real time (default: 1)",
-        )
+        add_speed(how)
         how.add_argument(
             "--broker",
-            type=arguments_of.broker_url,
+            type=broker_url,
             metavar="URL",
             help="publish to this broker, mqtt://HOST[:PORT], without TLS (default: one in the process)",
         )
@@ -117,7 +89,7 @@ class DemoCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
-        if wrong := arguments_of.misuse(arguments):
+        if wrong := misuse(arguments):
             self._parser.error(wrong)
         with _sigterm_interrupts():
             try:

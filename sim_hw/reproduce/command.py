@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim_hw.demo import arguments as arguments_of
+from sim_hw import arguments as arguments_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
