@@ -19,12 +19,15 @@ from drivers.can_batches import (
     BusOffError,
     CanBatch,
 )
-from drivers.can_errors import BUS_OFF
+from drivers.can_errors import ALL_CLASSES, BUS_OFF
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
+
+LINUX_ERRORS = frozenset({"unixbus"})
+"""Interfaces whose error frames mean what Linux's mean; on others only bus-off is alike."""
 
 BATCH_FRAMES = 2048
 GATHER_S = 0.002
@@ -36,15 +39,14 @@ class CanAdapter:
     Args:
         bus: the bus; it is shut down with this.
         clock: what arrivals are told in; each is stamped when it is taken.
+        error_classes: see `drivers.can_batches.CanSource`.
     """
 
     gather_s = GATHER_S
-    error_classes = BUS_OFF
-    """Other bits mean other things on other adapters."""
-
     recovers = False
 
-    def __init__(self, bus: can.BusABC, clock: Clock) -> None:
+    def __init__(self, bus: can.BusABC, clock: Clock, error_classes: int = BUS_OFF) -> None:
+        self.error_classes = error_classes
         self._bus = bus
         self._clock = clock
         self._failure: Exception | None = None
@@ -103,7 +105,9 @@ def open_adapter(options: Mapping[str, Any], clock: Clock) -> CanAdapter:
     else:
         chosen["fd"] = bool(options.get("fd"))
     return CanAdapter(
-        can.Bus(channel=options.get("channel"), interface=options["interface"], **chosen), clock
+        can.Bus(channel=options.get("channel"), interface=options["interface"], **chosen),
+        clock,
+        ALL_CLASSES if options["interface"] in LINUX_ERRORS else BUS_OFF,
     )
 
 

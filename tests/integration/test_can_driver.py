@@ -16,9 +16,11 @@ from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can_bus import CanDriver
 from drivers.frames import FrameLayout
+from sim_hw.bus_socket_wire import overflow_message
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
 
@@ -232,3 +234,15 @@ async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
         assert not blocks
     assert [b.first_index for b in blocks] == [0, 3 * PER_FRAME]
     assert blocks[1].lost_before == PER_FRAME
+
+
+async def test_the_virtual_bus_tells_of_its_overflows_as_a_controller_does(tmp_path: Path) -> None:
+    path = str(tmp_path / "can0")
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks, options={"interface": "unixbus", "channel": path, "fd": True}))
+    async with running(driver):
+        await until(lambda: driver.link.state == "up")
+        with can.Bus(interface="unixbus", channel=path, fd=True, hub="join") as peer:
+            peer.send(overflow_message(0.0, path))
+            await until(lambda: driver.counters.frames_error == 1)
+    assert (driver.counters.rx_overflows, driver.counters.overruns) == (1, 1)
