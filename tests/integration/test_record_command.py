@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import can
 import pytest
+from brokers import free_port
 from can_recordings import numbers
 
 from sim_hw.bus_socket import UnixBus
@@ -160,3 +161,40 @@ def test_what_cannot_be_recorded_is_said_in_one_line(machine: Path, tmp_path: Pa
     )
     modbus = RIG.parent / "modbus-gap-voltages.toml"
     assert "there is none" in refused(modbus, "--out", tmp_path / "run.log")
+
+
+def test_the_service_records_while_it_watches(machine: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "can"
+    folder.mkdir()
+    text = machine.read_text(encoding="utf-8").replace(
+        "fd = true\n", 'fd = true\nrecord = { folder = "can", format = "candump" }\n'
+    )
+    text = text.replace("127.0.0.1:1883", f"127.0.0.1:{free_port()}")
+    machine.write_text(text, encoding="utf-8")
+    daqsvc = [sys.executable, "-m", "daqsvc"]
+    with subprocess.Popen([*daqsvc, "run", str(machine), "--store", str(tmp_path / "store")]) as service:
+        try:
+            eventually((tmp_path / "bus").exists, "the service does not open its bus")
+            command = [*daqsvc, "sim", str(machine), "--scenario", "healthy", "--duration", "2"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+            sent = json.loads(done.stdout)["streams"]["shaft"]["samples_sent"]
+            eventually(lambda: _last_count(folder) == sent - 10, "the last frame is not recorded")
+            service.send_signal(signal.SIGTERM)
+            assert service.wait(PATIENCE_S) == 0
+        finally:
+            service.kill()
+    assert _counts(folder) == list(range(0, sent, 10))
+
+
+def _counts(folder: Path) -> list[int]:
+    """The counters of the rig's frames in the only file of a folder."""
+    [path] = folder.iterdir()
+    lines = path.read_text(encoding="ascii").splitlines()
+    return [int.from_bytes(bytes.fromhex(line.split("##")[1][1:5]), "little") for line in lines]
+
+
+def _last_count(folder: Path) -> int:
+    try:
+        return _counts(folder)[-1]
+    except (IndexError, ValueError):
+        return -1
