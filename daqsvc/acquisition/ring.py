@@ -11,6 +11,7 @@ import asyncio
 import heapq
 import itertools
 from bisect import bisect_right
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock, Samples
 
 ANCHORS = 4096
+GAPS = 256
+"""Gaps that a ring remembers, to tell what a reader has missed from what nobody ever had."""
 
 
 class RingError(Exception):
@@ -77,6 +80,7 @@ class SampleRing:
         self._anchor_index = [0] * ANCHORS
         self._anchor_time = [(0, 0.0)] * ANCHORS
         self._anchors = 0
+        self._gaps: deque[tuple[int, int]] = deque(maxlen=GAPS)
         self._order = itertools.count()
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
         self._closed = False
@@ -117,6 +121,8 @@ class SampleRing:
             )
         # Readers on other threads compare with this before and after they copy.
         self._oldest = max(self._oldest, block.end_index - self.capacity)
+        if block.lost_before:
+            self._gaps.append((self._end, block.first_index))
         self._fill(self._end, block.lost_before, None)
         self._fill(block.first_index, n, block.samples)
         self.samples_lost += block.lost_before
@@ -156,6 +162,10 @@ class SampleRing:
         if first < self._oldest:
             raise RingOverrun(self.stream, first, self._oldest)
         return copy
+
+    def lost_between(self, first: int, end: int) -> int:
+        """How many of the samples from index ``first`` up to ``end`` are missing, by the last `GAPS` gaps."""
+        return sum(max(0, min(end, gap_end) - max(first, gap_first)) for gap_first, gap_end in self._gaps)
 
     def time_of(self, index: int) -> int:
         """Host monotonic time in ns at which sample ``index`` was (or will be) taken.
@@ -225,11 +235,13 @@ class Chunk:
         first_index: absolute index of the first row.
         samples: float32 ``[n, channels]``, a private copy.
         skipped: samples between the last chunk and this one that were overwritten before they were read.
+        lost: how many of these were missing anyway: an outage that is longer than the ring.
     """
 
     first_index: int
     samples: Samples
     skipped: int
+    lost: int = 0
 
 
 class RingReader:
@@ -237,7 +249,7 @@ class RingReader:
 
     Attributes:
         position: index of the next sample to read; None until the ring has its first block.
-        samples_skipped: samples lost to overruns since the start, exactly.
+        samples_skipped: samples lost to overruns since the start, exactly; what was missing anyway is none.
     """
 
     def __init__(self, ring: SampleRing) -> None:
@@ -263,7 +275,7 @@ class RingReader:
             if not ring.started:
                 await self._first_block()
             self.position = ring.oldest_index
-        skipped = 0
+        skipped = lost = 0
         while True:
             await ring.wait_for(self.position + block)
             count = min((ring.end_index - self.position) // block, most_blocks) * block
@@ -271,11 +283,12 @@ class RingReader:
                 samples = ring.read(self.position, count)
             except RingOverrun as overrun:
                 skipped += overrun.lost
+                lost += ring.lost_between(self.position, overrun.oldest)
                 self.position = overrun.oldest
                 continue
-            chunk = Chunk(self.position, samples, skipped)
+            chunk = Chunk(self.position, samples, skipped, lost)
             self.position += count
-            self.samples_skipped += skipped
+            self.samples_skipped += skipped - lost
             return chunk
 
     async def _first_block(self) -> None:

@@ -44,7 +44,7 @@ class DetectorCounters:
     Attributes:
         windows: windows processed.
         samples: samples in them.
-        samples_skipped: samples it was too slow for, exactly.
+        samples_skipped: samples it was too slow for, exactly; what never arrived is none.
         failures: windows in which it raised, against its contract.
         busy_ns: time its kernels took, on the host's clock.
     """
@@ -172,12 +172,12 @@ class Pipeline:
                 chunk = await reader.take(detector.block, MOST_BLOCKS)
             except RingClosed:
                 return
-            if chunk.skipped:
-                counters.samples_skipped += chunk.skipped
+            if missed := chunk.skipped - chunk.lost:
+                counters.samples_skipped += missed
                 logger.warning(
                     "detector %s was too slow and has missed %d samples of %r from index %d on",
                     detector.name,
-                    chunk.skipped,
+                    missed,
                     detector.stream,
                     chunk.first_index - chunk.skipped,
                 )

@@ -98,6 +98,26 @@ async def test_a_detector_that_is_too_slow_learns_exactly_what_it_missed() -> No
     assert pipeline.counters["slow"].samples_skipped == 125
 
 
+async def test_an_outage_longer_than_the_ring_is_no_fault_of_the_detector(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    ring = SampleRing("s", ("a",), 16)
+    quick = Listener("quick", 4)
+    pipeline = Pipeline({"s": ring}, [quick], lambda _: None, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    write(ring, 8)
+    await asyncio.sleep(0.02)
+    block = SampleBlock("s", 108, np.full((4, 1), 1.0, np.float32), 108_000, 1000.0, lost_before=100)
+    ring.write(block)
+    await asyncio.sleep(0.02)
+    ring.close()
+    await running
+    # The windows after the outage know of all that lies between; the figures, of what was there to be had.
+    assert [(w.first_index, len(w.samples), w.skipped) for w in quick.windows] == [(0, 8, 0), (96, 16, 88)]
+    assert pipeline.counters["quick"].samples_skipped == 0
+    assert not caplog.records
+
+
 async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.LogCaptureFixture) -> None:
     ring = SampleRing("s", ("a",), 50)
     broken = Listener("broken", 10, fail_at=0)

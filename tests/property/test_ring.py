@@ -120,6 +120,31 @@ def test_a_reader_gets_every_sample_or_its_exact_count(capacity, chunks, size, r
     asyncio.run(main())
 
 
+@given(
+    capacity=st.integers(4, 40),
+    pieces=st.lists(st.tuples(st.integers(0, 60), st.integers(1, 20)), min_size=1, max_size=40),
+    read_every=st.integers(1, 6),
+)
+def test_what_a_reader_missed_is_told_from_what_never_came(capacity, pieces, read_every) -> None:
+    async def main() -> None:
+        ring = SampleRing("s", ("a", "b"), capacity)
+        reader = RingReader(ring)
+        there: list[bool] = []
+        missed = 0
+        for i, (lost, n) in enumerate(pieces):
+            ring.write(block(len(there) + lost, [1.0] * n, lost))
+            there += [False] * lost + [True] * n
+            if i % read_every == 0 and reader.behind:
+                before = ring.oldest_index if reader.position is None else reader.position
+                chunk = await reader.take(1, 64)
+                passed_over = there[before : chunk.first_index]
+                assert (chunk.skipped, chunk.lost) == (len(passed_over), passed_over.count(False))
+                missed += passed_over.count(True)
+        assert reader.samples_skipped == missed
+
+    asyncio.run(main())
+
+
 async def test_waiting_ends_when_the_index_is_there() -> None:
     ring = SampleRing("s", ("a", "b"), 10)
     near = asyncio.ensure_future(ring.wait_for(3))
