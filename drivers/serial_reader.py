@@ -38,8 +38,8 @@ GATHER_NS = 5_000_000
 """How long bytes are gathered into one batch: one turn of the event loop then serves them all."""
 
 READ_BYTES = 65_536
-BATCH_BYTES = 262_144
-BATCHES_UNDER_WAY = 32
+BATCH_BYTES = 524_288
+BATCHES_UNDER_WAY = 16
 SHUTDOWN_S = 0.5
 LINE_ERRORS_EVERY_NS = 1_000_000_000
 TIOCGICOUNT = 0x545D
