@@ -28,6 +28,7 @@ STORE = ("store/disk", "store/journal", "store/damage", "store/telemetry", "stor
 
 BUS_OVERRUN = "bus-overrun/"
 BUS_CONTROLLER = "bus-controller/"
+BUS_RECORDING = "bus-recording/"
 """How the names of the conditions of a bus begin."""
 
 CERTIFICATE = "certificate/"
@@ -60,11 +61,13 @@ class BusHealth(NamedTuple):
         overruns: what was lost because a buffer between the bus and this process was full.
         bus_off: how often its controller took itself off the bus.
         state: state of the controller; None for a bus that has none.
+        unrecorded: frames that are missing from its recording.
     """
 
     overruns: int
     bus_off: int
     state: Literal["error-active", "error-warning", "error-passive", "bus-off"] | None
+    unrecorded: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +116,8 @@ def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProx
     """
     found = list(STORE)
     found += [f"{BUS_OVERRUN}{bus}" for bus, driver in buses.items() if driver in {"can", "serial"}]
-    found += [f"{BUS_CONTROLLER}{bus}" for bus, driver in buses.items() if driver == "can"]
+    for kind in (BUS_CONTROLLER, BUS_RECORDING):
+        found += [f"{kind}{bus}" for bus, driver in buses.items() if driver == "can"]
     if mqtt is not None and mqtt.tls:
         files = {BROKER: True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
         found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
@@ -138,6 +142,7 @@ class SelfCheck:
         self._damaged = _Happening()
         self._overruns: defaultdict[str, _Happening] = defaultdict(_Happening)
         self._bus_off: defaultdict[str, _Happening] = defaultdict(_Happening)
+        self._unrecorded: defaultdict[str, _Happening] = defaultdict(_Happening)
         self._write_errors = 0
         self._unwritable = False
 
@@ -176,8 +181,10 @@ class SelfCheck:
             yield self._overrun(bus, health, vitals.now_ns)
             if health.state is not None:
                 yield self._controller(bus, health, vitals.now_ns)
+                yield self._recording(bus, health, vitals.now_ns)
+        of_a_bus = (BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
         for name in sorted(vitals.conditions_told):
-            if name.startswith((BUS_OVERRUN, BUS_CONTROLLER)) and name.partition("/")[2] not in vitals.buses:
+            if name.startswith(of_a_bus) and name.partition("/")[2] not in vitals.buses:
                 yield Condition(name, Level.NORMAL, "there is no such bus any more")
 
     def _certificate(self, name: str, left_ns: int, end_ns: int) -> Condition:
@@ -266,6 +273,16 @@ class SelfCheck:
         if health.state == "error-passive":
             return Condition(name, Level.ALERT, f"the controller of bus {bus} is error-passive: {look}")
         return Condition(name, Level.NORMAL, f"the controller of bus {bus} is sound")
+
+    def _recording(self, bus: str, health: BusHealth, now_ns: int) -> Condition:
+        name = f"{BUS_RECORDING}{bus}"
+        if not self._unrecorded[bus].goes_on(health.unrecorded, now_ns):
+            return Condition(name, Level.NORMAL, f"no frame is missing from the recording of bus {bus}")
+        sentence = (
+            f"frames of bus {bus} are missing from its recording: see that the folder is there, and its disk "
+            "has room and is fast enough"
+        )
+        return Condition(name, Level.ALERT, sentence)
 
 
 class _Happening:

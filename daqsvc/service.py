@@ -231,8 +231,13 @@ class Service:
         found: dict[str, BusHealth] = {}
         for driver in self.drivers:
             counters = driver.counters
-            state = counters.controller_state if isinstance(counters, CanCounters) else None
-            found[driver.name] = BusHealth(counters.overruns, counters.bus_off, state)
+            found[driver.name] = (
+                BusHealth(
+                    counters.overruns, counters.bus_off, counters.controller_state, counters.frames_unrecorded
+                )
+                if isinstance(counters, CanCounters)
+                else BusHealth(counters.overruns, counters.bus_off, None)
+            )
         return found
 
     async def _tell_status(self) -> None:

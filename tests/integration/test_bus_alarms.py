@@ -40,6 +40,12 @@ async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -
         assert level is Level.ALERT
         assert "what bus can0 carries is lost" in message
         assert how(service, "bus-controller/can0")[0] is Level.DANGER
+        assert "bus-recording/can0" not in service.desk.manager.alarms
+        driver.counters.frames_unrecorded += 1
+        service.desk.tick()
+        level, message = how(service, "bus-recording/can0")
+        assert level is Level.ALERT
+        assert "frames of bus can0 are missing from its recording" in message
         driver.take(Sorted(errors=ErrorCounts({"restarts": 1}, "error-active")))
         service.desk.tick()
         assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"

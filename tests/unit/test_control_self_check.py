@@ -177,6 +177,17 @@ def test_a_controller_that_leaves_the_bus_is_dangerous_and_one_near_it_is_told()
         assert words in found[1]
 
 
+def test_frames_that_are_missing_from_a_recording_are_an_alarm_until_a_minute_after_the_last() -> None:
+    check = self_check()
+    levels = []
+    for t_s, unrecorded in ((0, 0), (1, 10), (50, 11), (109, 11), (111, 11)):
+        buses = {"can0": BusHealth(0, 0, "error-active", unrecorded)}
+        level, words = look(check, now_ns=t_s * NS_PER_S, buses=buses)["bus-recording/can0"]
+        levels.append(level)
+        assert "missing from " in words
+    assert levels == [Level.NORMAL, *[Level.ALERT] * 3, Level.NORMAL]
+
+
 def test_a_bus_that_is_no_longer_there_has_no_alarm() -> None:
     told = frozenset({"bus-overrun/can1", "bus-controller/can1", "bus-overrun/can0"})
     found = look(self_check(), conditions_told=told, buses={"can0": BusHealth(0, 0, "error-active")})
@@ -190,6 +201,7 @@ def test_the_alarms_of_a_bus_are_known_before_they_are_raised() -> None:
     assert set(conditions(None, buses)) - set(conditions(None)) == {
         "bus-overrun/can0",
         "bus-controller/can0",
+        "bus-recording/can0",
         "bus-overrun/tty",
     }
 
