@@ -141,6 +141,8 @@ class ModbusWire(ModbusProtocol):
             LineLostError: the connection is gone.
             NoReplyError: no sound reply came in time.
         """
+        if self._waits:
+            raise RuntimeError(f"{self._options.where} is asked twice at once; wait for the first reply")
         if not self._serial:
             self._transaction = self._transaction % _LAST_TRANSACTION + 1
         unit, pdu, data_bytes = request
@@ -155,9 +157,7 @@ class ModbusWire(ModbusProtocol):
             return await self._reply
         finally:
             if self._serial and self._expected is not None and self.recv_buffer:
-                self._counters.note(
-                    "truncated"
-                )  # the request is over, and this is all that came of its reply
+                self._counters.note("truncated")  # this is all that came of the reply
             self._expected = None
             self._begin_anew()
 

@@ -77,6 +77,8 @@ async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_pat
         await eventually(lambda: min(received("drive-end"), received("other-end")) > 5, "both are polled")
         first = service.rings["drive-end"].read(service.rings["drive-end"].oldest_index, 1)[0]
         other = service.rings["other-end"].read(service.rings["other-end"].oldest_index, 1)[0]
+        polls = service.drivers[0].counters.requests
+        assert polls < received("drive-end") + received("other-end"), "one request reads both sensors"
     server.stop()
     assert first == pytest.approx([0.108, 0.182, 25.9])
     assert other == pytest.approx([1.5, 2.5, 30.0])
