@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
+import time
 from typing import TYPE_CHECKING
 
 import can
@@ -12,10 +13,11 @@ import numpy as np
 from machine_files import MACHINES, changed, problems_of
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.acquisition.samples import Quality
 from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import EXTENDED, IdMatch
+from drivers.can_batches import EXTENDED, CanBatch, IdMatch
 from drivers.can_bus import CanDriver
 from drivers.dbc import layout_from_dbc
 
@@ -54,6 +56,71 @@ async def test_frames_of_any_priority_are_one_stream() -> None:
     np.testing.assert_allclose(samples, expected, rtol=1e-6)
     assert driver.streams["housing"][0].samples_lost == 0
     assert set(driver.counters.unknown_ids) == {"0x18ff0381 (29 bit)", "0x18ff0480 (29 bit)"}
+
+
+class Played:
+    """A bus that has heard a device for ten seconds, and hears nothing more."""
+
+    gather_s = 0.0
+    error_classes = 0
+    recovers = True
+
+    def __init__(self, sent: np.ndarray, begin_ns: int) -> None:
+        lateral = 32_000 + sent % 1000
+        payloads = np.zeros((len(sent), 64), np.uint8)
+        payloads[:, :8] = (
+            np.column_stack([lateral, lateral, np.full_like(sent, 0xFFFF), sent * 0])
+            .astype("<u2")
+            .view(np.uint8)
+        )
+        ids = np.full(len(sent), 0x0CF02DE2 | EXTENDED, np.uint32)
+        arrival_ns = begin_ns + sent * 10_000_000
+        self._parts = [
+            CanBatch(
+                ids[k : k + 7], np.full(len(ids[k : k + 7]), 8), payloads[k : k + 7], arrival_ns[k : k + 7]
+            )
+            for k in range(0, len(sent), 7)
+        ]
+        self.left = len(self._parts)
+
+    def read(self, timeout_s: float) -> CanBatch:
+        if not self.left:
+            time.sleep(timeout_s)
+            return CanBatch(
+                np.zeros(0, np.uint32), np.zeros(0, int), np.zeros((0, 64), np.uint8), np.zeros(0, int)
+            )
+        self.left -= 1
+        return self._parts[-1 - self.left]
+
+    def close(self) -> None:
+        pass
+
+
+async def test_the_standard_message_has_no_counter_and_its_loss_is_told_all_the_same() -> None:
+    machine = load_machine_file(MACHINES / "j1939-pgn61485.toml")
+    blocks: list[SampleBlock] = []
+    sent = np.delete(np.arange(1000), [*range(200, 230), 500])
+    clock = SystemClock()
+    source = Played(sent, clock.monotonic_ns() - 20_000_000_000)
+    specs = [StreamSpec("foot", frame_layout(machine, "foot"), 100.0)]
+    port = BusPort("can0", {"interface": "played", "channel": "x"}, specs, clock, blocks.append)
+    driver = CanDriver(port, lambda _port, _sorter: source)
+    task = asyncio.create_task(driver.run())
+    async with asyncio.timeout(20):
+        while driver.streams["foot"][0].frames_received < len(sent):
+            await asyncio.sleep(0.001)
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    counters = driver.streams["foot"][0]
+    assert (counters.samples_received, counters.samples_lost, counters.gaps) == (969, 31, 2)
+    assert counters.values_absent == 969  # the vertical sensor is not fitted
+    for block in blocks:
+        index = np.arange(block.first_index, block.end_index)
+        np.testing.assert_allclose(block.samples[:, 0], (index % 1000) * 0.01, atol=1e-4)
+        assert np.isnan(block.samples[:, 2]).all()
+    lossy = [block for block in blocks if block.lost_before]
+    assert all(block.quality & Quality.LOSS_ESTIMATED for block in lossy)
 
 
 def test_a_message_of_a_j1939_data_base_has_any_priority(tmp_path: Path) -> None:
