@@ -66,3 +66,9 @@ def bad_link(tmp_path: Path) -> Path:
     path = tmp_path / "bad-link.toml"
     path.write_text(BAD_LINK, encoding="utf-8")
     return path
+
+
+@pytest.fixture
+def bus_path(tmp_path: Path) -> str:
+    """Where a virtual CAN bus may be."""
+    return str(tmp_path / "can0")
