@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import threading
@@ -23,30 +24,39 @@ if TYPE_CHECKING:
 ALL = IdMatch(0, 0)
 
 
-def opened(vcan: VcanLink, *matches: IdMatch, **options: object) -> SocketCan:
-    return open_socketcan({"channel": vcan.name, "fd": True} | options, matches, SystemClock())
+PATIENCE_S = 10.0
 
 
-def read_all(source: SocketCan) -> list[CanBatch]:
-    batches = []
-    while True:
-        batch = source.read(0.0)
-        batches.append(batch)
-        if not len(batch.ids) and batch.drained_ns is not None:
-            return batches
+def opened(vcan: VcanLink, *matches: IdMatch, **options: object) -> contextlib.closing[SocketCan]:
+    return contextlib.closing(
+        open_socketcan({"channel": vcan.name, "fd": True} | options, matches, SystemClock())
+    )
+
+
+def read_all(source: SocketCan, frames: int) -> list[CanBatch]:
+    """What comes until so many frames are accounted for; they may reach the socket after they were sent."""
+    batches: list[CanBatch] = []
+    deadline_s = time.monotonic() + PATIENCE_S
+    while sum(len(batch.ids) + batch.overrun for batch in batches) < frames:
+        assert time.monotonic() < deadline_s, f"{frames} frames do not come: {batches}"
+        batches.append(source.read(0.01))
+    batches.append(source.read(0.05))
+    return batches
+
+
+def ids_of(batches: list[CanBatch]) -> list[int]:
+    return np.concatenate([batch.ids for batch in batches]).tolist()
 
 
 def test_classic_and_fd_frames_come_in_order_with_their_time(vcan: VcanLink) -> None:
     clock = SystemClock()
-    source = opened(vcan, ALL)
-    with vcan.sender() as sender:
+    with opened(vcan, ALL) as source, vcan.sender() as sender:
         before_ns = clock.monotonic_ns()
         sender.send(frame_bytes(0x123, b"12345678"))
         sender.send(frame_bytes(0x1234_5678, bytes(range(64)), extended=True))
         after_ns = clock.monotonic_ns()
-    time.sleep(0.05)
-    batch = source.read(1.0)
-    source.close()
+        time.sleep(0.05)
+        batch = source.read(1.0)
     assert batch.ids.tolist() == [0x123, 0x1234_5678 | EXTENDED]
     assert batch.lengths.tolist() == [8, 64]
     assert batch.data[1].tobytes() == bytes(range(64))
@@ -56,8 +66,11 @@ def test_classic_and_fd_frames_come_in_order_with_their_time(vcan: VcanLink) -> 
 
 def test_the_kernel_passes_on_only_what_some_stream_has(vcan: VcanLink) -> None:
     wanted = IdMatch(0x101, STANDARD_ID | EXTENDED | REMOTE)
-    filtered, open_to_all = opened(vcan, wanted), opened(vcan, wanted, filter=False)
-    with vcan.sender() as sender:
+    with (
+        opened(vcan, wanted) as filtered,
+        opened(vcan, wanted, filter=False) as open_to_all,
+        vcan.sender() as sender,
+    ):
         for frame_id, extended, flags in [
             (0x100, False, 0),
             (0x101, False, 0),
@@ -68,15 +81,12 @@ def test_the_kernel_passes_on_only_what_some_stream_has(vcan: VcanLink) -> None:
             sender.send(frame_bytes(frame_id, b"", extended=extended, flags=flags))
         error = frame_bytes(ERROR | 0x40, bytes(8))
         sender.send(error)
-    assert read_all(filtered)[0].ids.tolist() == [0x101, 0x101, ERROR | 0x40]
-    assert sum(len(b.ids) for b in read_all(open_to_all)) == 6
-    filtered.close()
-    open_to_all.close()
+        assert len(ids_of(read_all(open_to_all, 6))) == 6
+        assert ids_of(read_all(filtered, 3)) == [0x101, 0x101, ERROR | 0x40]
 
 
 def test_a_flood_is_accounted_for_to_the_frame(vcan: VcanLink) -> None:
     frames_sent = 50_000
-    source = opened(vcan, ALL, receive_buffer_bytes=128 << 10)
     got: list[np.ndarray] = []
     overrun = 0
     done = threading.Event()
@@ -95,19 +105,19 @@ def test_a_flood_is_accounted_for_to_the_frame(vcan: VcanLink) -> None:
         done.set()
 
     thread = threading.Thread(target=flood)
-    thread.start()
-    try:
-        while True:
-            ended = done.is_set()
-            batch = source.read(0.01)
-            overrun += batch.overrun
-            got.append(batch.data[:, :8].copy().view(np.int64)[:, 0])
-            if ended and not len(batch.ids):
-                break
-            time.sleep(0.02)  # too slow on purpose
-    finally:
-        thread.join()
-        source.close()
+    with opened(vcan, ALL, receive_buffer_bytes=128 << 10) as source:
+        thread.start()
+        try:
+            while True:
+                ended = done.is_set()
+                batch = source.read(0.02)
+                overrun += batch.overrun
+                got.append(batch.data[:, :8].copy().view(np.int64)[:, 0])
+                if ended and not len(batch.ids):
+                    break
+                time.sleep(0.02)  # too slow on purpose
+        finally:
+            thread.join()
     numbers = np.concatenate(got)
     assert (np.diff(numbers) > 0).all()
     assert len(numbers) + overrun == frames_sent
@@ -115,30 +125,28 @@ def test_a_flood_is_accounted_for_to_the_frame(vcan: VcanLink) -> None:
 
 
 def test_drops_are_known_even_if_no_frame_follows(vcan: VcanLink) -> None:
-    source = opened(vcan, ALL, receive_buffer_bytes=4096)
-    with vcan.sender() as sender:
+    with opened(vcan, ALL, receive_buffer_bytes=4096) as source, vcan.sender() as sender:
         for k in range(500):
             sender.send(frame_bytes(1, k.to_bytes(4, "little")))
-    dropped = dropped_frames(source._socket)
-    batches = read_all(source)
-    source.close()
+        time.sleep(0.05)
+        dropped = dropped_frames(source._socket)
+        batches = read_all(source, 500)
     assert 0 < dropped < 500
     assert sum(b.overrun for b in batches) == dropped
     assert sum(len(b.ids) for b in batches) == 500 - dropped
 
 
 def test_an_interface_that_goes_down_gives_what_it_had_and_then_the_reason(vcan: VcanLink) -> None:
-    source = opened(vcan, ALL)
-    with vcan.sender() as sender:
-        for k in range(5):
-            sender.send(frame_bytes(k, b""))
-        time.sleep(0.05)  # what still is on its way to the socket goes down with the interface
-        vcan.down()
-    assert source.read(0.1).ids.tolist() == list(range(5))
-    with pytest.raises(OSError, match="Network is down") as raised:
-        source.read(0.1)
-    assert raised.value.errno == errno.ENETDOWN
-    source.close()
+    with opened(vcan, ALL) as source:
+        with vcan.sender() as sender:
+            for k in range(5):
+                sender.send(frame_bytes(k, b""))
+            time.sleep(0.05)  # what still is on its way to the socket goes down with the interface
+            vcan.down()
+        assert source.read(0.1).ids.tolist() == list(range(5))
+        with pytest.raises(OSError, match="Network is down") as raised:
+            source.read(0.1)
+        assert raised.value.errno == errno.ENETDOWN
     with pytest.raises(OSError, match=rf"interface {vcan.name} is down; set it up with"):
         opened(vcan, ALL)
     vcan.remove()
@@ -149,7 +157,8 @@ def test_an_interface_that_goes_down_gives_what_it_had_and_then_the_reason(vcan:
 def test_sockets_opened_and_closed_leave_no_descriptor(vcan: VcanLink) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
     for _ in range(100):
-        opened(vcan, ALL).close()
+        with opened(vcan, ALL):
+            pass
         vcan.down()
         with pytest.raises(OSError, match="is down"):
             opened(vcan, ALL)
@@ -163,16 +172,14 @@ def test_a_step_of_the_wall_clock_moves_no_arrival(vcan: VcanLink) -> None:
             "sets the wall clock, and this machine is no guest; tests/unit/test_socketcan.py has it, too"
         )
     clock = SystemClock()
-    source = opened(vcan, ALL)
     arrivals: list[int] = []
     sent: list[int] = []
-    with vcan.sender() as sender:
+    with opened(vcan, ALL) as source, vcan.sender() as sender:
         for step_s in (0, 3600, -7200, 3600):
             sender.send(frame_bytes(1, b""))
             sent.append(clock.monotonic_ns())
             time.clock_settime_ns(time.CLOCK_REALTIME, time.time_ns() + step_s * NS_PER_S)
             sender.send(frame_bytes(1, b""))
             sent.append(clock.monotonic_ns())
-            arrivals += source.read(1.0).arrival_ns.tolist()
-    source.close()
+            arrivals += [t_ns for batch in read_all(source, 2) for t_ns in batch.arrival_ns.tolist()]
     assert np.abs(np.array(arrivals) - np.array(sent)).max() < 50_000_000
