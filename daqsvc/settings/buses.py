@@ -115,7 +115,9 @@ class PlainLayout(Section):
     id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF, description="the frame's CAN id", examples=["0x101"])]
     extended: bool = Field(default=False, description="whether the id has 29 bits rather than 11")
     any_priority: bool = Field(
-        default=False, description="SAE J1939: frames with another priority than the id's are the same"
+        default=False,
+        description="SAE J1939: frames with another priority than the id's are the same, and unsigned raw "
+        "values from 0xfb.. on are no measurements",
     )
     length: Annotated[
         int, AfterValidator(_payload_length), Field(description="payload length in bytes", examples=[64])

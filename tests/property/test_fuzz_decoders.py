@@ -66,6 +66,17 @@ BITWISE = FrameLayout(
 )
 
 
+UNCOUNTED = frame_layout(
+    extended=True,
+    any_priority=True,
+    channels=[("x", 16, "unsigned", 0.01, -320.0), ("y", 32, "float", 1.0, 0.0)],
+    counter_byte=None,
+    counts="frames",
+    valid_raw={"y": (-100.0, 100.0)},
+)
+"""A message of SAE J1939: no counter, and raw values that are no measurements."""
+
+
 def assembler_of(layout: Any, blocks: list[SampleBlock]) -> StreamAssembler:
     return StreamAssembler(
         "s",
@@ -86,7 +97,8 @@ def in_order(blocks: list[SampleBlock]) -> None:
 def can_payloads(rng: np.random.Generator) -> int:
     """Payloads of the right length, all the way to blocks."""
     n = 500
-    layout = [frame_layout(), frame_layout(counter_bits=8, first_byte=1), BITWISE][int(rng.integers(3))]
+    layouts = [frame_layout(), frame_layout(counter_bits=8, first_byte=1), BITWISE, UNCOUNTED]
+    layout = layouts[int(rng.integers(len(layouts)))]
     counters = np.cumsum(rng.choice([0, 1, 1, 1, 1, 2, -1, 50], n)) * layout.samples_per_frame
     samples = rng.integers(-3, 4, (n, layout.samples_per_frame, 2)).astype(float)
     sound = layout.encode(np.abs(counters), samples, clip=True)
