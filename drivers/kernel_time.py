@@ -32,7 +32,7 @@ class KernelTime:
     the time base (`daqsvc.acquisition.timebase`) has it.
 
     A controller's clock is tied to the kernel's by the earliest kernel stamps of the last second: its stamps
-    lack the delay of the interrupt. In that second the two clocks drift apart by some 0.1 us per ppm.
+    lack the delay of the interrupt. In that second the two clocks drift apart by 1 us per ppm at most.
 
     Args:
         clock: monotonic time and wall time of the service.
