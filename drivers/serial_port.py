@@ -1,8 +1,8 @@
 """The driver of serial ports: framed binary samples, or lines of text, from a device that sends by itself.
 
-pyserial opens the port and sets it up; the bytes are read from its file descriptor by a thread of ours,
-cut into frames and decoded there, and handed to the event loop in batches. When the event loop cannot keep
-up the thread waits: bytes then pile up in the kernel, and what overflows there shows as a gap in the
+pyserial opens the port and sets it up; the bytes are read from its file descriptor by a thread of ours, cut
+into frames and decoded by another, and handed to the event loop in batches. When the event loop cannot keep
+up the threads wait: bytes then pile up in the kernel, and what overflows there shows as a gap in the
 devices' counters. A port that goes away, because it was unplugged, is opened again by its path.
 """
 

@@ -225,3 +225,43 @@ async def test_a_framing_that_fails_costs_the_link_and_not_the_service(
             os.write(cable.fd, b"1,1\n2,2\n3,3\n")
             await until(lambda: driver.streams["x"][0].frames_received > 1, "samples arrive")
     assert "as if by mistake" in caplog.text
+
+
+async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp_path: Path) -> None:
+    told: list[str] = []
+    blocks: list[SampleBlock] = []
+    driver = lines_driver(tmp_path / "port", blocks, checksum="xor")
+    begun, released = threading.Event(), threading.Event()
+    cut, take, tick = driver._framing.cut, driver.take, driver.tick
+
+    def slowly(data: bytes) -> Any:
+        begun.set()
+        assert released.wait(10)
+        return cut(data)
+
+    driver._framing.cut = slowly  # type: ignore[method-assign]
+    driver.take = lambda batch: (told.append(f"{batch.bytes_read} bytes"), take(batch))[1]  # type: ignore[method-assign]
+    driver.tick = lambda now_ns: (told.append("quiet"), tick(now_ns))[1]  # type: ignore[method-assign]
+    lines = driver._framing.encode("x", np.arange(2), np.ones((2, 1, 1)))
+    with PseudoTerminal(tmp_path / "port") as cable:
+        async with running(driver):
+            await until(lambda: driver.link.state == "up", "the port is open")
+            reader = next(t for t in threading.enumerate() if isinstance(t, serial_reader.SerialReader))
+            os.write(cable.fd, lines[0])
+            await until(begun.is_set, "the first batch is being cut")
+            await asyncio.sleep(0)
+            told.clear()
+            waiting = reader._jobs.qsize()
+            os.write(cable.fd, lines[1])
+            # Two more: one may still say that nothing had come by then.
+            await until(lambda: reader._jobs.qsize() > waiting + 1, "reading goes on")
+            assert told == []
+            cable.unplug()
+            await until(lambda: not reader.is_alive(), "the port has been found gone")
+            assert driver.link.state == "up"
+            released.set()
+            await until(lambda: driver.link.losses == 1, "the link is lost")
+    assert [what for what in told if what != "quiet"] == [f"{len(line)} bytes" for line in lines]
+    assert told[0] != "quiet"
+    assert "quiet" in told[1:]
+    assert sum(len(block.samples) for block in blocks) == 2
