@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ class LinkLostError(Exception):
     """The link is gone, and the frame that was offered to it."""
 
 
-class PlannedNode:
+class PlannedNode(ABC):
     """Plays a plan, event by event, and keeps the books.
 
     Args:
@@ -97,9 +98,9 @@ class PlannedNode:
             await self._do(event)
             self._played = event + 1
 
+    @abstractmethod
     async def _do(self, event: int) -> None:
         """What the plan has for this event."""
-        raise NotImplementedError
 
     async def _offer(self, take: Callable[[], str]) -> bool:
         """Offer a frame until the link takes it; False if the link is lost, and the frame with it.
