@@ -40,6 +40,10 @@ class ArrivalCount:
         self._due_ns: float | None = None
         """When the next frame is due."""
 
+    def begin_afresh(self) -> None:
+        """Take the next frame as due when it comes."""
+        self._due_ns = None
+
     def count(self, arrival_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The count of each frame, modulo ``2**COUNTER_BITS``; every frame counts one at least.
 

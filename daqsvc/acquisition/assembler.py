@@ -172,6 +172,17 @@ class StreamAssembler:
         if self._held is not None and now_ns - self._waiting_since_ns > self._patience_ns:
             self._release(everything=True)
 
+    def begin_afresh(self) -> None:
+        """What comes next is of a sender that is known to begin anew, such as a recording played again.
+
+        Its first frame takes the next index, whatever its counter is: nothing is lost. Its times are its own.
+        """
+        self.flush()
+        if self._next is not None:
+            self._time.begin_afresh(self._next)
+            if self._arrivals is not None:
+                self._arrivals.begin_afresh()
+
     def flush(self) -> None:
         """Hand over what is held back: the link is gone, or the service stops."""
         self._release(everything=True)

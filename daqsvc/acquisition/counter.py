@@ -22,6 +22,13 @@ DRIFT = 0.01
 """How far a device's rate may be off its nominal one, while the time base has not measured it."""
 
 
+LEAST_BITS, MOST_BITS = 4, 64
+"""How wide a counter may be: one of fewer bits wraps within a few frames, and tells nothing of a gap."""
+
+_FIRST_BITS = 32
+"""A wider counter begins at so many of its low bits: far from the end of the integers that count on."""
+
+
 class Placement(NamedTuple):
     """Where the frames of a batch belong.
 
@@ -38,7 +45,7 @@ class Placement(NamedTuple):
 
 
 class CounterUnwrapper:
-    """Follows one device's counter of 8, 16 or 32 bits.
+    """Follows one device's counter of 4 to 64 bits, which begins again at 0 after all ones.
 
     A frame is taken by its sequence alone while that agrees with the host clock. Where it does not,
     the number of missed wraps comes from the clock; a counter that no number of wraps can explain is
@@ -59,16 +66,18 @@ class CounterUnwrapper:
     """
 
     def __init__(self, bits: int, step: int, rate_hz: float, reorder_counts: int) -> None:
-        if bits not in {8, 16, 32}:
-            raise ValueError(f"a counter has 8, 16 or 32 bits, not {bits}")
+        if not LEAST_BITS <= bits <= MOST_BITS:
+            raise ValueError(f"a counter has {LEAST_BITS} to {MOST_BITS} bits, not {bits}")
         if not 0 < step < 2 ** (bits - 2):
             raise ValueError(f"a {bits}-bit counter cannot tell frames of {step} counts apart; make it wider")
         self._modulus = 2**bits
+        self._unused_bits = MOST_BITS - bits
         self._step = step
         self._rate = rate_hz / NS_PER_S
         self._back = min(reorder_counts, self._modulus // 4)
         self._ahead = min(JITTER_NS * self._rate, self._modulus / 4)
         self._started = False
+        self._first: int | None = None
         self._raw = 0
         self._count = 0
         self._seen_ns = 0
@@ -76,11 +85,20 @@ class CounterUnwrapper:
         self._highest = 0
         self._suspect: int | None = None
 
+    def begin_afresh(self, first: int) -> None:
+        """Take the next frame as the first one of a sender that begins anew, whatever its counter is.
+
+        Args:
+            first: the count of that frame.
+        """
+        self._started, self._first = False, first
+        self._late = 0.0
+
     def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
         """Unwrap a batch.
 
         Args:
-            raw: int64 ``[n]``, counters as sent.
+            raw: int64 ``[n]``, counters as sent; one of 64 bits as the signed number with the same bits.
             arrival_ns: int64 ``[n]``, host monotonic arrival times, not decreasing.
         """
         n = len(raw)
@@ -89,8 +107,9 @@ class CounterUnwrapper:
         restarts: list[int] = []
         at = 0
         if n and not self._started:
-            self._accept(int(raw[0]), int(raw[0]), int(arrival_ns[0]))
-            self._highest = count[0] = raw[0]
+            first = int(raw[0]) % 2**_FIRST_BITS if self._first is None else self._first
+            self._accept(int(raw[0]), first, int(arrival_ns[0]))
+            self._highest = count[0] = first
             at = 1
         while at < n:
             at += self._follow(raw[at:], arrival_ns[at:], count[at:])
@@ -127,7 +146,7 @@ class CounterUnwrapper:
         restarts: list[int],
     ) -> None:
         """Place one frame that the sequence does not explain."""
-        step = int(self._signed(np.array([raw - self._raw]))[0])
+        step = int(self._signed(np.array([raw], np.int64) - self._raw)[0])
         since = (arrival_ns - self._seen_ns) * self._rate
         # Either this frame is as late as the one before it, or it has not waited at all.
         advance = self._advance(step, since, since * DRIFT) or self._advance(
@@ -160,8 +179,8 @@ class CounterUnwrapper:
         self._suspect = None
 
     def _signed(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
-        half = self._modulus // 2
-        signed: NDArray[np.int64] = (steps + half) % self._modulus - half
+        # The counter's bits alone, the highest of them the sign: that holds even where a step overflows.
+        signed: NDArray[np.int64] = (steps << self._unused_bits) >> self._unused_bits
         return signed
 
 

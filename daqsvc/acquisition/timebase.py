@@ -71,7 +71,7 @@ class TimeBase:
 
     Args:
         rate_hz: nominal sampling rate.
-        counter_bits: 8, 16 or 32.
+        counter_bits: width of the counter, see `daqsvc.acquisition.counter`.
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         reorder_window_ns: how long a frame may be overtaken on its way.
@@ -131,6 +131,15 @@ class TimeBase:
     def settled(self) -> bool:
         """Whether rate and offset come from at least two seconds of arrivals."""
         return self._settled
+
+    def begin_afresh(self, first_index: int) -> None:
+        """Take the next frame as the first one of a sender that begins anew, with a clock of its own.
+
+        Args:
+            first_index: the index of its first sample.
+        """
+        self._forget()
+        self._unwrapper.begin_afresh(first_index // self._samples_per_count)
 
     def place(self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placed:
         """Place a batch of frames and learn from their arrivals.

@@ -168,7 +168,7 @@ def test_time_never_leaves_the_host_clock_before_it_settles() -> None:
     assert not base.state.settled
 
 
-@pytest.mark.parametrize(("bits", "step"), [(12, 1), (8, 64), (16, 0)])
+@pytest.mark.parametrize(("bits", "step"), [(3, 1), (65, 1), (4, 4), (8, 64), (16, 0)])
 def test_a_counter_that_cannot_work_is_refused(bits: int, step: int) -> None:
     with pytest.raises(ValueError, match="counter"):
         CounterUnwrapper(bits, step, 1000.0, 10)
