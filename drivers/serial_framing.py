@@ -1,8 +1,8 @@
 """Frames out of a stream of bytes: what every framing of a serial port has in common.
 
 A byte stream has no frames of its own. A framing cuts it into frames, finds its feet again after garbage,
-and says how much of it was garbage. All frames of a batch are cut, checked and decoded as arrays; no Python
-runs per frame. The virtual bus wraps its frames with the same objects.
+and says how much of it was garbage. All frames of a batch are cut, checked and decoded as arrays: no Python
+runs per frame that is of a known stream. The virtual bus wraps its frames with the same objects.
 """
 
 from __future__ import annotations

@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
 
 PER_FRAME = 500
-FRAMES = 16_000
-LINES = 200_000
+FRAMES = 40_000
+LINES = 400_000
 SYNC = b"\xa5\x5a\x0f"
-ROUNDS = 9
+ROUNDS = 7
 RATE_HZ = 1e6
 CHUNK = 4096
 UART_BYTES_PER_S = 12e6 / 10
