@@ -106,6 +106,7 @@ class StreamAssembler:
         self._arrival_ns = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_GAPS)
         self._after_restart = False
+        self._unplaced: list[tuple[NDArray[np.int64], Samples, NDArray[np.int64]]] = []
 
     @property
     def time_base(self) -> TimeBaseState:
@@ -146,29 +147,18 @@ class StreamAssembler:
             return
         if self._arrivals is not None:
             counter = self._arrivals.count(arrival_ns)
-        placed = self._time.place(counter, arrival_ns)
-        rejected = int((~placed.kept).sum())
-        if rejected and not self.counters.frames_rejected:
-            logger.warning(
-                "stream %r: a frame's counter fits neither the sequence nor a restart; "
-                "such frames are counted and left out",
-                self.stream,
-            )
-        self.counters.frames_rejected += rejected
-        for _ in placed.restarts:
-            logger.warning("stream %r: the device has restarted its counter", self.stream)
-        start = 0
-        for restart in [*placed.restarts, len(counter)]:
-            part = slice(start, restart)
-            kept = placed.kept[part]
-            self._merge(placed.indices[part][kept], samples[part][kept], int(arrival_ns[-1]))
-            if restart < len(counter):
-                self._release(everything=True)
-                self._after_restart = True
-            start = restart
+        self._unplaced.append((counter, samples, arrival_ns))
+        self._place(until_sure=True)
 
     def tick(self, now_ns: int) -> None:
-        """Give up on a gap when nothing has come to close it for a while; call every now and then."""
+        """Give up waiting for what nothing has come to tell for a while; call every now and then.
+
+        That is how a gap is closed, and why a counter is behind the clock.
+        """
+        if self._unplaced:
+            _, _, arrival_ns = self._unplaced[0]
+            if now_ns - int(arrival_ns[-1]) > self._time.watch_ns + self._patience_ns:
+                self._place()
         if self._held is not None and now_ns - self._waiting_since_ns > self._patience_ns:
             self._release(everything=True)
 
@@ -185,7 +175,48 @@ class StreamAssembler:
 
     def flush(self) -> None:
         """Hand over what is held back: the link is gone, or the service stops."""
+        self._place()
         self._release(everything=True)
+
+    def _place(self, *, until_sure: bool = False) -> None:
+        """Place what has come, unless more has to come before that can be done for sure."""
+        if not self._unplaced:
+            return
+        counter, samples, arrival_ns = self._unplaced[0]
+        if len(self._unplaced) > 1:
+            counter, samples, arrival_ns = map(np.concatenate, zip(*self._unplaced, strict=True))
+        if until_sure and self._time.wants_more(counter, arrival_ns):
+            return
+        self._unplaced = []
+        placed = self._time.place(counter, arrival_ns)
+        rejected = int((~placed.kept).sum())
+        if rejected and not self.counters.frames_rejected:
+            logger.warning(
+                "stream %r: a frame's counter fits neither the sequence nor a restart; "
+                "such frames are counted and left out",
+                self.stream,
+            )
+        self.counters.frames_rejected += rejected
+        for _ in placed.restarts:
+            logger.warning(
+                "stream %r: the device has restarted its counter, or has not counted for a while; "
+                "how many samples are missing is estimated from the clock",
+                self.stream,
+            )
+        if placed.anew:
+            logger.warning(
+                "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
+                self.stream,
+            )
+        start = 0
+        for restart in [*placed.restarts, len(counter)]:
+            part = slice(start, restart)
+            kept = placed.kept[part]
+            self._merge(placed.indices[part][kept], samples[part][kept], int(arrival_ns[-1]))
+            if restart < len(counter):
+                self._release(everything=True)
+                self._after_restart = True
+            start = restart
 
     def _merge(self, index: NDArray[np.int64], samples: Samples, arrival_ns: int) -> None:
         if not len(index):

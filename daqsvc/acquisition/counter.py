@@ -2,6 +2,9 @@
 
 The counter says where a frame belongs; the time of arrival only decides what the counter cannot: how
 often it wrapped during an outage, and whether it was restarted.
+
+Samples may arrive late, but never early. So a counter that is ahead of the clock was restarted; one that is
+behind it was restarted too, unless its frames were delayed on their way: then they catch up.
 """
 
 from __future__ import annotations
@@ -20,6 +23,12 @@ JITTER_NS = 50_000_000
 
 DRIFT = 0.01
 """How far a device's rate may be off its nominal one, while the time base has not measured it."""
+
+DOUBT_NS = NS_PER_S // 2
+"""A counter that falls behind the clock by more than this from one frame to the next is to be explained."""
+
+WATCH_NS = NS_PER_S
+"""How long frames that have fallen behind are watched: those that were delayed catch up, others do not."""
 
 
 LEAST_BITS, MOST_BITS = 4, 64
@@ -53,7 +62,9 @@ class CounterUnwrapper:
 
     Frames that waited in a buffer, because the process was suspended, arrive late and all at once. If the
     buffer overflowed, the first frame after them is a long step ahead in no time: such a step may be as long
-    as the frames before it were late.
+    as the frames before it were late. Frames that have fallen behind and do not catch up were not late: the
+    device was restarted and has counted past its old count meanwhile, or it has not counted for a while.
+    Which it is shows in what comes next: a batch that `wants_more` is placed together with that.
 
     With ``M`` counts to a wrap, outages are resolved exactly while ``M`` lasts longer than twice the
     arrival jitter. A restart inside the reorder window cannot be told from late frames.
@@ -73,7 +84,10 @@ class CounterUnwrapper:
         self._modulus = 2**bits
         self._unused_bits = MOST_BITS - bits
         self._step = step
-        self._rate = rate_hz / NS_PER_S
+        self._nominal_rate = self._rate = rate_hz / NS_PER_S
+        self._drift = DRIFT
+        self._doubt_ns = max(DOUBT_NS, round(2 * step / self._rate))
+        self.watch_ns = max(WATCH_NS, round(2 * step / self._rate))
         self._back = min(reorder_counts, self._modulus // 4)
         self._ahead = min(JITTER_NS * self._rate, self._modulus / 4)
         self._started = False
@@ -85,6 +99,40 @@ class CounterUnwrapper:
         self._highest = 0
         self._suspect: int | None = None
 
+    def measured(self, rate_hz: float, drift: float) -> None:
+        """Take the device's rate as it has been measured.
+
+        Args:
+            rate_hz: counts per second.
+            drift: how far it may be off, relative; `DRIFT` is the most that is believed.
+        """
+        self._rate = rate_hz / NS_PER_S
+        self._drift = min(drift, DRIFT)
+
+    def forget_rate(self) -> None:
+        """Go by the nominal rate again."""
+        self._rate, self._drift = self._nominal_rate, DRIFT
+
+    def wants_more(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:
+        """Whether a batch has fallen behind the clock, and only the frames after it can tell why.
+
+        Args:
+            raw: int64 ``[n]``, counters as sent.
+            arrival_ns: int64 ``[n]``, host monotonic arrival times, not decreasing.
+        """
+        if not self._started or arrival_ns[-1] - self._seen_ns <= self._doubt_ns:
+            return False
+        steps, elapsed, late = self._lags(raw, arrival_ns)
+        fallen = np.flatnonzero(np.diff(late) > self._doubt_ns * self._rate)
+        if not len(fallen):
+            return False
+        at = int(fallen[0])
+        since = float(elapsed[at])
+        if steps[at] != self._step and self._advance(int(steps[at]), since, since * self._drift):
+            return False  # wraps explain it
+        watched_ns = int(arrival_ns[-1] - arrival_ns[at])
+        return watched_ns < self.watch_ns and float(late[-1] - late[at]) > self._doubt_ns * self._rate
+
     def begin_afresh(self, first: int) -> None:
         """Take the next frame as the first one of a sender that begins anew, whatever its counter is.
 
@@ -93,6 +141,7 @@ class CounterUnwrapper:
         """
         self._started, self._first = False, first
         self._late = 0.0
+        self.forget_rate()
 
     def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
         """Unwrap a batch.
@@ -120,14 +169,13 @@ class CounterUnwrapper:
 
     def _follow(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64], count: NDArray[np.int64]) -> int:
         """Place the longest beginning of a batch that continues the sequence; returns its length."""
-        steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
-        elapsed = (arrival_ns - np.concatenate(([self._seen_ns], arrival_ns[:-1]))) * self._rate
-        # What lags by no more than the drift is a slow device, and not read late.
-        late = _lateness(self._late, elapsed * (1 - DRIFT) - steps)
-        unsure = self._ahead + 2 * DRIFT * late[:-1]
+        steps, elapsed, late = self._lags(raw, arrival_ns)
+        unsure = self._ahead + 2 * self._drift * late[:-1]
         sane = (steps >= -self._back) & (steps <= elapsed + late[:-1] + unsure)
         # After half a wrap of silence a small step may hide whole wraps, unless it is the very next frame.
         sane &= (elapsed + late[:-1] < self._modulus / 2) | (steps == self._step)
+        for at in np.flatnonzero(np.diff(late) > self._doubt_ns * self._rate).tolist():
+            sane[at] &= self._catches_up(late[at:], arrival_ns[at:])
         good = len(raw) if sane.all() else int(np.argmin(sane))
         if good:
             self._late = float(late[good])
@@ -135,6 +183,29 @@ class CounterUnwrapper:
             self._highest = max(self._highest, int(count[:good].max()))
             self._accept(int(raw[good - 1]), int(count[good - 1]), int(arrival_ns[good - 1]))
         return good
+
+    def _lags(
+        self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Steps of the counter and of the clock from frame to frame ``[n]``; how late each is ``[n + 1]``."""
+        steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
+        elapsed = (arrival_ns - np.concatenate(([self._seen_ns], arrival_ns[:-1]))) * self._rate
+        # What lags by no more than the drift is a slow device, and not read late.
+        return steps, elapsed, _lateness(self._late, elapsed * (1 - self._drift) - steps)
+
+    def _catches_up(self, late: NDArray[np.float64], arrival_ns: NDArray[np.int64]) -> bool:
+        """Whether frames that have fallen behind were delayed: they come faster than they were sent.
+
+        Args:
+            late: ``[n + 1]``, how late they are, in counts; first the frame before them.
+            arrival_ns: int64 ``[n]``.
+        """
+        end = int(np.searchsorted(arrival_ns, arrival_ns[0] + self.watch_ns, side="right"))
+        if late[end] - late[0] <= self._doubt_ns * self._rate:
+            return True
+        # Some are always held in a buffer when a link comes up: what counts is that it goes on.
+        half = int(np.searchsorted(arrival_ns, (arrival_ns[0] + arrival_ns[end - 1]) // 2))
+        return bool(late[1 + half] - late[end] > self._ahead)
 
     def _decide(
         self,
@@ -149,8 +220,8 @@ class CounterUnwrapper:
         step = int(self._signed(np.array([raw], np.int64) - self._raw)[0])
         since = (arrival_ns - self._seen_ns) * self._rate
         # Either this frame is as late as the one before it, or it has not waited at all.
-        advance = self._advance(step, since, since * DRIFT) or self._advance(
-            step, since + self._late, (since + 2 * self._late) * DRIFT
+        advance = self._advance(step, since, since * self._drift) or self._advance(
+            step, since + self._late, (since + 2 * self._late) * self._drift
         )
         if advance:
             count[at] = self._count + advance

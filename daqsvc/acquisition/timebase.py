@@ -6,6 +6,10 @@ arrival of every tenth of a second and supports a line under them where it fits 
 (`daqsvc.acquisition.clock_line`). Jitter of 10 ms then moves the estimate by far less than a millisecond,
 and the estimate says how far off it may be. The constant part of the delay cannot be seen from one side and
 stays in.
+
+Where all arrivals contradict the line it was wrong, or the device's clock has stepped, and the line begins
+anew: at once when they are early, for nothing comes before its time; after some seconds when they are late
+and do not catch up, for they may have been delayed.
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.clock_line import Bucket, clock_line
+from daqsvc.acquisition.clock_line import PARTS, Bucket, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
 
 if TYPE_CHECKING:
@@ -28,6 +32,12 @@ WINDOW_BUCKETS = 600
 SETTLING_NS = 2 * NS_PER_S
 MAX_DRIFT = 0.05
 RECENT_DELAYS = 1024
+CONTRADICTION_NS = NS_PER_S // 2
+"""How far arrivals must be off the line, beyond what it may err, to contradict it."""
+CONTRADICTED_NS = 4 * NS_PER_S
+"""How long late arrivals must contradict the line until it is given up."""
+CLOCK_DRIFT = 300e-6
+"""How far a device's rate may be off the measured one an outage later."""
 _NO_BUCKETS = np.empty((0, len(Bucket._fields)))
 
 
@@ -59,11 +69,13 @@ class Placed(NamedTuple):
         indices: int64 ``[n]``, sample index of each frame's first sample.
         kept: bool ``[n]``.
         restarts: places in the batch where the device restarted its counter.
+        anew: whether the arrivals contradicted the time base, so that it has begun anew.
     """
 
     indices: NDArray[np.int64]
     kept: NDArray[np.bool_]
     restarts: list[int]
+    anew: bool
 
 
 class TimeBase:
@@ -108,6 +120,8 @@ class TimeBase:
         self._offset_ns = 0.0
         self._error_ns = math.inf
         self._settled = False
+        self._contradiction_ns = CONTRADICTION_NS + 2 * samples_per_frame * self._nominal_ns
+        self._contrary: list[tuple[Bucket, float]] = []
 
     @property
     def state(self) -> TimeBaseState:
@@ -119,7 +133,7 @@ class TimeBase:
             jitter_ns=jitter,
             settled=self._settled,
             restarts=self._restarts,
-            error_ns=self._error_ns,
+            error_ns=max(self._error_ns, self._doubt_ns),
         )
 
     @property
@@ -131,6 +145,20 @@ class TimeBase:
     def settled(self) -> bool:
         """Whether rate and offset come from at least two seconds of arrivals."""
         return self._settled
+
+    @property
+    def watch_ns(self) -> int:
+        """How long a batch may have to wait for what comes after it; see `wants_more`."""
+        return self._unwrapper.watch_ns
+
+    def wants_more(self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:
+        """Whether a batch is behind the clock, so that it is better placed together with what comes after it.
+
+        Args:
+            counter: int64 ``[n]``, as sent.
+            arrival_ns: int64 ``[n]``, host monotonic, not decreasing.
+        """
+        return self._unwrapper.wants_more(counter, arrival_ns)
 
     def begin_afresh(self, first_index: int) -> None:
         """Take the next frame as the first one of a sender that begins anew, with a clock of its own.
@@ -155,10 +183,27 @@ class TimeBase:
             self._restarts += len(placement.restarts)
             fresh = slice(placement.restarts[-1], None)
             self._forget()
-            self._learn(index[fresh][placement.kept[fresh]], arrival_ns[fresh][placement.kept[fresh]])
+            self._unwrapper.forget_rate()
+            anew = self._learn(index[fresh][placement.kept[fresh]], arrival_ns[fresh][placement.kept[fresh]])
         else:
-            self._learn(index[placement.kept], arrival_ns[placement.kept])
-        return Placed(index, placement.kept, placement.restarts)
+            anew = self._learn(index[placement.kept], arrival_ns[placement.kept])
+        return Placed(index, placement.kept, placement.restarts, anew)
+
+    def learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64], *, restarted: bool) -> bool:
+        """Learn from frames whose place is known, since their driver follows the device's counter itself.
+
+        Args:
+            index: int64 ``[n]``, sample index of each frame's first sample.
+            arrival_ns: int64 ``[n]``, host monotonic, not decreasing.
+            restarted: whether where they belong is a guess, since the device has restarted its counter.
+
+        Returns:
+            Whether the line has begun anew, since the arrivals contradicted it.
+        """
+        if restarted:
+            self._restarts += 1
+            self._forget()
+        return self._learn(index, arrival_ns)
 
     def time_of(self, index: int) -> int:
         """Host monotonic time in ns at which sample ``index`` was taken.
@@ -174,26 +219,36 @@ class TimeBase:
     def error_at(self, index: int) -> float:
         """95th percentile of the error of `time_of`, in ns, beside the constant part of the delay.
 
-        It grows with the distance to the last arrivals; infinite until the time base has settled.
+        It grows with the distance to the last arrivals; infinite until the time base has settled. While the
+        arrivals contradict the line it is at least what they are off.
         """
         if self._origin is None or not self._settled:
             return math.inf
+        return max(self._line_error(index - self._origin[0]), self._doubt_ns)
+
+    def _line_error(self, x: int) -> float:
         first, last = float(self._buckets[0, 0]), float(self._buckets[-1, 0])
-        ahead = max(0.0, index - self._origin[0] - last)
+        ahead = max(0.0, x - last)
         return self._error_ns * (1.0 + 2.0 * ahead / (last - first))
+
+    @property
+    def _doubt_ns(self) -> float:
+        return self._contrary[-1][1] if self._contrary else 0.0
 
     def _forget(self) -> None:
         self._origin = self._bucket_best = None
         self._bucket_sums = (0, 0.0, 0.0)
         self._buckets = _NO_BUCKETS
         self._delays.clear()
+        self._contrary.clear()
         self._period_ns, self._offset_ns = self._nominal_ns, 0.0
         self._error_ns = math.inf
         self._settled = False
 
-    def _learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> None:
+    def _learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:
+        """Take in arrivals; returns whether the line has begun anew because of them."""
         if not len(index):
-            return
+            return False
         if self._origin is None:
             self._origin = (int(index[0]) + self._last_in_frame, int(arrival_ns[0]))
             self._bucket_start = 0
@@ -218,10 +273,43 @@ class TimeBase:
         if newest - self._bucket_start >= BUCKET_NS:
             count, sum_x, sum_late = self._bucket_sums
             bucket = Bucket(*self._bucket_best, count, sum_x / count, sum_late / count)
-            self._buckets = np.vstack([self._buckets[1 - WINDOW_BUCKETS :], bucket])
             self._bucket_best, self._bucket_sums = None, (0, 0.0, 0.0)
             self._bucket_start = newest
+            return self._take(bucket)
+        return False
+
+    def _take(self, bucket: Bucket) -> bool:
+        """Lay the line under a bucket, unless it contradicts the line; returns whether that began anew."""
+        off_ns = self._residual((bucket.x, bucket.y_ns)) - self._offset_ns if self._settled else 0.0
+        allowed_ns = self._contradiction_ns + (3.0 * self._line_error(bucket.x) if self._settled else 0.0)
+        if off_ns < -allowed_ns:
+            self._begin_anew([bucket])
+            return True
+        if off_ns <= allowed_ns:
+            self._contrary.clear()
+            self._buckets = np.vstack([self._buckets[1 - WINDOW_BUCKETS :], bucket])
             self._support()
+            return False
+        self._contrary.append((bucket, off_ns))
+        begin, begin_off_ns = self._contrary[0]
+        span_ns = bucket.y_ns - begin.y_ns
+        if span_ns < CONTRADICTED_NS or len(self._contrary) < PARTS:
+            return False
+        if abs(off_ns - begin_off_ns) <= MAX_DRIFT * span_ns:
+            self._begin_anew([contrary for contrary, _ in self._contrary])
+            return True
+        # They catch up, or fall further behind, faster than any clock: they are delayed.
+        del self._contrary[0]
+        return False
+
+    def _begin_anew(self, buckets: list[Bucket]) -> None:
+        origin = self._origin
+        self._forget()
+        self._unwrapper.forget_rate()
+        self._origin = origin
+        self._buckets = np.array(buckets, np.float64)
+        self._offset_ns = min(self._residual((bucket.x, bucket.y_ns)) for bucket in buckets)
+        self._support()
 
     def _residual(self, point: tuple[int, int]) -> float:
         return point[1] - point[0] * self._period_ns
@@ -234,3 +322,7 @@ class TimeBase:
         self._period_ns = self._nominal_ns + line.slope_ns
         self._offset_ns, self._error_ns = line.offset_ns, line.error_ns
         self._settled = True
+        if abs(line.slope_ns) < MAX_DRIFT * self._nominal_ns:
+            span_ns = float(self._buckets[-1, 0] - self._buckets[0, 0]) * self._nominal_ns
+            drift = CLOCK_DRIFT + 2.0 * line.error_ns / span_ns
+            self._unwrapper.measured(NS_PER_S / self._period_ns / self._samples_per_count, drift)
