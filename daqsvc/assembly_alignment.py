@@ -10,17 +10,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from daqsvc.acquisition.alignment import AlignedBlock
+    from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.models import MachineFile
 
 _NS_PER_MS = 1_000_000
 
 
-def alignment(machine: MachineFile, deliver: Callable[[SampleBlock], None]) -> Alignment:
+def alignment(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> Alignment:
     """The grids that the detectors of a machine file need; often none.
 
     Args:
         machine: the machine file.
+        clock: of the host.
         deliver: called with each block of a grid, which is named by `Grid.name`.
     """
 
@@ -42,6 +44,7 @@ def alignment(machine: MachineFile, deliver: Callable[[SampleBlock], None]) -> A
             pass_on,
             max_error_ns=given.max_error_us * 1e3,
             max_wait_ns=round(given.max_wait_ms * _NS_PER_MS),
+            clock=clock,
         )
         for grid in machine.grids
     )

@@ -113,7 +113,7 @@ class Service:
         detectors = assembly.detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self.rings = {grid.name: _ring(machine, grid, detectors) for grid in grids}
-        self.alignment = alignment(machine, self._deliver)
+        self.alignment = alignment(machine, self.clock, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
         self.pipeline = Pipeline(

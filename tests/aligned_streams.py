@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.acquisition.alignment import AlignedBlock
+    from daqsvc.acquisition.clock import DrivenClock
     from daqsvc.acquisition.samples import SampleBlock
 
 START_NS = 5_000_000_000
@@ -107,8 +108,16 @@ def play(
     duration_s: float,
     seed: int,
     deliver: Callable[[SampleBlock], None],
+    *,
+    stalled_s: tuple[float, float] = (np.inf, np.inf),
+    clock: DrivenClock | None = None,
 ) -> None:
-    """Send a signal, which is a function of the time in ns after `START_NS`, through the devices."""
+    """Send a signal, which is a function of the time in ns after `START_NS`, through the devices.
+
+    While the receiver is stalled nothing is read. What has come meanwhile is read at once, one stream
+    after the other. A clock is driven along.
+    """
+    stall_ns = [START_NS + t * 1e9 for t in stalled_s]
     rng = np.random.default_rng(seed)
     events = []
     for device in devices:
@@ -121,7 +130,10 @@ def play(
             deliver=deliver,
         )
         events += [(t, device.stream, k, device, assembler) for t, k in arrivals(device, duration_s, rng)]
-    for arrival_ns, _, block, device, assembler in sorted(events, key=lambda event: event[:3]):
+    read = [(int(stall_ns[1]) if stall_ns[0] <= e[0] < stall_ns[1] else e[0], *e[1:]) for e in events]
+    for arrival_ns, _, block, device, assembler in sorted(read, key=lambda event: event[:3]):
+        if clock is not None:
+            clock.advance_to(arrival_ns)
         index = block * device.per_block + np.arange(device.per_block)
         samples = signal(device.taken_ns(index)).astype(np.float32)
         assembler.accept(
@@ -144,12 +156,22 @@ class Rows:
     error_ns: np.ndarray
 
 
-def aligned(devices, signal, duration_s, seed, **options) -> tuple[Aligner, Rows]:
+def aligned(
+    devices, signal, duration_s, seed, *, stalled_s=(np.inf, np.inf), **options
+) -> tuple[Aligner, Rows]:
     """The rows of a grid over devices, the reference first; checks that none is left out or doubled."""
     blocks: list[AlignedBlock] = []
     sources = [AlignedSource(d.stream, ("a",), d.rate_hz, round(d.latency_ns)) for d in devices]
     aligner = Aligner("grid", sources, blocks.append, **options)
-    play(devices, signal, duration_s, seed, aligner.accept)
+    play(
+        devices,
+        signal,
+        duration_s,
+        seed,
+        aligner.accept,
+        stalled_s=stalled_s,
+        clock=options.get("clock"),
+    )
     end = blocks[0].first_index
     for block in blocks:
         assert block.first_index == end

@@ -7,13 +7,15 @@ data; samples that cannot be placed well enough are left out.
 
 The grid begins when all streams can be placed, some seconds after their first samples, or after `SETTLE_NS`
 at the latest. From then on it never waits long for a stream that is silent: its columns are NaN, and if it is
-the reference, the grid goes on by its last known rate.
+the reference, the grid goes on by its last known rate. Silent is what says nothing although it is listened
+to: after the process stood still, what the buffers hold of one stream is read before that of the next.
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,6 +28,7 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import Samples
 
 __all__ = ["AlignedBlock", "AlignedSource", "Aligner", "Alignment", "SourceCounters"]
@@ -36,6 +39,8 @@ _LEAST_S = 0.01
 """Shorter blocks are not worth the work."""
 _MOST_S = 1.0
 """Of one block: what is missing for longer is filled up block by block."""
+_BLOCK_NS = NS_PER_S
+"""Room for the newest block in what is held."""
 SETTLE_NS = 30 * NS_PER_S
 """In which time bases should have found out where samples belong."""
 
@@ -86,7 +91,7 @@ class AlignedBlock:
 class Aligner:
     """Puts the blocks of several streams on the grid of the first one.
 
-    The order of the blocks alone decides what comes out: no clock is asked.
+    Without a clock the order of the blocks alone decides what comes out.
 
     Args:
         name: name of the grid.
@@ -95,6 +100,8 @@ class Aligner:
         max_error_ns: samples that may be further off the reference's are left out, until they are not; once
             placed, up to twice as far is borne.
         max_wait_ns: how long after all others a stream may come, in time of the samples.
+        clock: of the host, on which it has to be that late too; unless given, blocks are taken to come as
+            fast as samples are taken.
 
     Raises:
         ValueError: fewer than two sources, or two of one name.
@@ -108,6 +115,7 @@ class Aligner:
         *,
         max_error_ns: float = 200_000.0,
         max_wait_ns: int = NS_PER_S,
+        clock: Clock | None = None,
     ) -> None:
         if len(sources) < 2 or len({source.stream for source in sources}) < len(sources):
             raise ValueError(
@@ -121,6 +129,8 @@ class Aligner:
         )
         self._deliver = deliver
         self._max_wait_ns = max_wait_ns
+        self._clock = clock
+        self._heard: deque[tuple[int, int]] = deque()
         rate_hz = sources[0].rate_hz
         self._followers = [Follower(source, rate_hz, max_error_ns, max_wait_ns) for source in sources]
         self._by_stream = {follower.source.stream: follower for follower in self._followers}
@@ -150,9 +160,10 @@ class Aligner:
         if follower is None:
             return
         follower.append(block)
+        due_ns = self._due_ns()
         if self._next is None and self._can_begin():
             self._next = self._reference.line.index
-        while self._next is not None and (rows := self._ready(self._next)) >= self._least:
+        while self._next is not None and (rows := self._ready(self._next, due_ns)) >= self._least:
             skipped = rows - self._most if rows > self._longest else 0
             self._next += skipped
             self._emit(self._next, min(rows, self._most), skipped)
@@ -168,12 +179,25 @@ class Aligner:
         waited_ns = max(f.newest_ns for f in self._followers if f.started) - self._since_ns
         return waited_ns >= SETTLE_NS or all(f.placeable(line) for f in self._others)
 
-    def _ready(self, first: int) -> int:
+    def _due_ns(self) -> int:
+        """Up to when samples must have come, in time of the samples, or are waited for no longer."""
+        newest_ns = max(f.newest_ns for f in self._followers if f.started)
+        due_ns = newest_ns - self._max_wait_ns
+        if self._clock is not None:
+            now_ns = self._clock.monotonic_ns()
+            self._heard.append((now_ns, newest_ns))
+            # What was the newest of all a wait ago: its contemporaries have had the wait to come.
+            while len(self._heard) > 1 and self._heard[1][0] <= now_ns - self._max_wait_ns:
+                self._heard.popleft()
+            # But what is held for it must not be forgotten meanwhile.
+            held_ns = round(min(f.memory_s for f in self._followers) * NS_PER_S) - _BLOCK_NS
+            due_ns = max(min(due_ns, self._heard[0][1]), newest_ns - held_ns)
+        return due_ns - self._filter_ns
+
+    def _ready(self, first: int, due_ns: int) -> int:
         """Rows from index ``first`` on that can be made: all streams are there, or one is too late."""
         line = self._reference.line
         covered = min(self._reference.end - first, *(f.covers(first, line) for f in self._others))
-        newest_ns = max(f.newest_ns for f in self._followers if f.started)
-        due_ns = newest_ns - self._max_wait_ns - self._filter_ns
         # A reference that has just begun to speak again may be ahead of what a silent one was due for.
         overdue = math.floor(line.samples_to(due_ns)) + line.index - first
         return max(covered, overdue)

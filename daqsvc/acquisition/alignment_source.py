@@ -20,6 +20,8 @@ FOLLOW_S = 1.0
 """Time constant with which the place follows what the time bases have learnt."""
 MOST_SLEW = 1e-3
 """A place moves no faster against its clock: 1 us in 1 ms, less than a degree of 1X in a revolution."""
+STALL_S = 8.0
+"""For how long the process may stand still: one stream's samples of that time come before the next one's."""
 _RATE_DOUBT = 2.0 * MOST_SLEW
 _FORGET_NS = 5.0 * NS_PER_S
 """An estimated line is twice as far off so long after it was laid."""
@@ -121,7 +123,8 @@ class Follower:
         self._line: Line | None = None
         self._place: tuple[int, float] | None = None
         self._told: News | None = None
-        self._capacity = round((2.0 + 4.0 * max_wait_ns / NS_PER_S) * source.rate_hz) + 8 * self._delay.reach
+        memory_s = STALL_S + 4.0 * max_wait_ns / NS_PER_S
+        self._capacity = round(memory_s * source.rate_hz) + 8 * self._delay.reach
 
     @property
     def reach(self) -> int:

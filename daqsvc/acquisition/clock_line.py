@@ -33,6 +33,10 @@ _LEAST_GROWTH = 1.3
 _SUPPORT_ERROR = (2.5, 3.0)
 """The support's error in units of the gap, and of how far it lies above the least delay."""
 _MEAN_ERROR = (1.0, 2.5)
+_HEARD = 0.5
+"""Of its share of the arrivals, what a part must have to be held against the line."""
+_STALLED = 10.0
+"""Arrivals later by more than so many times the median come from a stall, and bend the mean line."""
 _SIGMAS = 2.0
 _TOUCHES_NS = 1e-3
 
@@ -84,17 +88,21 @@ def clock_line(buckets: Sequence[Bucket] | Floats, nominal_ns: float, max_slope_
     begin = float(table[0, 0])
     x, arrivals, mean_x, mean_late = table[:, 0] - begin, table[:, 2], table[:, 3] - begin, table[:, 4]
     slope = float(np.clip(_support_slope(x, late), -max_slope_ns, max_slope_ns))
-    offset, gap, missed = _touching(x, late, slope)
-    mean_slope, spread_ns = _mean_slope(arrivals, mean_x, mean_late)
+    along = (table[:, 1] - table[:, 1].min()) / np.ptp(table[:, 1])
+    offset, gap, missed = _touching(x, late, along, slope)
+    behind = mean_late - slope * mean_x
+    behind -= behind.min()
+    usual = behind <= _STALLED * np.median(behind)
+    mean_slope, spread_ns = _mean_slope(arrivals[usual], mean_x[usual], mean_late[usual])
     if spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
         return ClockLine(slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
-    offset, gap, missed = _touching(x, late, mean_slope)
+    offset, gap, missed = _touching(x, late, along, mean_slope)
     return ClockLine(
         mean_slope, offset - mean_slope * begin, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed
     )
 
 
-def _touching(x: Floats, late: Floats, slope: float) -> tuple[float, float, float]:
+def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[float, float, float]:
     """The line of a given slope under all arrivals.
 
     The earliest arrivals of the window's parts lie above it: the fewer arrivals, the later their earliest.
@@ -106,12 +114,14 @@ def _touching(x: Floats, late: Floats, slope: float) -> tuple[float, float, floa
     """
     above = late - slope * x
     offset = float(above.min())
-    along = (x - x[0]) / (x[-1] - x[0])
     gaps = []
     for parts in (PARTS, PARTS**2):
+        part = np.minimum(along * parts, parts - 1).astype(np.int64)
         least = np.full(parts, np.inf)
-        np.minimum.at(least, np.minimum(along * parts, parts - 1).astype(np.int64), above - offset)
-        gaps.append(float(least[np.isfinite(least)].mean()))
+        np.minimum.at(least, part, above - offset)
+        # What comes at once after a stall tells how long that was, and nothing of the clock.
+        heard = np.bincount(part, minlength=parts) * parts >= _HEARD * len(x)
+        gaps.append(float(least[heard].mean()))
     gap, fine_gap = gaps
     if gap <= 0.0:
         return offset, 0.0, 0.0

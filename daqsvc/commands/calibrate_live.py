@@ -88,7 +88,7 @@ class _Listener:
         grid = machine.grid(machine.pipeline.rotor_synchronous)
         capacity = max(round(_RING_S * grid.rate_hz), 4 * detector.block)
         self._ring = SampleRing(grid.name, grid.channel_names, capacity)
-        self._alignment = alignment(machine, self._deliver)
+        self._alignment = alignment(machine, clock, self._deliver)
         self._reason = ""
         self.drivers = assembly_drivers.drivers(machine, clock, self._deliver)
         self.pipeline = Pipeline({detector.stream: self._ring}, [detector], self._report, clock)

@@ -6,6 +6,7 @@ import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem
 
 from daqsvc import assembly
+from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alignment import alignment
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 
@@ -26,7 +27,7 @@ def test_an_alignment_of_one_stream_is_of_no_effect() -> None:
     (warning,) = [w for w in machine.warnings if w.key == "pipeline.alignment"]
     assert warning.line == line
     assert "has no effect" in warning.message
-    assert alignment(machine, print).aligners == ()
+    assert alignment(machine, SystemClock(), print).aligners == ()
 
 
 def test_an_error_that_is_a_fault_s_worth_of_phase_is_warned_of() -> None:
@@ -64,7 +65,7 @@ def test_a_grid_is_made_as_the_file_says() -> None:
         ("max_wait_ms = 1000.0", "max_wait_ms = 300.0"),
         ("rate_hz = 2000.0\nlatency_ms = 0.0", "rate_hz = 2000.0\nlatency_ms = 1.5"),
     )
-    (aligner,) = alignment(parse_machine_file(text, TWO_BUSES), print).aligners
+    (aligner,) = alignment(parse_machine_file(text, TWO_BUSES), SystemClock(), print).aligners
     assert [source.stream for source in aligner.sources] == ["shaft-y", "shaft-x"]
     assert [source.latency_ns for source in aligner.sources] == [0, 1_500_000]
     assert aligner.channels == ("shaft-y.y", "shaft-y.kph", "shaft-x.x")
