@@ -11,7 +11,7 @@ import asyncio
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,17 +23,17 @@ from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.frames import FrameLayout
 from drivers.keeping import Attempt, in_thread, keep_up
+from drivers.replay_can import CanLog
+from drivers.replay_channel import ChannelChoice
 from drivers.replay_files import (
     TABLE_COUNTER_BITS,
-    CanLog,
     ColumnLayout,
-    GrowingCandump,
-    Place,
     RecordingError,
     SampleTable,
     kind_of,
     words,
 )
+from drivers.replay_growing import GrowingCandump, Place
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -65,24 +65,41 @@ class ReplayCounters(BusCounters):
 
     Attributes:
         frames_malformed: lines of a log that are no frames.
+        frames_other_channel: frames of other channels than the one that is played.
         passes: how often the recording has been played to its end.
+        passes_damaged: how often it has been played as far as it could be read, which was not its end.
     """
 
     frames_malformed: int = 0
+    frames_other_channel: int = 0
     passes: int = 0
+    passes_damaged: int = 0
+
+
+class Ending(NamedTuple):
+    """Why nothing more comes of a recording.
+
+    Attributes:
+        reason: in words.
+        readable: whether all that can be read of it has been played; else its reader failed.
+    """
+
+    reason: str
+    readable: bool
 
 
 class ReplayDriver:
     """Plays one recording.
 
-    Options of the bus: ``file``; ``at_end``, what to do at its end: ``"stop"`` (the link is down from then
-    on, with the reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is
-    writing the file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver
-    takes it, where the samples' times run ahead of the clock.
+    Options of the bus: ``file``; ``channel``, which one of a CAN log that holds several (the first one in it
+    if left out); ``at_end``, what to do at its end: ``"stop"`` (the link is down from then on, with the
+    reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is writing the
+    file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver takes it,
+    where the samples' times run ahead of the clock.
 
     A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
-    `ColumnLayout`. When a CAN log is played again its counters are those of a device that has restarted;
-    the samples of a table are counted on.
+    `ColumnLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
+    be read of one that is damaged is played, and that is its end.
 
     Args:
         port: settings, streams, clock and where to deliver.
@@ -99,10 +116,13 @@ class ReplayDriver:
         self._assemblers = {spec.name: _assembler(spec, port) for spec in port.streams}
         frames = [spec for spec in port.streams if isinstance(spec.layout, FrameLayout)]
         self._sorter = FrameSorter(frames)
+        self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
         self._place = Place()
         self._first_index: dict[str, int] = {}
+        self._to_its_end = False
         self._shift_ns: int | None = None
-        self._newest_ns = 0
+        self._newest_ns: int | None = None
+        self._said: set[str] = set()
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -122,14 +142,13 @@ class ReplayDriver:
         while (recording := await self._open()) is not None:
             self.link.up()
             before = self._frames
-            reason = await self._play(recording)
+            ending = await self._play(recording)
             played = self._frames > before
-            # One that breaks off, as after a power failure, ends there: tried again it would be played twice.
             if self._at_end == "stop":
-                self.link.end(reason)
+                self.link.end(ending.reason)
                 return None
-            if reason != END_OF_FILE or not played:
-                return Attempt(present=True, useful=played, reason=reason)
+            if self._at_end == "wait" or not ending.readable or not played:
+                return Attempt(present=True, useful=played, reason=ending.reason)
         return Attempt(present=False, useful=False, reason=self.link.reason)
 
     @property
@@ -138,7 +157,7 @@ class ReplayDriver:
 
     async def _open(self) -> Recording | None:
         try:
-            return await in_thread(self._open_file, undo=lambda recording: recording.close())
+            return await in_thread(self._open_file, undo=self._close)
         except RecordingError as error:
             reason = f"{error}"
         except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
@@ -156,28 +175,60 @@ class ReplayDriver:
             return SampleTable(self._path, self._port.streams, self._first_index)
         return CanLog(self._path, self._sort)
 
-    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
-        return self._sorter.sort(batch_of(messages, t_ns.tolist()), 0)
+    def _close(self, recording: Recording) -> None:
+        try:
+            recording.close()
+        except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
+            logger.info("closing %s: %s", self.link.name, words(error))
 
-    async def _play(self, recording: Recording) -> str:
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+        chosen = self._channel.of(messages)
+        batch = batch_of([messages[k] for k in chosen], t_ns[chosen].tolist())
+        found = self._sorter.sort(batch, 0)
+        found.note("frames_other_channel", len(messages) - len(chosen))
+        return found
+
+    async def _play(self, recording: Recording) -> Ending:
         """Play until there is no more; returns why."""
         if self._at_end != "wait":
-            self._shift_ns = None
+            self._begin_anew(recording)
         try:
             while True:
                 piece = await in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
                 if piece is None:
                     self.counters.passes += 1
-                    return END_OF_FILE
+                    self._to_its_end = True
+                    return Ending(self._channel.missed or END_OF_FILE, readable=True)
+                if piece.notes.get("frames_malformed"):
+                    self._say_once(
+                        f"what is no frame is counted (frames_malformed) and left out, first "
+                        f"{recording.first_malformed}"
+                    )
                 await self._take(piece)
         except RecordingError as error:
-            return f"{error}"
+            if self._at_end != "wait":
+                self.counters.passes_damaged += 1
+                self._say_once(f"{error}")
+            return Ending(f"{error}", readable=True)
         except Exception as error:
             logger.exception("the reader of %s failed", self.link.name)
             self.counters.reader_failures += 1
-            return f"its reader failed: {words(error)}"
+            return Ending(f"its reader failed: {words(error)}", readable=False)
         finally:
-            await in_thread(recording.close)
+            await in_thread(self._close, recording)
+
+    def _say_once(self, what: str) -> None:
+        if what not in self._said:
+            self._said.add(what)
+            logger.warning("%s: %s", self.link.name, what)
+
+    def _begin_anew(self, recording: Recording) -> None:
+        """The recording is played from its beginning: nothing is missing between this and what was before."""
+        if not (isinstance(recording, SampleTable) and recording.seamless and self._to_its_end):
+            for assembler in self._assemblers.values():
+                assembler.begin_afresh()
+        self._to_its_end = False
+        self._shift_ns = None
 
     async def _take(self, piece: Sorted) -> None:
         clock = self._port.clock
@@ -205,10 +256,9 @@ class ReplayDriver:
         if self._shift_ns is None or (
             self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS
         ):
-            # Never back in time: what was played before has its place.
-            self._shift_ns = max(now_ns, self._newest_ns) - first_ns
+            self._shift_ns = self._next_ns(now_ns) - first_ns
         due_ns = last_ns + self._shift_ns
-        floor_ns, self._newest_ns = self._newest_ns, max(self._newest_ns, due_ns)
+        floor_ns, self._newest_ns = self._newest_ns or 0, max(self._newest_ns or 0, due_ns)
         if self._paced and due_ns > now_ns:
             await clock.sleep_ns(due_ns - now_ns)
         else:
@@ -220,6 +270,23 @@ class ReplayDriver:
             self._assemblers[frames.stream].accept(
                 decoded.counter, decoded.samples, decoded.intact, arrival_ns
             )
+
+    def _next_ns(self, now_ns: int) -> int:
+        """When the first frame of what is played now comes: never before what was played has ended."""
+        if self._newest_ns is None:
+            return now_ns
+        if self._at_end == "wait":
+            return max(now_ns, self._newest_ns)
+        period_ns = min(_frame_ns(spec) for spec in self._port.streams)
+        next_ns = self._newest_ns + period_ns
+        # It takes a moment to begin again, which is no part of the recording.
+        return next_ns if now_ns - next_ns < REMAP_NS else now_ns
+
+
+def _frame_ns(spec: StreamSpec[FrameLayout | ColumnLayout]) -> int:
+    """Nominal time from frame to frame."""
+    samples = spec.layout.samples_per_frame if isinstance(spec.layout, FrameLayout) else 1
+    return round(samples * NS_PER_S / spec.rate_hz)
 
 
 def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:

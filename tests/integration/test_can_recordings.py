@@ -14,7 +14,7 @@ from drivers.base import StreamSpec
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.dbc import layout_from_dbc
-from drivers.replay_files import CanLog
+from drivers.replay_can import CanLog
 
 if TYPE_CHECKING:
     from pathlib import Path

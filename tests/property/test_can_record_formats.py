@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can_adapter import batch_of
-from drivers.can_batches import ERROR
+from drivers.can_batches import ERROR, Sorted
 from drivers.can_record_files import LogFile
 from drivers.can_record_formats import ENDINGS, encoder_for
-from drivers.replay_files import CanLog
+from drivers.replay_can import CanLog
 
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 ids = st.one_of(
@@ -79,12 +79,12 @@ def read_again(path: Path) -> list[can.Message]:
     """The frames of a log, as the replay driver gets them."""
     found: list[can.Message] = []
 
-    def keep(messages: list[can.Message], _t_ns: object) -> list[can.Message]:
+    def keep(messages: list[can.Message], _t_ns: object) -> Sorted:
         found.extend(messages)
-        return messages
+        return Sorted()
 
-    log = CanLog(path, keep)  # type: ignore[arg-type]
-    while log.read(10**18):
+    log = CanLog(path, keep)
+    while log.read(10**18) is not None:
         pass
     log.close()
     return found

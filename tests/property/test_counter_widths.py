@@ -1,4 +1,4 @@
-"""Counters of every width from 4 to 64 bits, as DBC files have them, from the payload to the place of a sample."""
+"""Counters of every width from 4 to 64 bits, as DBC files have them, from the payload to a place in time."""
 
 import numpy as np
 import pytest

@@ -26,7 +26,8 @@ from drivers.frames import Field, FrameLayout
 from drivers.modbus_replies import MAX_TCP_BYTES, Expected, judge_rtu, judge_tcp, register_bytes
 from drivers.registers import RegisterField, RegisterRecord, plan_runs
 from drivers.replay import ReplayDriver
-from drivers.replay_files import ColumnLayout, candump_messages
+from drivers.replay_files import ColumnLayout
+from drivers.replay_growing import candump_log
 from drivers.serial_lines import LineLayout
 from drivers.serial_port import framing_of
 
@@ -261,8 +262,9 @@ def candump_lines(rng: np.random.Generator) -> int:
         for k in range(n)
     ]
     text = b"\n".join(mutated(rng, line) for line in lines).decode("ascii", "replace")
-    messages, malformed = candump_messages(text)
-    assert len(messages) + malformed > 0
+    log = candump_log(text)
+    messages = list(log)
+    assert len(messages) + log.malformed > 0
     batch = batch_of(messages, [0] * len(messages))
     FrameSorter([StreamSpec("s", frame_layout(), 1000.0)]).sort(batch, 0)
     return n
