@@ -28,8 +28,8 @@ EXIT_FAILED = 1
 EXIT_BAD_FILE = 2
 SCENARIO = "paper"
 OF_RECORDINGS = ("map", "fs")
-OF_PLANTS = ("seed", "snr_db")
-"""Options that go with the one or the other; a scenario's faults go with both."""
+OF_PLANTS = ("snr_db",)
+"""Options that go with the one or the other; a scenario's faults, and their seed, go with both."""
 DEFAULT_BUS = "daqsvc-can0"
 """Name of the virtual bus below the folder for temporary files, where none is given."""
 
@@ -236,6 +236,11 @@ def _script(
     else:
         raise SignalError(
             f"a bearing needs sensors: name a machine file too, daqsvc sim FILE --scenario {given}"
+        )
+    if scenario is None and arguments.seed is not None:
+        raise SignalError(
+            "--seed draws the faults of a scenario anew, and a recording has none; name a scenario too with "
+            "--scenario, or leave --seed out"
         )
     faults = None if scenario is None else scenario.node_faults(arguments.seed)
     signals: Signals

@@ -102,7 +102,10 @@ async def node_for(order: NodeOrder) -> SimNode:
             f"{', '.join(sorted(known))}. Install the package that brings it, or choose other streams with "
             "--stream"
         )
-    return await known[driver](order)
+    try:
+        return await known[driver](order)
+    except ValueError as error:
+        raise NodeError(f"bus {order.bus} cannot be played: {error}") from error
 
 
 class CanNodes:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from sim_hw.plants.rotor import RotorEscapeError
 from sim_hw.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -67,14 +68,20 @@ class RotorSignals:
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
         """See `Signals.of`."""
         kind = getattr(sensor, "type", "")
-        channels = self._run(rate_hz)
-        if kind == "keyphasor":
-            return channels["keyphasor_v"]
-        if kind != "proximity":
+        if kind not in {"keyphasor", "proximity"}:
             raise SignalError(
                 f"sensor {sensor.name!r} is of type {kind!r}, and a rotor scenario gives proximity probes "
                 "and keyphasors; choose the streams that hold those with --stream, or play a --recording"
             )
+        speed_rpm = self._scenario.plant.speed_rpm
+        if rate_hz <= speed_rpm / 30.0:
+            raise SignalError(
+                f"stream {sensor.stream!r} is sampled at {rate_hz:g} Hz, too slowly to see a shaft turn at "
+                f"{speed_rpm:g} rpm; set its rate_hz above {speed_rpm / 30.0:g}, or play a --recording"
+            )
+        channels = self._run(rate_hz)
+        if kind == "keyphasor":
+            return channels["keyphasor_v"]
         stated = getattr(sensor, "angle_deg", None)
         angle_deg = self._angles_deg.setdefault(
             sensor.name, 90.0 * (len(self._angles_deg) % 2) if stated is None else stated
@@ -99,7 +106,10 @@ class RotorSignals:
                     "onset": [onset.model_dump() for onset in onsets],
                 }
             )
-            self._runs[rate_hz] = run.simulate(self._seed, self._snr_db).channels
+            try:
+                self._runs[rate_hz] = run.simulate(self._seed, self._snr_db).channels
+            except RotorEscapeError as error:
+                raise SignalError(f"scenario {self._scenario.title!r} cannot be played: {error}") from error
         return self._runs[rate_hz]
 
 

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
-from machine_files import MOTOR
+from machine_files import MACHINES, MOTOR
 from sim_processes import DOCUMENTATION, PATIENCE_S, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process
 
-from sim_hw.scenario import load_any_scenario
+from daqsvc.settings import load_machine_file
+from sim_hw.scenario import Scenario, builtin_scenarios, load_any_scenario, load_scenario
+from sim_hw.sim_command import SimCommand, _misuse, _script
+from sim_hw.sim_command_signals import BearingSignals, RotorSignals, SignalError, stream_samples
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_every_scenario_that_comes_along_can_be_read_and_says_what_goes_wrong() -> None:
@@ -47,6 +56,8 @@ def test_every_scenario_that_comes_along_can_be_read_and_says_what_goes_wrong() 
             "sensor 'accel-de' is of type 'accelerometer', and a rotor scenario gives proximity probes",
         ),
         ((VIRTUAL_RIG, "--bus", "/nowhere/can0", "--duration", "1"), "no bus can be made at /nowhere/can0"),
+        ((VIRTUAL_RIG, "--bus", "can-short", "--duration", "0.005"), "4 samples do not fill one frame 0x101"),
+        ((MOTOR, "--recording", "nothing.npz", "--seed", "3"), "name a scenario too with --scenario"),
     ],
 )
 def test_what_cannot_be_played_says_why(arguments: tuple[object, ...], message: str) -> None:
@@ -56,3 +67,51 @@ def test_what_cannot_be_played_says_why(arguments: tuple[object, ...], message: 
     assert message in errors
     assert "Traceback" not in errors
     assert output == ""
+
+
+@pytest.mark.parametrize("machine", sorted(MACHINES.glob("*.toml")), ids=lambda path: path.stem)
+def test_any_machine_plays_any_scenario_or_says_in_a_sentence_what_to_do(machine: Path) -> None:
+    described = load_machine_file(machine)
+    for name in [*builtin_scenarios(), *sorted(SCENARIOS.glob("*.toml"))]:
+        scenario = load_any_scenario(name)
+        rotor = isinstance(scenario, Scenario)
+        signals = RotorSignals(scenario, 0.5) if rotor else BearingSignals(scenario, 0.5)
+        played, refused = [], "with --stream"
+        try:
+            played = [stream_samples(described, stream, signals) for stream in described.streams]
+        except SignalError as error:
+            refused = str(error)
+        assert "with --stream" in refused, name
+        assert "\n" not in refused
+        for stream in played:
+            assert len(stream.samples) == 0.5 * stream.rate_hz
+            assert np.isfinite(stream.samples).all()
+
+
+def test_a_seed_draws_the_faults_of_a_recording_anew(tmp_path: Path) -> None:
+    np.savez(tmp_path / "motor.npz", de=np.zeros(1200))
+    recording = ("--recording", tmp_path / "motor.npz", "--map", "accel-de=de", "--fs", "12000")
+    faults = ("--scenario", SCENARIOS / "bad-bus.toml", "--seed", "7")
+    parser = argparse.ArgumentParser()
+    SimCommand().add_arguments(parser)
+    arguments = parser.parse_args([str(given) for given in (MOTOR, *recording, *faults)])
+    assert _misuse(arguments) is None
+    _, _, drawn, _ = _script(arguments)
+    assert drawn is not None
+    assert drawn.seed == 7
+
+
+def test_a_shaft_that_a_stream_is_too_slow_for_is_refused() -> None:
+    """The rig's shaft turns at 600 rpm; two samples a revolution tell nothing of it."""
+    probe, *_ = load_machine_file(VIRTUAL_RIG).sensors
+    with pytest.raises(SignalError, match=r"'shaft' is sampled at 20 Hz, too slowly .* rate_hz above 20"):
+        RotorSignals(load_scenario("healthy"), 0.5).of(probe, 20.0)
+
+
+def test_a_rotor_that_leaves_its_housing_is_refused() -> None:
+    scenario = load_scenario("healthy")
+    wild = replace(scenario.plant.rotor, eccentricity=5.0, contact_stiffness=0.0)
+    plant = scenario.plant.model_copy(update={"rotor": wild})
+    signals = RotorSignals(scenario.model_copy(update={"plant": plant}), 0.5)
+    with pytest.raises(SignalError, match="cannot be played: the rotor left its housing"):
+        stream_samples(load_machine_file(VIRTUAL_RIG), "shaft", signals)
