@@ -15,9 +15,10 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
 from drivers.keeping import Attempt, keep_up
 from drivers.modbus_client import ModbusClient
-from drivers.modbus_line import ModbusLine, Patience, WritableRun
+from drivers.modbus_line import ModbusLine, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
 from drivers.modbus_sampling import readers_for
+from drivers.modbus_silence import Patience
 from drivers.modbus_wire import LineOptions
 from drivers.registers import Run
 from drivers.tty import Character, CharacterFormat
@@ -78,6 +79,7 @@ class ModbusDriver:
             values: what to write, 0 to 65535 each.
 
         Raises:
+            ValueError: registers cannot hold these values, or a request so many; nothing has been sent.
             WriteRefusedError: the machine file does not allow it; nothing has been sent.
             LineLostError: the line is down.
             NoReplyError: the unit does not answer.

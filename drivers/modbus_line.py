@@ -2,19 +2,20 @@
 
 A reply on a serial line carries no number that tells which request it answers. One that comes after its
 request was given up would be taken for the reply to the next request, so after every failure the line is
-kept quiet, and whatever arrives meanwhile is thrown away and counted.
+kept quiet, and whatever arrives meanwhile is thrown away and counted. The same goes for a line that has just
+been opened: whoever had it before may have asked for what is still to come.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from numbers import Integral
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus_outcomes import LineLostError, NoReplyError, RefusedError
+from drivers.modbus_replies import GATEWAY_CODES, READ_FIFO, WRITE_REGISTERS
+from drivers.modbus_silence import Enquiry, UnitSilence
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -22,42 +23,25 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus_client import ModbusClient
     from drivers.modbus_outcomes import ModbusCounters
+    from drivers.modbus_silence import Patience
     from drivers.registers import Run
-
-logger = logging.getLogger(__name__)
-
-GATEWAY_CODES = frozenset({10, 11})
-"""Exceptions by which a gateway says that the unit behind it is silent."""
 
 LONGEST_BABBLE = 4
 """Quiet times for which a line that does not fall silent is waited for, before it is used all the same."""
 
+COURTESY_NS = 2_000_000
+"""How long a request that may stay without reply stands back: no event loop wakes up to the millisecond."""
+
+MOST_WRITTEN = 123
+"""Registers that a request can write (Modbus Application Protocol 1.1b3, 6.12)."""
+
+MOST_VALUE = 0xFFFF
+
 Result = TypeVar("Result")
-
-
-class UnitSetAsideError(NoReplyError):
-    """The unit has been silent, and it is not yet time to ask it again."""
 
 
 class WriteRefusedError(PermissionError):
     """The machine file does not allow to write these registers."""
-
-
-@dataclass(frozen=True, slots=True)
-class Patience:
-    """How long to bear with a line and its units.
-
-    Attributes:
-        quiet_ns: silence kept after a failed request on a serial line; at least the response time-out.
-        gap_ns: silence between frames on a serial line.
-        demote_after: requests without reply, in a row, after which a unit is set aside.
-        demotion_ns: how long it is set aside, before one request probes whether it is back.
-    """
-
-    quiet_ns: int
-    gap_ns: int
-    demote_after: int = 3
-    demotion_ns: int = 10 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,19 +52,25 @@ class WritableRun:
     run: Run
 
 
-@dataclass(slots=True)
-class _Unit:
-    """What is known about a unit: requests without reply in a row, and when to ask again."""
+class Reading(NamedTuple):
+    """Registers, and when they were read.
 
-    failures: int = 0
-    probe_ns: int | None = None
+    Attributes:
+        registers: high byte of each first.
+        asked_ns: when the request went out, host monotonic.
+        answered_ns: when its reply was there.
+    """
+
+    registers: bytes
+    asked_ns: int
+    answered_ns: int
 
 
 class ModbusLine:
     """An open line. It is lost when its connection is, or when no unit of it answers any more.
 
     Args:
-        client: the connection; it is open.
+        client: the connection; it has just been opened.
         clock: the service's clock.
         counters: of the bus.
         patience: see there.
@@ -105,48 +95,73 @@ class ModbusLine:
         self._clock = clock
         self._counters = counters
         self._patience = patience
-        self._units = {unit: _Unit() for unit in units}
+        self._units = {unit: UnitSilence(unit, patience, counters) for unit in units}
         self._writable = writable
         self._heard = heard
         self._lock = asyncio.Lock()
-        self._quiet_until_ns = 0
+        self._quiet_until_ns = clock.monotonic_ns() + patience.quiet_ns
         self._failed = False
-        self._last_words: dict[int, str] = defaultdict(str)
 
-    async def read(self, unit: int, function: int, run: Run) -> bytes:
+    async def poll(self, unit: int, function: int, run: Run, what: str = "") -> Reading:
+        """Read registers, and tell when that was; see `read`."""
+        enquiry = Enquiry(function, what)
+        return Reading(
+            *await self._ask(unit, enquiry, lambda: self._client.read(unit, function, run.address, run.count))
+        )
+
+    async def read(self, unit: int, function: int, run: Run, what: str = "") -> bytes:
         """Read registers; see `ModbusClient.read` for what is returned and raised.
 
-        Raises:
-            UnitSetAsideError: the unit is silent, and it is not yet time to ask it again.
-        """
-        return await self._ask(unit, lambda: self._client.read(unit, function, run.address, run.count))
+        Args:
+            unit: address of the unit.
+            function: see `ModbusClient.read`.
+            run: the registers.
+            what: what is read, in words. Requests of one function for the same are set aside together, if
+                they stay without reply while the unit answers others.
 
-    async def read_fifo(self, unit: int, address: int) -> bytes:
+        Raises:
+            UnitSetAsideError: there was no reply before, and it is not yet time to ask again.
+        """
+        return (await self.poll(unit, function, run, what)).registers
+
+    async def read_fifo(self, unit: int, address: int, what: str = "") -> bytes:
         """Read a FIFO queue; see `read`."""
-        return await self._ask(unit, lambda: self._client.read_fifo(unit, address))
+        enquiry = Enquiry(READ_FIFO, what)
+        registers, _, _ = await self._ask(unit, enquiry, lambda: self._client.read_fifo(unit, address))
+        return registers
 
     async def write(self, unit: int, address: int, values: Sequence[int]) -> None:
         """Write holding registers that the machine file allows to write; see `read`.
 
         Raises:
-            WriteRefusedError: it does not; nothing has been sent.
+            ValueError: registers cannot hold these values, or a request so many; nothing has been sent.
+            WriteRefusedError: the machine file does not allow it; nothing has been sent.
         """
+        _check_values(values)
         if not may_write(self._writable, unit, address, len(values)):
             raise WriteRefusedError(
                 f"registers {address} to {address + len(values) - 1} of unit {unit} must not be written; add "
                 f"{{ unit = {unit}, address = {address}, count = {len(values)} }} to writes of the bus if "
                 "they may"
             )
-        await self._ask(unit, lambda: self._client.write(unit, address, values))
+        await self._ask(unit, Enquiry(WRITE_REGISTERS), lambda: self._client.write(unit, address, values))
 
-    async def _ask(self, unit: int, request: Callable[[], Awaitable[Result]]) -> Result:
+    async def _ask(
+        self, unit: int, enquiry: Enquiry, request: Callable[[], Awaitable[Result]]
+    ) -> tuple[Result, int, int]:
+        """Make a request as soon as it may be; returns its result, when it went out and when it ended."""
+        silence = self._units.get(unit)
+        if silence is None:
+            silence = self._units[unit] = UnitSilence(unit, self._patience, self._counters)
+        silence.check(enquiry, self._clock.monotonic_ns())
+        if silence.doubtful(enquiry):
+            await self._let_others_go_first()
         async with self._lock:
             if self._quiet_left_ns() > 0:
                 await self._keep_quiet()
-            state = self._units.setdefault(unit, _Unit())
-            if state.probe_ns is not None:
-                if self._clock.monotonic_ns() < state.probe_ns:
-                    raise UnitSetAsideError(f"unit {unit} is set aside: {self._last_words[unit]}")
+            asked_ns = self._clock.monotonic_ns()
+            silence.check(enquiry, asked_ns)
+            if silence.probes(enquiry):
                 self._counters.probes += 1
             self._failed = True  # until a reply is there: also if this task is cancelled meanwhile
             try:
@@ -155,22 +170,30 @@ class ModbusLine:
                 self._lose(f"{error}")
                 raise
             except NoReplyError as error:
-                self._miss(unit, state, f"{error}")
+                self._miss(silence, enquiry, f"{error}")
                 raise
             except RefusedError as error:
                 self._failed = False
                 if error.code in GATEWAY_CODES:
-                    self._miss(unit, state, f"{error}")
+                    self._miss(silence, enquiry, f"{error}")
                 else:
-                    self._answered(unit, state)
+                    self._heard()
+                    silence.answered(enquiry, refused=True)
                 raise
             else:
                 self._failed = False
-                self._answered(unit, state)
-                return result
+                self._heard()
+                silence.answered(enquiry)
+                return result, asked_ns, self._clock.monotonic_ns()
             finally:
                 silence_ns = self._patience.quiet_ns if self._failed else self._patience.gap_ns
                 self._quiet_until_ns = self._clock.monotonic_ns() + silence_ns
+
+    async def _let_others_go_first(self) -> None:
+        """Line up behind all that is due now: what stays without reply takes a time-out and a silence."""
+        await self._clock.sleep_ns(COURTESY_NS)
+        async with self._lock:
+            pass
 
     async def _keep_quiet(self) -> None:
         """Wait out the quiet time; a late reply makes it longer by a frame's gap."""
@@ -182,32 +205,31 @@ class ModbusLine:
         until_ns = max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
         return until_ns - self._clock.monotonic_ns()
 
-    def _answered(self, unit: int, state: _Unit) -> None:
-        self._heard()
-        if state.probe_ns is not None:
-            self._counters.units_back += 1
-            logger.warning("unit %d is back", unit)
-        state.failures, state.probe_ns = 0, None
-
-    def _miss(self, unit: int, state: _Unit, why: str) -> None:
-        state.failures += 1
-        self._last_words[unit] = why
-        if state.failures < self._patience.demote_after and state.probe_ns is None:
-            return
-        if state.probe_ns is None:
-            self._counters.units_demoted += 1
-            logger.warning(
-                "%s; it is set aside and asked every %g s from now on",
-                why,
-                self._patience.demotion_ns / NS_PER_S,
-            )
-        state.probe_ns = self._clock.monotonic_ns() + self._patience.demotion_ns
-        if all(other.probe_ns is not None for other in self._units.values()):
+    def _miss(self, silence: UnitSilence, enquiry: Enquiry, why: str) -> None:
+        silence.missed(enquiry, why, self._clock.monotonic_ns())
+        if all(unit.dead for unit in self._units.values()):
             self._lose(f"no unit answers any more; the last: {why}")
 
     def _lose(self, why: str) -> None:
         if not self.lost.done():
             self.lost.set_result(why)
+
+
+def _check_values(values: Sequence[int]) -> None:
+    """Make sure that a request can write these.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    if not 1 <= len(values) <= MOST_WRITTEN:
+        raise ValueError(
+            f"{len(values)} values to be written; a request writes 1 to {MOST_WRITTEN} registers"
+        )
+    for value in values:
+        if not isinstance(value, Integral) or not 0 <= value <= MOST_VALUE:
+            raise ValueError(
+                f"value {value!r} to be written; a register holds whole numbers 0 to {MOST_VALUE}"
+            )
 
 
 def may_write(writable: Sequence[WritableRun], unit: int, address: int, count: int) -> bool:

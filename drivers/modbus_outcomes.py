@@ -46,11 +46,14 @@ class ModbusCounters(BusCounters):
         replies_wrong_protocol: TCP frames that are not Modbus.
         replies_unasked: bunches of bytes on a serial line while no reply was waited for: late replies.
         units_demoted: how often a silent unit was set aside.
-        probes: requests to a unit set aside, to see if it is back.
-        units_back: how often one was.
+        units_back: how often one was found to be back.
+        requests_demoted: how often requests of a unit that answers others were set aside.
+        requests_back: how often such were answered again.
+        probes: requests made to see whether what was set aside is answered again.
         blocks_torn: waveform blocks that the device replaced while they were read.
         blocks_missed: waveform blocks that were over before they could be read.
         ring_overruns: how often a ring was overwritten before it was read.
+        counts_doubted: write counters and block ids that another look did not bear out.
     """
 
     requests: int = 0
@@ -66,11 +69,14 @@ class ModbusCounters(BusCounters):
     replies_wrong_protocol: int = 0
     replies_unasked: int = 0
     units_demoted: int = 0
-    probes: int = 0
     units_back: int = 0
+    requests_demoted: int = 0
+    requests_back: int = 0
+    probes: int = 0
     blocks_torn: int = 0
     blocks_missed: int = 0
     ring_overruns: int = 0
+    counts_doubted: int = 0
 
     def note(self, fault: str) -> None:
         """Count a faulty reply."""

@@ -32,6 +32,9 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 
+GATEWAY_CODES = frozenset({10, 11})
+"""Exceptions by which a gateway says that the unit behind it is silent."""
+
 _MBAP = struct.Struct(">HHHB")
 MBAP_BYTES = _MBAP.size
 MAX_TCP_BYTES = 260

@@ -1,27 +1,34 @@
-"""Present values polled on a schedule: streams whose registers lie together share requests."""
+"""Present values polled on a schedule: streams whose registers lie together share requests.
+
+The schedule is ours, and so is the clock: a sample was taken between the moment its request went out and the
+moment its reply was there. Nothing need be estimated, and a poll that had to wait for the line is still a
+sample, of its own true time.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.acquisition.assembler import StreamCounters
+from daqsvc.acquisition.books import note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from drivers.modbus_layouts import FUNCTIONS
 from drivers.modbus_outcomes import NoReplyError, RefusedError
-from drivers.modbus_reading import PollingReader, RowAssembler
+from drivers.modbus_reading import PollingReader
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daqsvc.acquisition.assembler import StreamCounters
-    from daqsvc.acquisition.samples import SampleBlock
-    from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus_layouts import Trend
-    from drivers.modbus_line import ModbusLine
+    from drivers.modbus_line import ModbusLine, Reading
     from drivers.registers import Run
 
 logger = logging.getLogger(__name__)
@@ -35,39 +42,47 @@ EARLY_NS = 500_000
 """How early a poll may be: no event loop sleeps for less than a millisecond."""
 
 LATE_NS = 2_000_000
-"""How late it may be: no event loop wakes up to the millisecond, and what is overdue is soon asked for."""
+"""How late one may be at least: no event loop wakes up to the millisecond; what is overdue is soon asked."""
 
 REFUSALS_OF_REGISTERS = frozenset({2, 3})
 """Exceptions by which a unit says that it has not these registers, or not so many at once."""
 
 
-class _Reply(NamedTuple):
-    """Registers, and when they were there."""
+class _Row(NamedTuple):
+    """The registers of a sample, its place in the schedule, and between when and when it was taken."""
 
+    slot: int
     registers: bytes
-    arrival_ns: int
+    from_ns: int
+    to_ns: int
 
 
 class _TrendStream:
-    """One stream of those that are polled together: its samples until a batch of them is handed on."""
+    """One stream of those that are polled together: its samples until a batch of them is handed on.
+
+    A sample is placed midway between request and reply, which bound its error. Those of one block are as far
+    from even steps as its polls were from the schedule: that is in the block's error, too.
+    """
 
     def __init__(self, spec: StreamSpec[Trend], port: BusPort) -> None:
         self.name = spec.name
         self.own_runs = spec.layout.record.runs
+        self.counters = StreamCounters()
         self._record = spec.layout.record
-        self._port = port
+        self._deliver = port.deliver
+        self._period_ns = NS_PER_S / spec.rate_hz
         self._places: tuple[int, ...] = ()
-        self._assembler = RowAssembler(spec, port.clock, self._deliver, counter_bits=32)
-        self._lateness_ns = 0.0
-        self._slots: list[int] = []
-        self._arrivals_ns: list[int] = []
-        self._rows: list[bytes] = []
+        self._rows: list[_Row] = []
+        self._start_ns = 0
+        self._next: int | None = None
+        self._lateness_ns: deque[float] = deque(maxlen=RECENT_DELAYS)
+        self._error_ns = np.inf
 
     @property
-    def state(self) -> tuple[StreamCounters, TimeBaseState]:
-        """Counters and clock; what is told of the clock's error is that of a single sample's time, too."""
-        time_base = self._assembler.time_base
-        return self._assembler.counters, time_base._replace(error_ns=time_base.error_ns + time_base.jitter_ns)
+    def time_base(self) -> TimeBaseState:
+        """How well the schedule is kept, and how far off the time of the last sample may be."""
+        late_ns = float(np.percentile(self._lateness_ns, 95)) if self._lateness_ns else 0.0
+        return TimeBaseState(self._period_ns, 0.0, late_ns, self._next is not None, 0, self._error_ns)
 
     def places_in(self, runs: Sequence[Run]) -> tuple[int, ...]:
         """Places of those runs that its quantities lie in."""
@@ -80,51 +95,68 @@ class _TrendStream:
 
     def take_from(self, runs: Sequence[Run], places: Sequence[int]) -> None:
         """Say which runs are read from now on, and which of them are for this stream."""
-        self.hand_on()
+        self.flush()
         self._places = tuple(places)
         self._record = replace(self._record, runs=tuple(runs[place] for place in places))
 
-    def take(self, slot: int, replies: Sequence[_Reply | None]) -> None:
-        """Take the sample of a slot, from the reply to each run; without one of its own it is lost."""
-        row = b""
-        arrival_ns = 0
-        for place in self._places:
-            reply = replies[place]
-            if reply is None:
-                return
-            row += reply.registers
-            arrival_ns = reply.arrival_ns
-        self._slots.append(slot)
-        self._arrivals_ns.append(arrival_ns)
-        self._rows.append(row)
-        if len(self._slots) >= BATCH_POLLS or arrival_ns - self._arrivals_ns[0] > BATCH_NS:
-            self.hand_on()
+    def take(self, slot: int, start_ns: int, readings: Sequence[Reading | None]) -> None:
+        """Take the sample of a slot, from what each run holds; without one of its own it is lost.
 
-    def hand_on(self) -> None:
-        """Hand on what has been read."""
-        if self._slots:
-            slots = np.array(self._slots, np.int64) % 2**32
-            arrivals_ns = np.array(self._arrivals_ns, np.int64)
-            rows = b"".join(self._rows)
-            self._slots, self._arrivals_ns, self._rows = [], [], []
-            self._lateness_ns = self._assembler.time_base.jitter_ns
-            self._assembler.accept(self._record, slots, rows, arrivals_ns)
+        Args:
+            slot: its place in the schedule.
+            start_ns: when the schedule began, host monotonic.
+            readings: of each run; None if there is none.
+        """
+        own = [reading for place in self._places if (reading := readings[place]) is not None]
+        if len(own) < len(self._places):
+            return
+        self._start_ns = start_ns
+        if self._rows and slot != self._rows[-1].slot + 1:
+            self.flush()
+        registers = b"".join(reading.registers for reading in own)
+        row = _Row(slot, registers, own[0].asked_ns, own[-1].answered_ns)
+        self._rows.append(row)
+        if len(self._rows) >= BATCH_POLLS or row.to_ns - self._rows[0].to_ns > BATCH_NS:
+            self.flush()
 
     def flush(self) -> None:
-        """Hand over what is held back."""
-        self.hand_on()
-        self._assembler.flush()
-
-    def _deliver(self, block: SampleBlock) -> None:
-        # The time base knows the schedule better than any poll keeps it: a value is as late as its poll.
-        self._port.deliver(replace(block, t_error_ns=block.t_error_ns + self._lateness_ns))
+        """Hand on what has been read."""
+        if not self._rows:
+            return
+        rows, self._rows = self._rows, []
+        first = rows[0].slot
+        due_ns = [self._start_ns + round(row.slot * self._period_ns) for row in rows]
+        from_ns = min(row.from_ns - due for row, due in zip(rows, due_ns, strict=True))
+        to_ns = max(row.to_ns - due for row, due in zip(rows, due_ns, strict=True))
+        self._error_ns = (to_ns - from_ns) / 2
+        self._lateness_ns.extend(max(row.from_ns - due, 0) for row, due in zip(rows, due_ns, strict=True))
+        raw = np.frombuffer(b"".join(row.registers for row in rows), np.uint8).reshape(len(rows), -1)
+        samples = np.ascontiguousarray(self._record.decode(raw))
+        lost = 0 if self._next is None else first - self._next
+        self._next = first + len(rows)
+        self.counters.frames_received += len(rows)
+        note_received(self.counters, self.name, samples)
+        if lost:
+            note_gap(self.counters, self.name, lost, first)
+        self._deliver(
+            SampleBlock(
+                self.name,
+                first,
+                samples,
+                due_ns[0] + (from_ns + to_ns) // 2,
+                self._period_ns,
+                lost,
+                Quality.AFTER_LOSS if lost else Quality.GOOD,
+                self._error_ns,
+            )
+        )
 
 
 class TrendReader(PollingReader):
     """Polls registers on a schedule; a sample's count is its place in the schedule.
 
-    A poll that fails, or whose time passes while another request holds the line, is a lost sample of every
-    stream that has registers in it, and of no other.
+    A poll that fails is a lost sample of every stream that has registers in it, and of no other; and so is
+    one whose request could not go out before the next was due, because others held the line.
 
     Args:
         specs: streams of one unit, table and rate.
@@ -139,8 +171,9 @@ class TrendReader(PollingReader):
         self._unit = specs[0].layout.unit
         self._function = FUNCTIONS[specs[0].layout.table]
         self._period_ns = NS_PER_S / specs[0].rate_hz
-        self._start_ns: int | None = None
-        self._done = -1
+        self._late_ns = max(self._period_ns, LATE_NS)
+        self._start_ns = 0
+        self._done: int | None = None
         self._streams = [_TrendStream(spec, port) for spec in specs]
         if runs is None:
             self._read_apart()
@@ -150,7 +183,7 @@ class TrendReader(PollingReader):
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
         """See `Reader.streams`."""
-        return {stream.name: stream.state for stream in self._streams}
+        return {stream.name: (stream.counters, stream.time_base) for stream in self._streams}
 
     def flush(self) -> None:
         """See `Reader.flush`."""
@@ -159,30 +192,36 @@ class TrendReader(PollingReader):
 
     async def _look(self, line: ModbusLine) -> None:
         slot = await self._wait_for_slot()
-        replies: list[_Reply | None] = []
+        readings: list[Reading | None] = []
         lost: frozenset[_TrendStream] = frozenset()
         failure: tuple[NoReplyError | RefusedError, Run, frozenset[_TrendStream]] | None = None
         for run, takers in self._plan:
-            reply = None
+            reading = None
             if not takers <= lost:  # else nobody's sample can be whole any more
                 try:
-                    registers = await line.read(self._unit, self._function, run)
+                    reading = await line.poll(self._unit, self._function, run, _words(run))
                 except (NoReplyError, RefusedError) as error:
                     failure = error, run, takers
                     lost |= takers
-                else:
-                    reply = _Reply(registers, self._clock.monotonic_ns())
-            replies.append(reply)
-        for stream in self._streams:
-            stream.take(slot, replies)
+            readings.append(reading)
+        self._take(slot, readings)
         if failure is not None:
             self._fail(*failure)
+
+    def _take(self, slot: int, readings: Sequence[Reading | None]) -> None:
+        """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
+        asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
+        if asked_ns is None:
+            return
+        self._done = max(slot, self._oldest_slot(asked_ns))
+        for stream in self._streams:
+            stream.take(self._done, self._start_ns, readings)
 
     def _fail(self, error: NoReplyError | RefusedError, run: Run, takers: frozenset[_TrendStream]) -> None:
         """Read the streams apart if the unit has not all that they share; else tell the failure as it is."""
         if not isinstance(error, RefusedError):
             raise error
-        told = RefusedError(f"{error} (registers {run.address} to {run.end - 1})", error.code)
+        told = RefusedError(f"{error} ({_words(run)})", error.code)
         if error.code not in REFUSALS_OF_REGISTERS or len(takers) == 1:
             raise told from error
         logger.warning(
@@ -215,14 +254,24 @@ class TrendReader(PollingReader):
     async def _wait_for_slot(self) -> int:
         """Wait for the next place in the schedule that has not passed for good."""
         now_ns = self._clock.monotonic_ns()
-        if self._start_ns is None:
+        if self._done is None:
             self._start_ns = now_ns
-        slot = max(self._done + 1, -int((self._start_ns + LATE_NS - now_ns) // self._period_ns))
-        wait_ns = self._start_ns + round(slot * self._period_ns) - now_ns
+            self._done = -1
+        self._done = max(self._done + 1, self._oldest_slot(now_ns))
+        wait_ns = self._due_ns(self._done) - now_ns
         if wait_ns > WORTH_A_BATCH_NS:
-            for stream in self._streams:
-                stream.hand_on()
+            self.flush()
         if wait_ns > EARLY_NS:
             await self._clock.sleep_ns(wait_ns)
-        self._done = slot
-        return slot
+        return self._done
+
+    def _oldest_slot(self, now_ns: int) -> int:
+        """The first place in the schedule that has not passed for good: the next but one is not due yet."""
+        return -int((self._start_ns + self._late_ns - now_ns) // self._period_ns)
+
+    def _due_ns(self, slot: int) -> int:
+        return self._start_ns + round(slot * self._period_ns)
+
+
+def _words(run: Run) -> str:
+    return f"registers {run.address} to {run.end - 1}"

@@ -75,6 +75,8 @@ class _Modbus(ABC):
     overflow_frames = 2000
     cannot = CANNOT
     acknowledge: int | None
+    timeout_ms: float
+    """Time is simulated, but replies come when they come."""
 
     def __init__(self, _folder: Path) -> None:
         self.time = SimulatedTime()
@@ -99,8 +101,7 @@ class _Modbus(ABC):
         await asyncio.sleep(0)
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> ModbusDriver:
-        # Time is simulated, but replies come when they come.
-        options = {**self.options(), "timeout_ms": 20_000.0, "quiet_ms": 1.0}
+        options = {**self.options(), "timeout_ms": self.timeout_ms, "demote_after": 30}
         return ModbusDriver(BusPort("mb", options, [self._spec], self.time.clock, deliver, start))
 
 
@@ -109,6 +110,7 @@ class ModbusTcp(_Modbus):
 
     name = "Modbus TCP"
     acknowledge = None
+    timeout_ms = 20_000.0
 
     async def start(self) -> None:
         self._server = ModbusTcpServer({UNIT: self.device.unit})
@@ -129,6 +131,7 @@ class ModbusRtu(_Modbus):
 
     name = "Modbus RTU"
     acknowledge = ACKNOWLEDGE
+    timeout_ms = 100.0  # a line that is opened is quiet for so long, in simulated time
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)

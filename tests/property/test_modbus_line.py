@@ -14,8 +14,9 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus_client import ModbusClient
 from drivers.modbus_layouts import Count, Ring, Trend, sample_record
-from drivers.modbus_line import ModbusLine, Patience, UnitSetAsideError
+from drivers.modbus_line import ModbusLine
 from drivers.modbus_outcomes import ModbusCounters, NoReplyError, RefusedError
+from drivers.modbus_silence import Patience, UnitSetAsideError
 from drivers.modbus_wire import LineOptions
 from drivers.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer

@@ -1,0 +1,185 @@
+"""Who does not answer on a Modbus line: a unit that is dead, or one request of a unit that lives.
+
+Either is set aside after a few requests without reply, and asked again ever more rarely. A unit is dead when
+nothing that it is asked is answered any more: a queue that it does not have must not cost its other streams
+their samples.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.acquisition.clock import NS_PER_S
+from drivers.modbus_outcomes import NoReplyError
+from drivers.modbus_replies import WRITE_REGISTERS
+
+if TYPE_CHECKING:
+    from drivers.modbus_outcomes import ModbusCounters
+
+logger = logging.getLogger(__name__)
+
+LONGEST_DEMOTION_NS = 60 * NS_PER_S
+
+
+class UnitSetAsideError(NoReplyError):
+    """The unit, or this request of it, has stayed without reply, and it is not yet time to ask again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long to bear with a line and its units.
+
+    Attributes:
+        quiet_ns: silence kept on a serial line after it was opened, and after a request that failed; at least
+            the response time-out.
+        gap_ns: silence between frames on a serial line.
+        demote_after: requests without reply, in a row, after which a unit, or one request, is set aside.
+        demotion_ns: how long it is set aside, before one request probes whether it is back; twice as long
+            after each probe without reply, up to `LONGEST_DEMOTION_NS` if that is more.
+    """
+
+    quiet_ns: int
+    gap_ns: int
+    demote_after: int = 3
+    demotion_ns: int = 10 * NS_PER_S
+
+    @property
+    def longest_demotion_ns(self) -> int:
+        """The longest time from a probe to the next."""
+        return max(self.demotion_ns, LONGEST_DEMOTION_NS)
+
+    @property
+    def of_probes(self) -> str:
+        """When is asked again, in words."""
+        first_s, longest_s = self.demotion_ns / NS_PER_S, self.longest_demotion_ns / NS_PER_S
+        if first_s == longest_s:
+            return f"asked again every {first_s:g} s"
+        return f"asked again in {first_s:g} s, then after times that double up to {longest_s:g} s"
+
+
+class Enquiry(NamedTuple):
+    """What a unit is asked again and again, and what is set aside by itself.
+
+    Attributes:
+        function: code of the function.
+        what: what it is for, in words.
+    """
+
+    function: int
+    what: str = ""
+
+    def __str__(self) -> str:
+        return f"function {self.function}" + (f" for {self.what}" if self.what else "")
+
+
+@dataclass(slots=True)
+class _Silence:
+    """Requests without reply in a row, and when to ask again."""
+
+    failures: int = 0
+    wait_ns: int = 0
+    probe_ns: int | None = None
+
+    def set_aside(self, patience: Patience, now_ns: int) -> bool:
+        """Let nobody ask for a while; returns whether that is new."""
+        new = self.probe_ns is None
+        self.wait_ns = patience.demotion_ns if new else min(2 * self.wait_ns, patience.longest_demotion_ns)
+        self.probe_ns = now_ns + self.wait_ns
+        return new
+
+    def end(self) -> None:
+        """There was an answer."""
+        self.failures, self.probe_ns = 0, None
+
+
+class UnitSilence:
+    """What is known about the silence of a unit.
+
+    Args:
+        unit: its address.
+        patience: how long to bear with it.
+        counters: of the bus.
+    """
+
+    def __init__(self, unit: int, patience: Patience, counters: ModbusCounters) -> None:
+        self._unit = unit
+        self._patience = patience
+        self._counters = counters
+        self._whole = _Silence()
+        self._enquiries: dict[Enquiry, _Silence] = {}
+        # What was answered when it was asked last, or has not been asked yet: the unit may live.
+        self._hopeful: set[Enquiry] = set()
+        self._last_words = ""
+
+    @property
+    def dead(self) -> bool:
+        """Whether the whole unit is set aside."""
+        return self._whole.probe_ns is not None
+
+    def check(self, enquiry: Enquiry, now_ns: int) -> None:
+        """Make sure that this may be asked now.
+
+        Raises:
+            UnitSetAsideError: it is not yet time.
+        """
+        for silence in (self._whole, self._of(enquiry)):
+            if silence.probe_ns is not None and now_ns < silence.probe_ns:
+                raise UnitSetAsideError(f"unit {self._unit} is set aside: {self._last_words}")
+
+    def doubtful(self, enquiry: Enquiry) -> bool:
+        """Whether this may well stay without reply."""
+        return self.dead or self._of(enquiry).failures > 0
+
+    def probes(self, enquiry: Enquiry) -> bool:
+        """Whether this, asked now, is to find out if somebody is back."""
+        return self.dead or self._of(enquiry).probe_ns is not None
+
+    def answered(self, enquiry: Enquiry, *, refused: bool = False) -> None:
+        """There was a reply.
+
+        Args:
+            enquiry: to this.
+            refused: by which the unit refuses: it lives now, but need not be asked that again.
+        """
+        silence = self._of(enquiry)
+        if refused:
+            self._hopeful.discard(enquiry)
+        elif enquiry.function != WRITE_REGISTERS:  # nobody need ever write again
+            self._hopeful.add(enquiry)
+        if self.dead:
+            self._counters.units_back += 1
+            logger.warning("unit %d is back", self._unit)
+            for other in self._enquiries.values():
+                other.end()
+        elif silence.probe_ns is not None:
+            self._counters.requests_back += 1
+            logger.warning("unit %d answers %s again", self._unit, enquiry)
+        self._whole.end()
+        silence.end()
+
+    def missed(self, enquiry: Enquiry, why: str, now_ns: int) -> None:
+        """There was no reply, because of ``why``."""
+        whole, silence, patience = self._whole, self._of(enquiry), self._patience
+        whole.failures += 1
+        silence.failures += 1
+        self._hopeful.discard(enquiry)
+        self._last_words = why
+        if not self._hopeful and whole.failures >= patience.demote_after:
+            if whole.set_aside(patience, now_ns):
+                self._counters.units_demoted += 1
+                logger.warning("%s; the unit is set aside, and %s", why, patience.of_probes)
+            if len(self._enquiries) > 1:
+                # Something else is to probe next: this one may be what the unit does not know.
+                silence.probe_ns = now_ns + whole.wait_ns + patience.demotion_ns
+        elif silence.failures >= patience.demote_after and silence.set_aside(patience, now_ns):
+            self._counters.requests_demoted += 1
+            logger.warning("%s; %s is set aside, and %s", why, enquiry, patience.of_probes)
+
+    def _of(self, enquiry: Enquiry) -> _Silence:
+        if enquiry not in self._enquiries:
+            self._enquiries[enquiry] = _Silence()
+            if enquiry.function != WRITE_REGISTERS:
+                self._hopeful.add(enquiry)
+        return self._enquiries[enquiry]
