@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.arrival_count import COUNTER_BITS, ArrivalCount
+from daqsvc.acquisition.books import note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBase, TimeBaseState
@@ -46,7 +47,8 @@ class StreamCounters:
         samples_received: samples handed on.
         samples_lost: samples declared missing, by the device's counter, or by time if it sends none.
         gaps: how often samples were missing.
-        values_absent: values in the samples handed on, of any channel, that the device said it does not have.
+        values_absent: values in the samples handed on, of any channel, that the device said it does not have,
+            or that are not finite.
     """
 
     frames_received: int = 0
@@ -284,17 +286,6 @@ class StreamAssembler:
             self._emit(int(index[0]), self._held[:length], lost)
             self._hold(index[length:], self._held[length:])
 
-    def _count_absent(self, flat: Samples) -> None:
-        absent = int(np.count_nonzero(np.isnan(flat)))
-        if absent and not self.counters.values_absent:
-            logger.warning(
-                "stream %r: the device sends no value %d times, but says that it has none; such values are "
-                "missing, and are counted from now on. Look at the sensors behind it",
-                self.stream,
-                absent,
-            )
-        self.counters.values_absent += absent
-
     def _hold(self, index: NDArray[np.int64], samples: Samples) -> None:
         self._held_index = index
         self._held = samples if len(index) else None
@@ -308,22 +299,13 @@ class StreamAssembler:
             quality |= Quality.AFTER_LOSS
             if self._after_restart or self._arrivals is not None:
                 quality |= Quality.LOSS_ESTIMATED
-            if not self.counters.gaps:
-                logger.warning(
-                    "stream %r: %d samples are missing before index %d; gaps are counted from now on",
-                    self.stream,
-                    lost,
-                    first,
-                )
-            self.counters.gaps += 1
-            self.counters.samples_lost += lost
+            note_gap(self.counters, self.stream, lost, first)
             self._gaps.append((self._next, first))
         self._after_restart = False
         # Whatever is still held back waits for another frame than before.
         self._waiting_since_ns = self._arrival_ns
         flat = np.ascontiguousarray(samples.reshape(-1, samples.shape[2]))
-        self.counters.samples_received += len(flat)
-        self._count_absent(flat)
+        flat = note_received(self.counters, self.stream, flat)
         self._next = first + len(flat)
         self._deliver(
             SampleBlock(

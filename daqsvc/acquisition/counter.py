@@ -189,7 +189,7 @@ class CounterUnwrapper:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Steps of the counter and of the clock from frame to frame ``[n]``; how late each is ``[n + 1]``."""
         steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
-        elapsed = (arrival_ns - np.concatenate(([self._seen_ns], arrival_ns[:-1]))) * self._rate
+        elapsed: NDArray[np.float64] = np.diff(arrival_ns, prepend=self._seen_ns) * self._rate
         # What lags by no more than the drift is a slow device, and not read late.
         return steps, elapsed, _lateness(self._late, elapsed * (1 - self._drift) - steps)
 

@@ -133,6 +133,7 @@ def test_absent_values_are_counted_beside_the_samples_and_said_once(caplog: pyte
     samples = np.ones((40, 1, 3), np.float32)
     samples[5:12, 0, 1] = np.nan
     samples[30, 0, :] = np.nan
+    samples[35, 0, :2] = np.inf, -np.inf
     with caplog.at_level(logging.WARNING):
         for start in range(0, 40, 10):
             part = slice(start, start + 10)
@@ -140,7 +141,10 @@ def test_absent_values_are_counted_beside_the_samples_and_said_once(caplog: pyte
             stream.accept(counter, samples[part], np.ones(10, np.bool_), counter * 10_000_000)
         stream.flush()
     counters = stream.counters
-    assert (counters.samples_received, counters.samples_lost, counters.values_absent) == (40, 0, 10)
+    assert (counters.samples_received, counters.samples_lost, counters.values_absent) == (40, 0, 12)
+    values = np.concatenate([block.samples for block in blocks])
+    assert np.isnan(values).sum() == 12
+    assert (values[np.isfinite(values)] == 1.0).all()
     assert [r.message for r in caplog.records if "no value" in r.message] == [caplog.records[0].message]
 
 
