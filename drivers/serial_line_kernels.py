@@ -231,31 +231,77 @@ def read_lines(
     return states, values
 
 
+COUNT, STAMP, DUE, GRAIN, SHARED = range(5)
+"""What is known of a device's time stamps: count, stamp and instant of its newest sample in s, how coarse the
+stamps are in s, and whether several samples share one."""
+KNOWN = SHARED + 1
+_SLACK = 0.6
+"""How many periods late, beside the half one, a sample must be for a shared stamp to tell of missing ones."""
+_NOT_BEFORE_STAMP = 0.5
+"""In place of `tracking`, for samples that are due before the stamp that they share with others."""
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def count_stamps(times_s: Values, period_s: float, tracking: float, state: Values) -> Places:
+def _next_stamp(state: Values, time_s: float, period_s: float, tracking: float) -> None:
+    """Take in the stamp of the sample after the newest one; no earlier than that one's."""
+    passed_s = time_s - state[STAMP]
+    if passed_s == 0.0:
+        state[SHARED] = 1.0
+    else:
+        state[GRAIN] = min(state[GRAIN], passed_s)
+    # It was taken when it is due, or some samples are missing before it.
+    slack = _SLACK if state[SHARED] else 0.0
+    steps = max(np.rint((time_s - state[DUE]) / period_s - slack), 1.0)
+    state[COUNT] = (state[COUNT] + steps % _COUNTS) % _COUNTS
+    state[DUE] += steps * period_s
+    state[STAMP] = time_s
+    ahead_s = time_s - state[DUE]
+    if not state[SHARED]:
+        state[DUE] += tracking * ahead_s
+    elif ahead_s > 0.0:
+        state[DUE] += _NOT_BEFORE_STAMP * ahead_s
+    else:
+        # The samples that share a stamp were taken within its grain.
+        state[DUE] += tracking * min(ahead_s + state[GRAIN], 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_stamps(
+    times_s: Values, period_s: float, tracking: float, back_s: float, leap_s: float, states: Values
+) -> Places:
     """Sample counts from time stamps, modulo 2^32; see `drivers.serial_lines.DeviceTime`.
 
     Args:
         times_s: float64 ``[n]``.
         period_s: nominal time between samples.
         tracking: share of a stamp's deviation by which the sampling instants are corrected.
-        state: count, last stamp (NaN before the first) and instant of the last sample; changed.
+        back_s: how far behind the newest one the stamp of a line may be that was overtaken.
+        leap_s: how far ahead of it a stamp may be, for others to be believed to go on from there.
+        states: float64 ``[2, KNOWN]``, what is known; and what was known before the newest stamp if that is
+            far from the one before, and may be damaged. Their stamp is NaN if there is none. Changed.
 
     Returns:
         int64 ``[n]``.
     """
     counts = np.empty(len(times_s), np.int64)
-    count, last_s, phase_s = state[0], state[1], state[2]
+    now, before = states[0], states[1]
     for k in range(len(times_s)):
         time_s = times_s[k]
-        if time_s >= last_s:
-            steps = np.rint((time_s - phase_s) / period_s)
-            count = (count + max(steps, 0.0) % _COUNTS) % _COUNTS
-            phase_s += steps * period_s
-            phase_s += tracking * (time_s - phase_s)
+        if not now[STAMP] - back_s <= time_s <= now[STAMP] + leap_s:
+            if before[STAMP] - back_s <= time_s <= before[STAMP] + leap_s:
+                now[:] = before
+                before[STAMP] = np.nan
+            elif np.isnan(before[STAMP]):
+                before[:] = now
         else:
-            count, phase_s = 0.0, time_s
-        last_s = time_s
-        counts[k] = np.int64(count)
-    state[0], state[1], state[2] = count, last_s, phase_s
+            before[STAMP] = np.nan
+        if time_s >= now[STAMP]:
+            _next_stamp(now, time_s, period_s, tracking)
+            counts[k] = np.int64(now[COUNT])
+        elif time_s >= now[STAMP] - back_s:
+            earlier = max(np.rint((now[DUE] - time_s) / period_s), 1.0)
+            counts[k] = np.int64((now[COUNT] - earlier) % _COUNTS)
+        else:
+            now[:] = np.array([0.0, time_s, time_s, np.inf, 0.0])
+            counts[k] = 0
     return counts

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from daqsvc.acquisition.clock import NS_PER_S
 from drivers.frames import Decoded, LayoutError
 from drivers.serial_framing import DelimitedFraming, Frames
-from drivers.serial_line_kernels import HARD, OTHER, READ, check_lines, count_stamps, read_lines
+from drivers.serial_line_kernels import HARD, KNOWN, OTHER, READ, check_lines, count_stamps, read_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -47,6 +48,9 @@ _SUMS: Mapping[Checksum, Callable[[bytes], int]] = {
 }
 _TRACKING = 0.05
 """Share of a stamp's deviation by which the device's sampling instants are corrected."""
+REORDER_WINDOW_NS = 10_000_000
+LEAP_S, LEAP_PERIODS = 1.0, 16
+"""A stamp farther ahead than either may be damaged: the next one shows."""
 
 
 class Lines(NamedTuple):
@@ -191,20 +195,28 @@ class DeviceTime:
 
     Each stamp is compared with the one expected after the stamp before it, so that a device whose rate is
     not quite the nominal one gains or loses no sample over the hours. Stamps may be rounded to a quarter
-    of a sampling period; where several samples share a stamp, have the device count. Time that goes back
-    means that the device was restarted: the count begins at 0 again.
+    of a sampling period for every gap to be told exactly. Coarser ones, which several lines share, tell of
+    gaps that are longer than their grain; a line is a sample all the same, so without a counter a repeated
+    line cannot be told.
+
+    A line that was overtaken goes back to its place within the reorder window. Time that goes back farther
+    means that the device was restarted: the count begins at 0 again. One damaged stamp moves no other.
 
     Args:
         rate_hz: nominal samples per second.
+        reorder_window_ns: how long a line may be overtaken on its way.
     """
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, reorder_window_ns: int = REORDER_WINDOW_NS) -> None:
         self._period_s = 1.0 / rate_hz
-        self._state = np.array([0.0, math.nan, 0.0])
+        # As wide as where the counters of frames are followed: what comes too late is known as late.
+        self._back_s = (4 * reorder_window_ns) / NS_PER_S + 2.0 * self._period_s
+        self._leap_s = max(LEAP_S, LEAP_PERIODS * self._period_s)
+        self._states = np.full((2, KNOWN), math.nan)
 
     def count(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
         """The count of each sample, modulo ``2**TIME_COUNTER_BITS``; both ``[n]``."""
-        return count_stamps(times_s, self._period_s, _TRACKING, self._state)
+        return count_stamps(times_s, self._period_s, _TRACKING, self._back_s, self._leap_s, self._states)
 
 
 class LineFraming(DelimitedFraming):
@@ -217,6 +229,7 @@ class LineFraming(DelimitedFraming):
             ``$`` or ``!`` (if there is one) and the ``*``: all characters combined by XOR, as in NMEA 0183,
             or their CRC-16/IBM-3740.
         delimiter: the byte at the end of each line; a carriage return before it is no part of the line.
+        reorder_windows_ns: how long a line may be overtaken on its way, by stream.
 
     Raises:
         LayoutError: the streams cannot be told apart.
@@ -228,6 +241,7 @@ class LineFraming(DelimitedFraming):
         rates_hz: Mapping[str, float],
         checksum: Checksum = "none",
         delimiter: bytes = NEWLINE,
+        reorder_windows_ns: Mapping[str, int] | None = None,
     ) -> None:
         self._layouts = dict(layouts)
         self._rates_hz = dict(rates_hz)
@@ -245,7 +259,9 @@ class LineFraming(DelimitedFraming):
             )
         self._separator = next(iter(self._separators))
         self._times = {
-            name: DeviceTime(rates_hz[name]) for name, layout in layouts.items() if layout.time is not None
+            name: DeviceTime(rates_hz[name], (reorder_windows_ns or {}).get(name, REORDER_WINDOW_NS))
+            for name, layout in layouts.items()
+            if layout.time is not None
         }
         self._end = RETURN + NEWLINE if delimiter == NEWLINE else delimiter
         # Without a checksum nothing shows whether the beginning of a line is missing, e.g. a digit.

@@ -217,7 +217,8 @@ def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -
         lines: dict[str, LineLayout] = {s.name: s.layout for s in streams}
         rates_hz = {s.name: s.rate_hz for s in streams}
         delimiter = options.get("delimiter", "\n").encode("ascii")
-        return LineFraming(lines, rates_hz, options.get("checksum", "none"), delimiter)
+        windows_ns = {s.name: s.reorder_window_ns for s in streams}
+        return LineFraming(lines, rates_hz, options.get("checksum", "none"), delimiter, windows_ns)
     layouts: dict[str, FrameLayout] = {s.name: s.layout for s in streams}
     codec = BodyCodec(
         layouts,

@@ -22,6 +22,7 @@ from drivers import serial_reader
 from drivers.base import BusPort, StreamSpec
 from drivers.serial_lines import LineLayout
 from drivers.serial_port import SerialDriver, framing_of
+from drivers.serial_reader import Batch
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
@@ -265,3 +266,26 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
     assert told[0] != "quiet"
     assert "quiet" in told[1:]
     assert sum(len(block.samples) for block in blocks) == 2
+
+
+def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: Path) -> None:
+    stamped = LineLayout(("t", "x"), ("x",), np.ones(1), np.zeros(1), time="t", time_unit="ms")
+    specs = [StreamSpec("x", stamped, 100.0)]
+    options = {"port": str(tmp_path), "framing": "lines"}
+    blocks: list[SampleBlock] = []
+    driver = SerialDriver(BusPort("ser0", options, specs, DrivenClock(), blocks.append))
+    lines = [b"%d,%d\n" % (10 * k, k) for k in range(800)]
+    lines[300], lines[310], lines[320] = b"3000,1e999\n", b"3100,1e39\n", b"3200,-1e400\n"
+    lines[500], lines[501] = lines[501], lines[500]
+    framing = framing_of(options, specs)
+    for k, line in enumerate(lines):
+        found = framing.cut(line)
+        driver.take(Batch(len(line), found, {"x": np.full(len(found.frames), 10_000_000 * k)}))
+    driver._assemblers["x"].flush()
+    values = np.concatenate([block.samples[:, 0] for block in blocks])
+    expected = np.arange(1, 800, dtype=np.float32)
+    expected[[299, 309, 319]] = np.nan
+    np.testing.assert_array_equal(values, expected)
+    counters, time_base = driver.streams["x"]
+    assert (counters.samples_received, counters.samples_lost, counters.values_absent) == (799, 0, 3)
+    assert (counters.frames_reordered, counters.frames_rejected, time_base.restarts) == (1, 0, 0)

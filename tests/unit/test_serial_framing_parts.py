@@ -211,16 +211,41 @@ def test_a_device_whose_rate_is_off_gains_and_loses_no_sample(rate_error):
     assert (counts == kept).all()
 
 
-def test_a_stamp_that_comes_twice_is_a_repeat_and_time_that_goes_back_a_restart():
-    assert DeviceTime(100.0).count(np.array([5.00, 5.01, 5.01, 5.02, 0.0, 0.01])).tolist() == [
-        0,
-        1,
-        1,
-        2,
-        0,
-        1,
-    ]
+def test_time_that_goes_back_is_a_restart():
+    assert DeviceTime(100.0).count(np.array([5.00, 5.01, 5.02, 0.0, 0.01])).tolist() == [0, 1, 2, 0, 1]
     assert DeviceTime(1e7).count(np.array([0.0, LATEST_S])).tolist() == [0, int(LATEST_S * 1e7) % 2**32]
+
+
+@pytest.mark.parametrize("rate_error", [-0.01, 0.0, 0.01])
+@pytest.mark.parametrize("grain_s", [0.016777, 0.033554, 0.1])
+def test_lines_that_share_a_stamp_are_samples_each(grain_s, rate_error):
+    taken_s = np.arange(20_000) * 0.01 * (1 + rate_error)
+    stamps = np.floor(taken_s / grain_s) * grain_s
+    assert (DeviceTime(100.0).count(stamps) == np.arange(20_000)).all()
+    there = np.delete(np.arange(20_000), np.arange(7000, 7050))
+    counts = DeviceTime(100.0).count(stamps[there])
+    assert (np.diff(counts) >= 1).all()
+    # What is missing is told to within the grain.
+    assert abs(counts[-1] - 19_999) <= 1 + grain_s / 0.01
+    assert counts[8000] - counts[6000] > 2040 - grain_s / 0.01
+
+
+def test_overtaken_lines_go_back_to_their_places():
+    stamps = np.arange(100) * 0.01
+    order = np.arange(100)
+    order[[20, 21]] = 21, 20
+    order[[40, 41, 42, 43]] = 43, 41, 40, 42
+    assert (DeviceTime(100.0, reorder_window_ns=20_000_000).count(stamps[order]) == order).all()
+
+
+@pytest.mark.parametrize("damaged_s", [0.05, 50.0, 5000.0])
+def test_one_damaged_stamp_moves_no_other(damaged_s):
+    stamps = 10.0 + np.arange(100) * 0.01
+    stamps[50] = damaged_s
+    counts = DeviceTime(100.0).count(stamps)
+    others = np.delete(np.arange(100), 50)
+    assert (counts[others] == others).all()
+    assert abs(counts[50] - 50) > 40
 
 
 def test_a_corrupt_stamp_moves_no_other():
