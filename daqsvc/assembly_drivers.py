@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.settings.bus_checks import DRIVERS
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import Channel, DbcChannel, MachineFile
     from drivers.base import Driver
 
-DRIVERS = "daqsvc.drivers"
 _NS_PER_MS = 1_000_000
 _POLL_MS = 100.0
 _LOOKS_PER_FILL = 4
@@ -229,7 +229,7 @@ def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock],
     """One driver per bus, found by its entry point.
 
     Raises:
-        AssemblyError: a driver is not installed, cannot be loaded, or cannot use an option.
+        AssemblyError: a driver cannot be loaded, or cannot use an option.
         LayoutError: see `frame_layout`.
     """
     return [bus_driver(machine, name, clock, deliver) for name in machine.buses]
@@ -255,13 +255,6 @@ def bus_driver(
         AssemblyError, LayoutError: see `drivers`.
     """
     bus = machine.buses[name]
-    installed = {point.name: point for point in entry_points(group=DRIVERS)}
-    if bus.driver not in installed:
-        raise AssemblyError(
-            f"{machine.path}: buses.{name}.driver = {bus.driver!r}: no such driver is installed; "
-            f"there are {', '.join(sorted(installed)) or 'none'}. "
-            "Install the package that brings it, or correct the name"
-        )
     options: dict[str, Any] = dict(bus.options) if isinstance(bus, OtherBus) else bus.model_dump()
     if isinstance(bus, ReplayBus):
         options["file"] = machine.resolve(bus.file)
@@ -278,7 +271,8 @@ def bus_driver(
         if stream.bus == name
     ]
     port = BusPort(name, {**options, **(changed or {})}, streams, clock, deliver, bus.start)
-    return _driver(installed[bus.driver], port, f"{machine.path}: buses.{name}")
+    point = next(iter(entry_points(group=DRIVERS, name=bus.driver)))  # settings/bus_checks.py
+    return _driver(point, port, f"{machine.path}: buses.{name}")
 
 
 def _driver(point: EntryPoint, port: BusPort, bus: str) -> Driver:

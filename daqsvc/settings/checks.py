@@ -14,6 +14,7 @@ from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.broker_url import is_tls
+from daqsvc.settings.bus_checks import check_drivers, check_interfaces
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
     check_bus_load,
@@ -23,7 +24,6 @@ from daqsvc.settings.layout_checks import (
     check_dbc_unit,
     check_frame_length,
     check_ids,
-    check_interfaces,
     check_plain_layout,
     check_sensor_channel,
     check_stream_bus,
@@ -85,6 +85,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_ids(draft, messages)
     yield check_bus_load(draft, messages)
     yield _unused_buses(draft)
+    yield check_drivers(draft)
     yield check_interfaces(draft)
     yield check_serial_ports(draft)
     yield check_replay_buses(draft)

@@ -33,7 +33,7 @@ def describe(machine: MachineFile) -> str:
     blocks = [
         _facts(_identity(machine)),
         ["Buses", *_table([], [(name, _bus(machine, name)) for name in machine.buses])],
-        ["Streams", *_table(_STREAM_HEADER, [_stream(machine, *item) for item in machine.streams.items()])],
+        ["Streams", *_streams(machine)],
         ["Sensors", *_table(_SENSOR_HEADER, [_sensor(sensor) for sensor in machine.sensors])],
         ["Detectors", *_table([], list(_detectors(machine)))],
         ["Alarms", *_table(_ALARM_HEADER, list(_alarms(machine)))],
@@ -105,6 +105,13 @@ def _bus(machine: MachineFile, name: str) -> str:
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
+
+
+def _streams(machine: MachineFile) -> list[str]:
+    rows = [_stream(machine, *item) for item in machine.streams.items()]
+    # Only of a CAN bus with a bit rate is it known what a stream takes.
+    shown = slice(None) if any(row[-1] for row in rows) else slice(-1)
+    return _table(_STREAM_HEADER[shown], [row[shown] for row in rows])
 
 
 def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:

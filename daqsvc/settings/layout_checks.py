@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 SHORTEST_WRAP_S = 0.040
 """A counter that wraps sooner cannot tell a long gap from a short one."""
 
+LEAST_COUNTER_BITS = 4
+"""A narrower counter wraps within a few frames."""
+
 PRIORITY = 0x1C00_0000
 """Bits of a J1939 id that say how urgent it is, and nothing else (SAE J1939-21, 5.2)."""
 
@@ -197,27 +200,6 @@ def check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterato
         yield Finding((*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses))
 
 
-def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
-    """python-can, or a plugin of it, knows the interfaces of the CAN buses."""
-    # Imported here: it is slow, and nothing else in the settings needs it.
-    from can.interfaces import BACKENDS  # noqa: PLC0415
-
-    for name, bus in draft.buses.items():
-        with suppress(UnusableValueError):
-            if isinstance(bus, CanBus) and bus.interface not in BACKENDS:
-                yield Finding(
-                    ("buses", name, "interface"),
-                    "python-can knows no such interface",
-                    f"{choice(bus.interface, BACKENDS)}; or install the python-can plugin that brings it",
-                )
-            elif isinstance(bus, CanBus) and bus.interface == "socketcan" and bus.options:
-                yield Finding(
-                    ("buses", name, "options"),
-                    "mean nothing to SocketCAN",
-                    f"remove {', '.join(bus.options)}; set the interface up by `ip link set {bus.channel}`",
-                )
-
-
 def check_frame_length(
     draft: MachineFile, stream: Stream, message: DbcMessage | None, at: KeyPath
 ) -> Iterator[Finding]:
@@ -257,6 +239,24 @@ def check_counter(stream: Stream, message: DbcMessage | None, at: KeyPath) -> It
     if isinstance(layout, PlainLayout | DbcLayout):
         yield from _check_counted(layout, (*at, "layout"))
     if facts is None or facts.counter_bits is None:
+        return
+    if facts.counter_bits < LEAST_COUNTER_BITS:
+        yield Finding(
+            (*at, "layout", "counter"),
+            f"has {facts.counter_bits} bit{'s' if facts.counter_bits > 1 else ''}: it wraps within a few "
+            f"frames, and tells nothing of what was lost",
+            f"name a counter of {LEAST_COUNTER_BITS} bits or more; if the device sends none, write "
+            "no_counter = true in its place, and loss is estimated from the times of arrival",
+        )
+        return
+    step = facts.samples_per_frame if facts.counts_samples else 1
+    if step >= 2 ** (facts.counter_bits - 2):
+        yield Finding(
+            (*at, "layout", "counter"),
+            f"a counter of {facts.counter_bits} bits cannot tell frames of {step} samples apart: it wraps "
+            "within four of them",
+            'have the device send a wider counter, or count "frames"',
+        )
         return
     per_count = 1 if facts.counts_samples else facts.samples_per_frame
     wrap_s = 2**facts.counter_bits * per_count / stream.rate_hz

@@ -28,6 +28,15 @@ class ReplayBus(Section):
             examples=["run-up.blf"],
         ),
     ]
+    channel: Annotated[
+        str | None,
+        Field(
+            min_length=1,
+            description="which channel of a CAN log that holds several, as the log calls it; the first one "
+            "in it if left out",
+            examples=["can0", "1"],
+        ),
+    ] = None
     at_end: Literal["stop", "loop", "wait"] = Field(
         default="stop",
         description="what to do at its end: stop, play it again, or wait for more",
@@ -48,7 +57,8 @@ class ReplayBus(Section):
     def summary(self) -> str:
         """What a person is told of it."""
         end = {"stop": "once", "loop": "again and again", "wait": "as it is written"}[self.at_end]
-        return f"replay of {self.file}, {end}{', unpaced' if self.pace == 'unpaced' else ''}"
+        channel = "" if self.channel is None else f", channel {self.channel}"
+        return f"replay of {self.file}{channel}, {end}{', unpaced' if self.pace == 'unpaced' else ''}"
 
 
 class TableColumn(Section):

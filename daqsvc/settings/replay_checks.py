@@ -18,16 +18,37 @@ if TYPE_CHECKING:
     from daqsvc.settings.problems import KeyPath
 
 
+_DATA_BASES = frozenset({".db", ".sqlite", ".sqlite3"})
+
+
 def check_replay_buses(draft: MachineFile) -> Iterator[Finding]:
-    """Only a candump log can be read while it is being written."""
+    """The file can be played, while it is being written too, and has the channel that is asked for."""
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
-            if isinstance(bus, ReplayBus) and bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
+            if not isinstance(bus, ReplayBus):
+                continue
+            yield from _check_format(bus, ("buses", name))
+            if bus.at_end == "wait" and bus.file.suffix.lower() != ".log":
                 yield Finding(
                     ("buses", name, "at_end"),
                     f"{bus.file.name} cannot be read while it is written: only a candump log (.log) can",
                     'write at_end = "stop" or "loop", or have a candump log written',
                 )
+
+
+def _check_format(bus: ReplayBus, at: KeyPath) -> Iterator[Finding]:
+    if bus.file.suffix.lower() in _DATA_BASES:
+        yield Finding(
+            (*at, "file"),
+            "is a data base, which cannot be played",
+            f"make a BLF of it: can_logconvert {bus.file.name} {bus.file.stem}.blf",
+        )
+    if bus.is_table and bus.channel is not None:
+        yield Finding(
+            (*at, "channel"),
+            f"means nothing to a table of samples, which {bus.file.name} is",
+            "remove it; the columns are named in the layouts of the streams",
+        )
 
 
 def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:

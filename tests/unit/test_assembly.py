@@ -14,7 +14,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.diagnosis.levels import LevelDetector
 from daqsvc.diagnosis.trends import TrendDetector
-from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings import load_machine_file
 from drivers.frames import FrameLayout
 
 FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"))
@@ -56,16 +56,6 @@ def test_a_probe_reads_micrometres_from_its_gap_voltage() -> None:
     counts = np.full((1, layout.samples_per_frame, 3), -9.5 / volts_per_count)
     got = layout.decode(raw.encode(np.array([0]), counts)).samples
     assert got[0, 0] == pytest.approx([500 / 7.87, 500 / 7.87, -9.5], rel=1e-6)
-
-
-def test_a_driver_that_is_not_installed_is_named() -> None:
-    file = next(file for file in FILES if file.stem == "motor-accelerometer")
-    text = file.read_text()
-    start = text.index("[buses.")
-    end = text.index("\n[", start + 1)
-    machine = parse_machine_file(text[:start] + '[buses.can0]\ndriver = "profibus"\n' + text[end:], file)
-    with pytest.raises(assembly.AssemblyError, match=r"'profibus': no such driver.*there are can"):
-        assembly_drivers.drivers(machine, SystemClock(), lambda _: None)
 
 
 def test_a_verb_that_cannot_be_loaded_is_left_out(

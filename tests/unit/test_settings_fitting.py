@@ -279,7 +279,7 @@ WARNINGS = [
     ),
     (
         LAVAL,
-        [("[streams.shaft]", '[buses.spare]\ndriver = "profibus"\n[streams.shaft]')],
+        [("[streams.shaft]", '[buses.spare]\ndriver = "replay"\nfile = "a.log"\n[streams.shaft]')],
         "buses.spare",
         "no stream",
     ),

@@ -51,11 +51,20 @@ def test_a_can_log_takes_frames() -> None:
     assert machine.resolve(machine.buses["tape"].file) == Path("/m/gap.blf")
 
 
+def test_one_channel_of_a_can_log_is_described() -> None:
+    text = TEXT.replace('"gap.npz"', '"gap.blf"\nchannel = "2"').replace(COLUMNS, FRAMES)
+    assert "replay of gap.blf, channel 2, again" in describe(
+        parse_machine_file(text, Path("/m/replayed.toml"))
+    )
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ('"loop"', '"wait"', 'buses.tape.at_end = "wait": gap.npz cannot be read while it is written'),
         ('"loop"', '"rewind"', "buses.tape.at_end"),
+        ('"loop"', '"loop"\nchannel = "1"', 'buses.tape.channel = "1": means nothing to a table of samples'),
+        ("gap.npz", "gap.db", "gap.db.*is a data base.*can_logconvert gap.db gap.blf"),
         (
             "gap.npz",
             "gap.blf",
