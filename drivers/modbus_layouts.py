@@ -206,20 +206,21 @@ class Waveform:
     poll_ns: int = 100_000_000
 
     @property
-    def runs(self) -> tuple[tuple[int, Run], ...]:
-        """The requests that read a block: which page to select, and what to read then."""
+    def pages(self) -> tuple[tuple[Run, ...], ...]:
+        """The requests that read each page of a block; without a window there is one page."""
         left = self.samples * self.record.registers
         window = left if self.page is None else self.page.registers
-        requests = []
-        page = 0
+        pages = []
         while left:
             inside = min(left, window)
-            for start in range(0, inside, MAX_REGISTERS):
-                count = min(MAX_REGISTERS, inside - start)
-                requests.append((page, Run(self.address + start, count)))
+            pages.append(
+                tuple(
+                    Run(self.address + start, min(MAX_REGISTERS, inside - start))
+                    for start in range(0, inside, MAX_REGISTERS)
+                )
+            )
             left -= inside
-            page += 1
-        return tuple(requests)
+        return tuple(pages)
 
 
 ModbusLayout: TypeAlias = Trend | Fifo | Ring | Waveform

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,11 +12,13 @@ from daqsvc.acquisition.assembler import StreamCounters
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
+from drivers.modbus_counted import SampleClock
 from drivers.modbus_layouts import FUNCTIONS
 from drivers.modbus_reading import PollingReader
 from drivers.registers import Run
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Callable, Mapping
 
     from drivers.base import BusPort, StreamSpec
@@ -23,7 +26,12 @@ if TYPE_CHECKING:
     from drivers.modbus_line import ModbusLine
     from drivers.modbus_outcomes import ModbusCounters
 
-ID_MODULUS = 65_536
+logger = logging.getLogger(__name__)
+
+IDS = 65_535
+"""How many ids there are: they run from 1 to this, and again from 1; 0 says that there is no block."""
+
+NO_BLOCK = 0
 
 
 class _Ended(NamedTuple):
@@ -49,17 +57,30 @@ class WaveformReader(PollingReader):
 
     Nothing in a block tells when it was taken. But the last look at the id that found another one was before
     its end, and the first that found its own was after it: it ended midway, give or take half of that time.
+
+    A new id is believed once a second look finds it, too.
+
+    Args:
+        spec: the stream.
+        port: of its bus.
+        counters: of the bus.
+        window: held while a page is selected and read, by all streams of the unit.
     """
 
-    def __init__(self, spec: StreamSpec[Waveform], port: BusPort, counters: ModbusCounters) -> None:
+    def __init__(
+        self, spec: StreamSpec[Waveform], port: BusPort, counters: ModbusCounters, window: asyncio.Lock
+    ) -> None:
         super().__init__([spec.name], port.clock)
         self._name = spec.name
         self._layout = spec.layout
         self._counters = counters
+        self._window = window
         self._stream_counters = StreamCounters()
         self._period_ns = NS_PER_S / spec.rate_hz
+        self._sample_clock = SampleClock(spec.rate_hz)
         self._deliver: Callable[[SampleBlock], None] = port.deliver
         self._last_id: int | None = None
+        self._last_seen_ns = 0
         self._end: tuple[int, int] | None = None
         self._lost_since = 0
         self._restarts = 0
@@ -82,26 +103,39 @@ class WaveformReader(PollingReader):
     async def _look(self, line: ModbusLine) -> None:
         await self._trigger(line)
         block_id = await self._id(line)
-        if block_id in {0, self._last_id}:
+        if block_id == NO_BLOCK:
+            self._note_no_block()
+        if block_id in {NO_BLOCK, self._last_id}:
             await self._clock.sleep_ns(self._layout.poll_ns)
             return
         ended = self._ended
-        rows = b""
-        page_shown: int | None = None
-        for page, run in self._layout.runs:
-            if self._layout.page is not None and page != page_shown:
-                await line.write(self._layout.unit, self._layout.page.select, [page])
-                page_shown = page
-            rows += await line.read(self._layout.unit, FUNCTIONS[self._layout.table], run)
+        rows = await self._read_block(line, block_id)
         self._stream_counters.frames_received += 1
-        if await self._id(line) != block_id:
+        self._lose_until(block_id)
+        if rows is None:
             self._counters.blocks_torn += 1
-            self._lose_until(block_id)
             self._lose(1)
             return
-        self._lose_until(block_id)
         self._triggered_ns = None
         self._hand_on(rows, ended)
+
+    async def _read_block(self, line: ModbusLine, block_id: int) -> bytes | None:
+        """Read all pages of a block; None if another block has taken its place meanwhile."""
+        layout = self._layout
+        rows = b""
+        for page, runs in enumerate(layout.pages):
+            async with self._window:  # else another stream of the unit might turn the page
+                if layout.page is not None:
+                    await line.write(layout.unit, layout.page.select, [page])
+                for run in runs:
+                    rows += await line.read(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            if await self._id(line) != block_id:
+                return None
+        return rows
+
+    @property
+    def _what(self) -> str:
+        return f"stream {self._name!r}"
 
     async def _pause_after_failure(self) -> None:
         await self._clock.sleep_ns(self._layout.poll_ns)
@@ -118,27 +152,53 @@ class WaveformReader(PollingReader):
 
     async def _id(self, line: ModbusLine) -> int:
         """The id of the block that the device shows, and with a new one when that block ended."""
-        asked_ns = self._clock.monotonic_ns()
-        run = Run(self._layout.block_id, 1)
-        raw = await line.read(self._layout.unit, FUNCTIONS[self._layout.table], run)
-        block_id = int.from_bytes(raw, "big")
-        if block_id != self._shown:
-            self._ended = _Ended.between(self._asked_ns, self._clock.monotonic_ns())
-        self._shown, self._asked_ns = block_id, asked_ns
+        layout = self._layout
+        run = Run(layout.block_id, 1)
+        while True:
+            first = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            block_id = int.from_bytes(first.registers, "big")
+            if block_id == self._shown:
+                self._asked_ns = first.asked_ns
+                break
+            again = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            if again.registers == first.registers:
+                self._ended = _Ended.between(self._asked_ns, first.answered_ns)
+                self._shown, self._asked_ns = block_id, again.asked_ns
+                break
+            self._counters.counts_doubted += 1
+            await self._clock.sleep_ns(layout.poll_ns)
+        if block_id == self._last_id:
+            self._last_seen_ns = self._asked_ns
         return block_id
+
+    def _note_no_block(self) -> None:
+        """Before the first block of a device there is none; so it has restarted if there was one."""
+        if self._last_id not in {None, NO_BLOCK}:
+            self._tell_restart()
+        self._last_id, self._last_seen_ns = NO_BLOCK, self._asked_ns or 0
 
     def _lose_until(self, block_id: int) -> None:
         """Count the blocks between the last one and this one, which nobody can read any more."""
         last, self._last_id = self._last_id, block_id
+        since_ns, self._last_seen_ns = self._last_seen_ns, self._asked_ns or 0
         if last is None:
             return
-        # Ids run from 1 to 65535: 0 says that there is no block.
-        missed = (block_id - last) % (ID_MODULUS - 1) - 1
-        if missed > ID_MODULUS // 2:
-            self._restarts += 1
-            return
+        missed = (block_id - last - 1) % IDS
+        elapsed_ns = self._clock.monotonic_ns() - since_ns
+        most = (self._sample_clock.most(elapsed_ns) + self._sample_clock.at_once) / self._layout.samples
+        if missed > most:
+            self._tell_restart()
+            missed = block_id - 1 if block_id - 1 <= most else 0
         self._counters.blocks_missed += missed
         self._lose(missed)
+
+    def _tell_restart(self) -> None:
+        logger.warning(
+            "stream %r: the device has begun to count its blocks again; blocks that it took just before are "
+            "not counted as lost",
+            self._name,
+        )
+        self._restarts += 1
 
     def _lose(self, blocks: int) -> None:
         self._lost_since += blocks * self._layout.samples

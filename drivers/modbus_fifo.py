@@ -1,0 +1,192 @@
+"""Samples from a queue that is read by function 24, each once, or counted as lost."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from drivers.modbus_counted import CountedReader
+from drivers.modbus_layouts import Fifo
+
+if TYPE_CHECKING:
+    from drivers.base import BusPort, StreamSpec
+    from drivers.modbus_line import ModbusLine
+
+REPLIES_LOST_AT_ONCE = 8
+"""Replies that may get lost without time to speak of, each with the samples that it took out of the queue."""
+
+
+class _Reply(NamedTuple):
+    """What came out of the queue.
+
+    Attributes:
+        first: count of the first sample.
+        rows: registers, sample by sample.
+        taken: samples.
+        asked_ns: when it was asked for, host monotonic.
+        seen_ns: when it was there.
+    """
+
+    first: int
+    rows: bytes
+    taken: int
+    asked_ns: int
+    seen_ns: int
+
+
+class _Emptied(NamedTuple):
+    """How far the device had counted when its queue was found empty, and when that was."""
+
+    at_index: int
+    seen_ns: int
+
+
+class FifoReader(CountedReader[Fifo]):
+    """Empties a queue, and acknowledges what it has taken if the device waits for that.
+
+    The count at the head of a reply tells what is missing before it, and what has come before. A count that
+    does not go on from the last reply is believed when the next reply goes on from it; until then nothing is
+    acknowledged, and the samples are held back.
+    """
+
+    def __init__(self, spec: StreamSpec[Fifo], port: BusPort) -> None:
+        super().__init__(spec, port)
+        self._unacknowledged = 0
+        self._held: _Reply | None = None
+        self._last: _Reply | None = None
+        self._emptied: _Emptied | None = None
+
+    def flush(self) -> None:
+        """Hand over what is held back, unless its count is beyond belief."""
+        held, self._held = self._held, None
+        if held is None:
+            return
+        if self._gap(held) is None:
+            self._rows.counters.frames_rejected += held.taken
+        else:
+            self._go_on_at(held)
+
+    async def _look(self, line: ModbusLine) -> None:
+        reply = await self._read(line)
+        if reply is not None and self._take(reply) and self._layout.acknowledge is not None:
+            await self._acknowledge(line)
+        if reply is None or reply.taken < self._layout.samples_per_read:
+            await self._clock.sleep_ns(self._layout.poll_ns)
+
+    async def _read(self, line: ModbusLine) -> _Reply | None:
+        """What the queue hands out; None if that is nothing, or no whole samples."""
+        layout = self._layout
+        asked_ns = self._clock.monotonic_ns()
+        raw = await line.read_fifo(layout.unit, layout.address, f"stream {self._name!r}")
+        head = 2 * layout.count.run.count
+        taken, left_over = divmod(max(len(raw) - head, 0), 2 * layout.record.registers)
+        if left_over or 0 < len(raw) < head:
+            self._rows.counters.frames_wrong_length += 1
+            return None
+        if not taken:
+            return None
+        return _Reply(layout.count.decode(raw), raw[head:], taken, asked_ns, self._clock.monotonic_ns())
+
+    async def _acknowledge(self, line: ModbusLine) -> None:
+        """Tell the device how far its queue has been taken."""
+        assert self._layout.acknowledge is not None  # noqa: S101 - only then is there anything to tell
+        assert self._next is not None  # noqa: S101 - something has been taken
+        told = self._layout.count.encode(self._next)
+        words = [int.from_bytes(told[k : k + 2], "big") for k in range(0, len(told), 2)]
+        await line.write(self._layout.unit, self._layout.acknowledge, words)
+        self._unacknowledged = 0
+
+    def _take(self, reply: _Reply) -> bool:
+        """Hand on what is new in a reply; returns whether its count is believed."""
+        held, self._held = self._held, None
+        if held is not None:
+            self._settle(held, reply)
+        if self._next is None:
+            self._next = self._index = reply.first
+        if not self._continues(reply):
+            self._held = reply
+            self._rows.counters.frames_received += reply.taken
+            return False
+        repeated = self._repeated(reply)
+        self._rows.counters.frames_received += reply.taken - repeated
+        if held is None:  # else it was asked again what comes again
+            self._rows.counters.frames_duplicate += repeated
+        self._hand_on_new(reply)
+        return True
+
+    def _continues(self, reply: _Reply) -> bool:
+        """Whether a reply has the next sample, or begins with some that the device has handed out before."""
+        return (self._following - reply.first) % self._modulus <= self._unacknowledged
+
+    def _repeated(self, reply: _Reply) -> int:
+        """How many samples at the head of a reply have been taken before."""
+        return min((self._following - reply.first) % self._modulus, reply.taken)
+
+    @property
+    def _following(self) -> int:
+        assert self._next is not None  # noqa: S101 - `_take` has set it
+        return self._next
+
+    def _settle(self, held: _Reply, reply: _Reply) -> None:
+        """Decide on a reply whose count did not go on from the one before, now that the next one is there."""
+        drops = self._layout.acknowledge is None
+        if self._continues(reply):
+            self._rows.counters.frames_rejected += held.taken  # it was there before, or is there again
+        elif drops and (reply.first - self._following) % self._modulus == held.taken:
+            self._hand_on_new(held._replace(first=self._following))  # only its count was damaged
+        elif self._follows(held, reply):
+            self._go_on_at(held)
+        else:
+            self._rows.counters.frames_rejected += held.taken
+
+    def _follows(self, held: _Reply, reply: _Reply) -> bool:
+        """Whether a reply goes on from another one, but for what the device may have dropped in between."""
+        least = held.taken if self._layout.acknowledge is None else 0
+        since_ns = reply.seen_ns - held.asked_ns
+        dropped = (reply.first - held.first - least) % self._modulus
+        return dropped <= self._sample_clock.most(since_ns) + self._sample_clock.at_once
+
+    def _go_on_at(self, held: _Reply) -> None:
+        gap = self._gap(held)
+        if gap is None:
+            last = self._last or held
+            elapsed_ns = held.seen_ns - last.seen_ns
+            self._begin_again(self._index + self._sample_clock.samples(elapsed_ns) - held.taken)
+        else:
+            self._index += gap
+        self._next = held.first
+        self._unacknowledged = 0
+        self._hand_on_new(held)
+
+    def _gap(self, reply: _Reply) -> int | None:
+        """Samples that are missing before a reply; None if the clock cannot explain so many.
+
+        The head of a queue moves on as samples are taken out, or as the queue is full and new ones come.
+        """
+        last = self._last or reply
+        since_ns = reply.seen_ns - last.asked_ns
+        popped = REPLIES_LOST_AT_ONCE * self._layout.samples_per_read
+        most = self._sample_clock.most(since_ns) + self._sample_clock.at_once + popped
+        ahead = (reply.first - self._following) % self._modulus
+        return ahead + int((most - ahead) // self._modulus) * self._modulus if ahead <= most else None
+
+    def _hand_on_new(self, reply: _Reply) -> None:
+        repeated = self._repeated(reply)
+        if repeated < reply.taken:
+            new = reply.taken - repeated
+            self._check_standstill(reply, new)
+            self._hand_on(reply.rows[repeated * 2 * self._layout.record.registers :], reply.seen_ns)
+            self._unacknowledged += new if self._layout.acknowledge is not None else 0
+        self._last = reply
+
+    def _check_standstill(self, reply: _Reply, new: int) -> None:
+        """See whether the device has counted as long as the clock has run; an emptied queue shows that."""
+        if reply.taken == self._layout.samples_per_read:
+            return
+        index = self._index + new
+        if self._emptied is not None:
+            elapsed_ns = reply.asked_ns - self._emptied.seen_ns
+            counted = index - self._emptied.at_index
+            if counted < self._sample_clock.least(elapsed_ns) - self._sample_clock.standstill:
+                index = self._emptied.at_index + self._sample_clock.samples(elapsed_ns)
+                self._begin_again(index - new)
+        self._emptied = _Emptied(self._index + new, reply.seen_ns)
