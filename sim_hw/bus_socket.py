@@ -60,6 +60,7 @@ class UnixBus(can.BusABC):
         can_filters: as python-can has them; applied here, after a frame has arrived.
         fd: whether this end sends and receives CAN FD frames; like a classic controller one without
             is not shown them.
+        receive: whether it wants frames at all; for an end that only sends, none wait in the hub.
         receive_own_messages: whether its own frames come back to it.
         hub: ``"start"`` starts the bus if there is none, ``"join"`` fails then.
         bitrate: without effect: the bus has none.
@@ -77,6 +78,7 @@ class UnixBus(can.BusABC):
         can_filters: can.typechecking.CanFilters | None = None,
         *,
         fd: bool = False,
+        receive: bool = True,
         receive_own_messages: bool = False,
         hub: Literal["start", "join"] = "start",
         bitrate: int | None = None,  # noqa: ARG002 - machine files for hardware name it
@@ -88,7 +90,7 @@ class UnixBus(can.BusABC):
         if unknown:
             raise can.CanInitializationError(
                 f"a unixbus has no option {', '.join(map(repr, unknown))}; there are fd, hub, "
-                "receive_own_messages and queue_frames"
+                "queue_frames, receive and receive_own_messages"
             )
         if hub not in {"start", "join"}:
             raise can.CanInitializationError(f'hub = {hub!r} of a unixbus must be "start" or "join"')
@@ -99,6 +101,7 @@ class UnixBus(can.BusABC):
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._fd = fd
         wish = Wish.ECHO if receive_own_messages else Wish.NOTHING
+        wish |= Wish.NOTHING if receive else Wish.DEAF
         self._socket = _join(self.channel, wish, queue_frames if hub == "start" else None)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)

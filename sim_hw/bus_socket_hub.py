@@ -64,10 +64,16 @@ class _Client:
     def __init__(self, connection: socket.socket, limit: int) -> None:
         self.connection = connection
         self.joined = False
-        self.echo = False
+        self.wish = Wish.NOTHING
         self.backlog: deque[bytes] = deque()
         self._limit = limit
         self._untold = 0
+
+    def hears(self, sender: _Client) -> bool:
+        """Whether a frame of that sender is for this end."""
+        if not self.joined or Wish.DEAF in self.wish:
+            return False
+        return sender is not self or Wish.ECHO in self.wish
 
     def offer(self, packet: bytes) -> bool:
         """Send a packet, or queue it; False if it was lost because the queue is full.
@@ -222,6 +228,19 @@ class Hub:
             self._take(client, packet)
         return True
 
+    def _drain(self, client: _Client) -> None:
+        """Take what a client had sent before its sending was shut off."""
+        while True:
+            try:
+                packet = client.connection.recv(LONGEST + 1)
+            except ConnectionResetError:
+                continue  # as in `_receive`
+            except OSError:
+                return
+            if not packet:
+                return
+            self._take(client, packet)
+
     def _take(self, client: _Client, packet: bytes) -> None:
         if not client.joined:
             wish = unpack_greeting(packet)
@@ -229,11 +248,11 @@ class Hub:
                 self.counters.malformed += 1
                 self._leave(client)
                 return
-            client.joined, client.echo = True, bool(wish & Wish.ECHO)
+            client.joined, client.wish = True, wish
             client.offer(pack_greeting(wish))
         elif is_frame(packet):
             for other in list(self._clients.values()):
-                if other.joined and (other is not client or client.echo):
+                if other.hears(client):
                     self._deliver(other, packet)
             self.counters.frames += 1
         else:
@@ -262,11 +281,13 @@ class Hub:
 
     def _flush(self) -> None:
         """Send what is queued, for as long as clients read it, and a second at most."""
+        # From here on a sender is refused: no frame counts as sent that the bus does not carry.
+        for connection in self._clients:
+            with contextlib.suppress(OSError):  # its client is gone
+                connection.shutdown(socket.SHUT_RD)
+        for client in list(self._clients.values()):
+            self._drain(client)
         until_s = time.monotonic() + FLUSH_S
-        # Frames sent before the end was decided are part of what the bus has carried.
-        sending = list(self._clients.values())
-        while sending and time.monotonic() < until_s:
-            sending = [client for client in sending if self._receive(client)]
         while (late := [c for c in self._clients.values() if c.backlog]) and time.monotonic() < until_s:
             for client in late:
                 try:

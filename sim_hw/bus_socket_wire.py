@@ -41,6 +41,8 @@ class Wish(IntFlag):
     NOTHING = 0
     ECHO = 1
     """To be sent its own frames too."""
+    DEAF = 2
+    """To be sent no frames at all."""
 
 
 def is_frame(packet: bytes) -> bool:
@@ -107,7 +109,7 @@ def unpack_greeting(packet: bytes) -> Wish | None:
     if len(packet) != _GREETING.size:
         return None
     mark, wish = _GREETING.unpack(packet)
-    return Wish(wish & Wish.ECHO) if mark == _GREETED else None
+    return Wish(wish & (Wish.ECHO | Wish.DEAF)) if mark == _GREETED else None
 
 
 def pack_lost(frames: int) -> bytes:

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import json
+import logging
 import signal
 import sys
 import tempfile
@@ -83,6 +84,8 @@ class SimCommand:
         from daqsvc.cli import start_logging  # noqa: PLC0415
 
         start_logging(verbose=False)
+        # What python-can has to say of a bus is raised too; of a lost one it would say so at each attempt.
+        logging.getLogger("can").setLevel(logging.CRITICAL)
         if arguments.what is None:
             from sim_hw.bus_socket import run_hub  # noqa: PLC0415
 

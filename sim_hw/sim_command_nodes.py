@@ -7,11 +7,13 @@ says in ``driver = "..."``: a callable that takes a `NodeOrder` and returns a `S
 from __future__ import annotations
 
 import asyncio
+import socket
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from daqsvc import assembly_drivers
 from sim_hw.nodes.can_node import CanNode
@@ -128,11 +130,16 @@ class CanNodes:
                 "virtual bus between processes with --bus PATH"
             )
 
+        chosen = {key: options[key] for key in ("bitrate", "data_bitrate") if options.get(key)}
+        chosen |= options["options"] or {}
+        # A node reads nothing: what the others send must not pile up for it.
+        chosen |= {"receive": False} if interface == "unixbus" else {}
+
         def bus() -> can.BusABC:
-            chosen = {key: options[key] for key in ("bitrate", "data_bitrate") if options.get(key)}
-            return can.Bus(
-                interface=interface, channel=channel, fd=options["fd"], **chosen, **(options["options"] or {})
-            )
+            opened = can.Bus(interface=interface, channel=channel, fd=options["fd"], **chosen)
+            if isinstance(opened, SocketcanBus):
+                opened.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+            return opened
 
         nodes: dict[str, CanNode] = {}
         opened: list[can.BusABC] = []

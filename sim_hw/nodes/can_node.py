@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import threading
 from typing import TYPE_CHECKING
 
 import can
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from sim_hw.link_faults import LinkFaults
 
 logger = logging.getLogger(__name__)
+
+REOPEN_S = 0.02
+"""Between attempts to open a bus that was lost."""
 
 
 class CanNode(PlannedNode):
@@ -64,6 +68,9 @@ class CanNode(PlannedNode):
         self._bus = bus
         self._layout = layout
         self._reopen = reopen
+        self._opening: asyncio.Task[None] | None = None
+        self._changing = threading.Lock()
+        self._lost = self._closed = False
         plan = NodeFaults.of(faults).plan(
             len(samples),
             rate_hz,
@@ -105,10 +112,17 @@ class CanNode(PlannedNode):
 
     async def _send(self, message: can.Message) -> bool:
         """Put a frame on the bus; False if the bus is lost, and the frame with it."""
-        sent = await self._offer(lambda: self._refusal(message))
-        if not sent and self._reopen is not None:
-            await self._open_again(self._reopen)
-        return sent
+        if self._opening is not None:
+            if not self._opening.done():
+                return False
+            self._opening.result()
+        if await self._offer(lambda: self._refusal(message)):
+            self._lost = False
+            return True
+        if self._reopen is not None:
+            # In the background: the device goes on sampling, and what is due meanwhile is gone.
+            self._opening = asyncio.create_task(self._open_again(self._reopen), name="CAN node's bus")
+        return False
 
     def _refusal(self, message: can.Message) -> str:
         """Why the bus does not take a frame for now; nothing if it does."""
@@ -117,6 +131,7 @@ class CanNode(PlannedNode):
         except can.CanOperationError as error:
             # A full queue (ENOBUFS) empties by itself.
             if self._reopen is not None and error.error_code != errno.ENOBUFS:
+                self._tell_lost(error)
                 raise LinkLostError from error
             return (
                 f"{self._bus.channel_info} has refused frame {message.arbitration_id:#x} for "
@@ -124,15 +139,37 @@ class CanNode(PlannedNode):
             )
         return ""
 
+    def _tell_lost(self, error: can.CanOperationError) -> None:
+        if not self._lost:
+            logger.warning(
+                "%s is lost to the node of frame %#x (%s); what it sends until the bus is back is gone",
+                self._bus.channel_info,
+                self._layout.frame_id,
+                error,
+            )
+        self._lost = True
+
     async def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
+        while not await asyncio.to_thread(self._opened, reopen):  # noqa: ASYNC110 - nothing tells of it
+            await asyncio.sleep(REOPEN_S)
+
+    def _opened(self, reopen: Callable[[], can.BusABC]) -> bool:
+        """Open the bus again; whether there is one. Not from the event loop: that may take long."""
         try:
-            bus = await asyncio.to_thread(reopen)
+            bus = reopen()
         except (can.CanError, OSError) as error:
             logger.debug("the bus cannot be opened again yet: %s", error)
-            return
-        self._bus.shutdown()
-        self._bus = bus
+            return False
+        with self._changing:
+            # Whoever has closed the node meanwhile does not know of this one.
+            old, self._bus = (bus, self._bus) if self._closed else (self._bus, bus)
+        old.shutdown()
+        return True
 
     def close(self) -> None:
         """Shut down the bus that the node has now, which is not the first one if that was lost."""
+        if self._opening is not None:
+            self._opening.cancel()
+        with self._changing:
+            self._closed = True
         self._bus.shutdown()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -200,3 +201,33 @@ def test_a_hub_of_its_own_says_what_it_carried(bus_path: str, number: int) -> No
     }
     assert (hub.returncode, errors) == (0, "")
     assert not os.path.exists(bus_path)  # noqa: PTH110
+
+
+def test_nothing_piles_up_for_an_end_that_only_sends(bus_path: str) -> None:
+    """Without that the hub would queue the frames of one device for the next, and wait for it at its end."""
+    with running(bus_path, queue_frames=10) as hub:
+        with UnixBus(bus_path, receive=False) as one, UnixBus(bus_path, receive=False) as other:
+            for number in range(1000):
+                (one, other)[number % 2].send(frame(number), PATIENCE_S)
+            assert other.recv(0.0) is None
+        eventually(lambda: hub.counters.frames == 1000, "all frames are taken")
+        assert (hub.counters.delivered, hub.counters.lost) == (0, 0)
+
+
+def test_each_frame_that_counts_as_sent_is_carried_even_by_a_bus_that_ends(bus_path: str) -> None:
+    """Senders send as fast as they can while the hub is told to stop."""
+    sent = [0] * 4
+
+    def send(sender: int) -> None:
+        with UnixBus(bus_path, receive=False) as bus, contextlib.suppress(can.CanOperationError):
+            while True:
+                bus.send(frame(sender), PATIENCE_S)
+                sent[sender] += 1
+
+    with ThreadPoolExecutor(len(sent)) as pool, running(bus_path) as hub:
+        done = [pool.submit(send, sender) for sender in range(len(sent))]
+        eventually(lambda: min(sent) > 100, "all are sending")
+        hub.stop()
+        for each in done:
+            each.result()
+    assert hub.counters.frames == sum(sent)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import threading
 
 import can
 import numpy as np
@@ -23,6 +24,7 @@ LAYOUT = FrameLayout.plain(
     first_byte=2,
     crc_byte=62,
 )
+PATIENCE_S = 20.0
 SAMPLES = np.random.default_rng(7).normal(0, 50, (2000, 1))
 
 
@@ -33,12 +35,16 @@ class Wire:
 
     def __init__(self, down=range(0)):
         self.down = down
+        self.may_open = threading.Event()
+        self.may_open.set()
         self.offered = 0
         self.sent = []
-        self.opened = self.closed = 0
+        self.opened = self.closed = self.absences = 0
 
     def open(self):
-        if self.offered in self.down:
+        assert self.may_open.wait(PATIENCE_S)
+        if self.absences:
+            self.absences -= 1
             raise can.CanInitializationError("no such device")
         self.opened += 1
         return self
@@ -58,15 +64,48 @@ class AtOnce:
         await asyncio.sleep(0)
 
 
+class BackAt(AtOnce):
+    """The bus may be opened again when it is time for a frame, and is open before that is sent."""
+
+    def __init__(self, wire, frame):
+        self.wire, self.frame = wire, frame
+
+    async def wait_until(self, t_ns):
+        await asyncio.sleep(0)
+        if t_ns >= round((10 * self.frame + 9) / 640.0 * 1e9) and not self.wire.may_open.is_set():
+            self.wire.may_open.set()
+            async with asyncio.timeout(PATIENCE_S):
+                while self.wire.closed < 1:
+                    await asyncio.sleep(0.001)
+                await asyncio.sleep(0.05)
+
+
 async def test_frames_are_lost_and_counted_while_the_bus_is() -> None:
-    wire = Wire(down=range(50, 80))
+    """However long it takes to open the bus again: nothing of that time is sent later."""
+    wire = Wire(down=[50])
     node = CanNode(wire.open(), LAYOUT, SAMPLES, 640.0, reopen=wire.open)
-    await node.play(AtOnce())
-    assert (node.frames_unsent, node.frames_sent, node.samples_sent) == (30, 170, 2000)
+    wire.may_open.clear()
+    wire.absences = 2
+    await node.play(BackAt(wire, 120))
+    assert (node.frames_unsent, node.frames_sent, node.samples_sent) == (70, 130, 2000)
     counters = LAYOUT.decode(np.array([list(m.data) for m in wire.sent], np.uint8)).counter
-    assert (counters // 10).tolist() == [*range(50), *range(80, 200)]
+    assert (counters // 10).tolist() == [*range(50), *range(120, 200)]
     node.close()
-    assert wire.opened == wire.closed
+    assert wire.opened == wire.closed == 2
+
+
+async def test_a_bus_that_opens_after_its_node_has_left_is_shut_down() -> None:
+    wire = Wire(down=[50])
+    node = CanNode(wire.open(), LAYOUT, SAMPLES, 640.0, reopen=wire.open)
+    wire.may_open.clear()
+    await node.play(AtOnce())
+    assert node.frames_unsent == 150
+    node.close()
+    wire.may_open.set()
+    async with asyncio.timeout(PATIENCE_S):
+        while wire.closed < 2:
+            await asyncio.sleep(0.001)
+    assert wire.opened == 2
 
 
 async def test_a_babbling_node_s_frames_lie_between_the_device_s_own() -> None:
