@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.acquisition.counter import Placement
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-COUNTER_BITS = 32
-"""Width of the counts, as of a device's counter."""
 
 TOLERANCE = 0.75
 """How late a frame may be, as a share of the time between frames, before others are taken to be missing."""
@@ -28,11 +27,16 @@ class ArrivalCount:
     whose rate is off the nominal one by up to 0.5 % gains and loses nothing. Loss is told exactly while no
     frame is later than half the time between frames, and the device's clock drifts by less than a quarter of
     it during a gap. A delay of more than `TOLERANCE` of that time is taken for missing frames, and a repeated
-    frame for a new one.
+    frame for a new one. No frame is ever rejected: one that comes before its time is a frame all the same.
+
+    It takes the place of a `daqsvc.acquisition.counter.CounterUnwrapper`, and knows of no restarts.
 
     Args:
         period_ns: nominal time from one frame to the next.
     """
+
+    watch_ns = 0
+    """See `daqsvc.acquisition.counter.CounterUnwrapper.watch_ns`."""
 
     def __init__(self, period_ns: float) -> None:
         self._period_ns = period_ns
@@ -40,12 +44,35 @@ class ArrivalCount:
         self._due_ns: float | None = None
         """When the next frame is due."""
 
-    def begin_afresh(self) -> None:
-        """Take the next frame as due when it comes."""
-        self._due_ns = None
+    def begin_afresh(self, first: int) -> None:
+        """Take the next frame as due when it comes.
+
+        Args:
+            first: the count of that frame.
+        """
+        self._count, self._due_ns = first, None
+
+    def measured(self, rate_hz: float, drift: float) -> None:
+        """The device's rate has been measured, by these very counts: that tells nothing new."""
+
+    def forget_rate(self) -> None:
+        """Go by the nominal rate, as ever."""
+
+    def wants_more(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:  # noqa: ARG002
+        """Whether frames can be placed only together with those after them: never."""
+        return False
+
+    def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
+        """Count a batch.
+
+        Args:
+            raw: int64 ``[n]``, anything.
+            arrival_ns: int64 ``[n]``, host monotonic, in the order of arrival.
+        """
+        return Placement(self.count(arrival_ns), np.ones(len(raw), np.bool_), [])
 
     def count(self, arrival_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The count of each frame, modulo ``2**COUNTER_BITS``; every frame counts one at least.
+        """The count of each frame; every frame counts one at least.
 
         Args:
             arrival_ns: int64 ``[n]``, host monotonic, in the order of arrival.
@@ -55,7 +82,7 @@ class ArrivalCount:
             if self._due_ns is None:
                 self._due_ns = float(t_ns)
             missing = max(math.floor((t_ns - self._due_ns) / self._period_ns + 1.0 - TOLERANCE), 0)
-            counts.append((self._count + missing) % 2**COUNTER_BITS)
+            counts.append(self._count + missing)
             late_ns = t_ns - self._due_ns - missing * self._period_ns
             share = _FALLING_BEHIND if late_ns > 0 else _CATCHING_UP
             self._due_ns += (missing + 1) * self._period_ns + share * late_ns

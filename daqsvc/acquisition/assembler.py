@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.arrival_count import COUNTER_BITS, ArrivalCount
 from daqsvc.acquisition.books import note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
@@ -95,10 +94,7 @@ class StreamAssembler:
         self._per_frame = samples_per_frame
         self._window = round(rate_hz * reorder_window_ns / NS_PER_S) + samples_per_frame
         self._patience_ns = 4 * reorder_window_ns + round(4 * samples_per_frame / rate_hz * NS_PER_S)
-        self._arrivals = None
-        if counter_bits is None:
-            self._arrivals = ArrivalCount(samples_per_frame / rate_hz * NS_PER_S)
-            counter_bits, counts_per_frame = COUNTER_BITS, 1
+        self._counts_arrivals = counter_bits is None
         self._time = TimeBase(rate_hz, counter_bits, samples_per_frame, counts_per_frame, reorder_window_ns)
         self._next: int | None = None
         self._highest: int | None = None
@@ -147,8 +143,6 @@ class StreamAssembler:
             counter, samples, arrival_ns = counter[intact], samples[intact], arrival_ns[intact]
         if not len(counter):
             return
-        if self._arrivals is not None:
-            counter = self._arrivals.count(arrival_ns)
         self._unplaced.append((counter, samples, arrival_ns))
         self._place(until_sure=True)
 
@@ -172,8 +166,6 @@ class StreamAssembler:
         self.flush()
         if self._next is not None:
             self._time.begin_afresh(self._next)
-            if self._arrivals is not None:
-                self._arrivals.begin_afresh()
 
     def flush(self) -> None:
         """Hand over what is held back: the link is gone, or the service stops."""
@@ -297,7 +289,7 @@ class StreamAssembler:
             quality |= Quality.TIME_UNSETTLED
         if lost:
             quality |= Quality.AFTER_LOSS
-            if self._after_restart or self._arrivals is not None:
+            if self._after_restart or self._counts_arrivals:
                 quality |= Quality.LOSS_ESTIMATED
             note_gap(self.counters, self.stream, lost, first)
             self._gaps.append((self._next, first))

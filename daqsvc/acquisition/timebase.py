@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.clock_line import PARTS, Bucket, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
@@ -83,7 +84,8 @@ class TimeBase:
 
     Args:
         rate_hz: nominal sampling rate.
-        counter_bits: width of the counter, see `daqsvc.acquisition.counter`.
+        counter_bits: width of the counter, see `daqsvc.acquisition.counter`; None if the device sends none: then
+            frames are counted by their times (`daqsvc.acquisition.arrival_count`), one count a frame.
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         reorder_window_ns: how long a frame may be overtaken on its way.
@@ -92,21 +94,27 @@ class TimeBase:
     def __init__(
         self,
         rate_hz: float,
-        counter_bits: int,
+        counter_bits: int | None,
         samples_per_frame: int,
         counts_per_frame: int,
         reorder_window_ns: int = 10_000_000,
     ) -> None:
         self._nominal_ns = NS_PER_S / rate_hz
+        if counter_bits is None:
+            counts_per_frame = 1
         self._samples_per_count = samples_per_frame // counts_per_frame
         count_rate_hz = rate_hz / self._samples_per_count
-        self._unwrapper = CounterUnwrapper(
-            counter_bits,
-            counts_per_frame,
-            count_rate_hz,
-            # Wider than the window: a frame that comes too late should be known as late, not as alien.
-            reorder_counts=round(4 * reorder_window_ns * count_rate_hz / NS_PER_S) + 2 * counts_per_frame,
-        )
+        self._unwrapper: CounterUnwrapper | ArrivalCount
+        if counter_bits is None:
+            self._unwrapper = ArrivalCount(NS_PER_S / count_rate_hz)
+        else:
+            self._unwrapper = CounterUnwrapper(
+                counter_bits,
+                counts_per_frame,
+                count_rate_hz,
+                # Wider than the window: a frame that comes too late should be known as late, not as alien.
+                reorder_counts=round(4 * reorder_window_ns * count_rate_hz / NS_PER_S) + 2 * counts_per_frame,
+            )
         # A frame is complete, and can leave, when its last sample has been taken.
         self._last_in_frame = samples_per_frame - 1
         self._restarts = 0

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import gzip
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cantools.database.can
 import numpy as np
 import pytest
 
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.assembly_drivers import drivers
+from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.dbc import layout_from_dbc
+from drivers.replay import ReplayCounters
 from drivers.replay_can import CanLog
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import can
     from cantools.database.can import Message
     from numpy.typing import NDArray
 
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.settings.models import MachineFile
     from drivers.can_batches import Sorted
     from drivers.frames import FrameLayout
 
@@ -114,3 +119,83 @@ def test_the_imu_feels_gravity_and_nothing_else(data: Path) -> None:
     felt = np.concatenate([part.decoded.samples[:, 0] for piece in pieces for part in piece.frames])
     assert np.linalg.norm(felt.mean(axis=0)) == pytest.approx(9.81, abs=1.0)
     assert felt.std(axis=0).max() < 0.5
+
+
+CHANNELS = {"formula-student": "can0", "gnss-imu": "can1"}
+SENSORS = {
+    "formula-student": 'type = "trend"\nstream = "ID_D0"\nchannel = "STEER_ANGLE"\nunit = "deg"',
+    "gnss-imu": 'type = "accelerometer"\nstream = "gnss_imu"\nchannel = "AccelerationX"\nunit = "m/s2"',
+}
+
+
+def machine_of(
+    recording: str, data: Path, messages: list[Message], rates_hz: dict[str, float]
+) -> MachineFile:
+    """A machine file that plays a log, a stream for every message of its DBC file."""
+    log, dbc, _ = RECORDINGS[recording]
+    streams = [
+        f"""[streams.{message.name}]
+bus = "car"
+rate_hz = {rates_hz[message.name]}
+layout = {{ dbc = "{data / dbc}", message = "{message.name}", no_counter = true, channels = [{
+            ", ".join(f'{{ name = "{s.name}", signals = ["{s.name}"] }}' for s in message.signals)
+        }] }}
+"""
+        for message in messages
+    ]
+    text = f"""schema_version = 1
+site = "lab"
+box = "edge-1"
+[machine]
+name = "{recording}"
+speed_rpm = 1500.0
+[buses.car]
+driver = "replay"
+file = "{data / log}"
+channel = "{CHANNELS[recording]}"
+pace = "unpaced"
+{"".join(streams)}
+[[sensors]]
+name = "one"
+{SENSORS[recording]}
+"""
+    return parse_machine_file(text, Path(f"/m/{recording}.toml"))
+
+
+@pytest.mark.parametrize("recording", RECORDINGS)
+async def test_the_service_plays_the_log_of_a_vehicle_frame_by_frame(data: Path, recording: str) -> None:
+    """Neither log has a counter: every frame is delivered, in its order, as what cantools reads of it."""
+    log_path, dbc_path, frames = RECORDINGS[recording]
+    database = cantools.database.can.Database()
+    database.add_dbc_file(str(data / dbc_path))
+    with gzip.open(data / log_path, "rt") as lines:
+        words = [line.split() for line in lines]
+    sent: dict[str, list[tuple[float, bytes]]] = {}
+    for stamp, channel, frame in words:
+        frame_id, payload = frame.split("#")
+        if channel == CHANNELS[recording]:
+            sent.setdefault(frame_id, []).append((float(stamp[1:-1]), bytes.fromhex(payload)))
+    messages = [message for message in database.messages if f"{message.frame_id:03X}" in sent]
+    t_s = {m.name: [t for t, _ in sent[f"{m.frame_id:03X}"]] for m in messages}
+    rates_hz = {name: round(1.0 / float(np.median(np.diff(t))), 2) for name, t in t_s.items()}
+    blocks: list[SampleBlock] = []
+    [driver] = drivers(machine_of(recording, data, messages, rates_hz), DrivenClock(), blocks.append)
+
+    await driver.run()
+
+    assert driver.link.reason == "end of file"
+    assert isinstance(driver.counters, ReplayCounters)
+    assert driver.counters.frames_other_channel == frames - sum(map(len, sent.values()))
+    for message in messages:
+        counters, _ = driver.streams[message.name]
+        written = sent[f"{message.frame_id:03X}"]
+        assert (counters.frames_received, counters.samples_received) == (len(written), len(written))
+        assert (counters.frames_rejected, counters.frames_duplicate, counters.frames_late) == (0, 0, 0)
+        mine = [block for block in blocks if block.stream == message.name]
+        values = np.concatenate([block.samples for block in mine])
+        physical: list[Any] = [message.decode(payload, decode_choices=False) for _, payload in written]
+        expected = np.array([[row[s.name] for s in message.signals] for row in physical], np.float64)
+        np.testing.assert_allclose(values, expected, rtol=2e-7, atol=1e-12)
+        index = np.concatenate([np.arange(block.first_index, block.end_index) for block in mine])
+        assert (np.diff(index) >= 1).all()
+        assert index[-1] - index[0] + 1 == counters.samples_received + counters.samples_lost

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from machine_files import MACHINES, changed, only_problem
 
-from daqsvc.acquisition.arrival_count import COUNTER_BITS, ArrivalCount
+from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.assembly_drivers import frame_layout
@@ -49,10 +49,22 @@ def test_frames_that_come_all_at_once_are_a_frame_each() -> None:
     assert (np.diff(ArrivalCount(PERIOD_NS).count(arrival_ns)) >= 1).all()
 
 
-def test_counts_wrap_as_a_counter_of_32_bits_does() -> None:
-    counter = ArrivalCount(PERIOD_NS)
-    counter.count(np.array([0]))
-    assert counter.count(np.array([2**COUNTER_BITS * PERIOD_NS])).tolist() == [0]
+def test_a_frame_that_comes_before_its_time_is_delivered_all_the_same() -> None:
+    """A message of one a second that is also sent when something happens."""
+    blocks: list[SampleBlock] = []
+    stream = StreamAssembler(
+        "s", 1.0, counter_bits=None, samples_per_frame=1, counts_per_frame=1, deliver=blocks.append
+    )
+    arrival_ns = np.sort(np.concatenate([np.arange(60), [7.23, 7.9, 31.5]]) * 1e9).astype(np.int64)
+    for t_ns in arrival_ns:
+        stream.accept(np.zeros(1, np.int64), np.zeros((1, 1, 1), np.float32), np.ones(1, bool), t_ns[None])
+    stream.flush()
+    assert stream.counters.samples_received == len(arrival_ns)
+    assert stream.counters.frames_rejected == 0
+    assert stream.time_base.restarts == 0
+    index = np.concatenate([np.arange(block.first_index, block.end_index) for block in blocks])
+    assert len(index) == len(arrival_ns)
+    assert (np.diff(index) > 0).all()
 
 
 def test_what_the_assembler_makes_of_them_is_whole_and_says_that_loss_is_estimated() -> None:
