@@ -171,4 +171,5 @@ def _patience(options: Mapping[str, Any], line: LineOptions) -> Patience:
         gap_ns=line.gap_ns,
         demote_after=options.get("demote_after", 3),
         demotion_ns=round(options.get("demotion_s", 10.0) * NS_PER_S),
+        opening_ns=quiet_ns + line.timeout_ns if line.transport == "rtu" else 0,
     )

@@ -99,7 +99,7 @@ class ModbusLine:
         self._writable = writable
         self._heard = heard
         self._lock = asyncio.Lock()
-        self._quiet_until_ns = clock.monotonic_ns() + patience.quiet_ns
+        self._quiet_until_ns = clock.monotonic_ns() + patience.opening_ns
         self._failed = False
 
     async def poll(self, unit: int, function: int, run: Run, what: str = "") -> Reading:

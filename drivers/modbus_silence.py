@@ -32,18 +32,20 @@ class Patience:
     """How long to bear with a line and its units.
 
     Attributes:
-        quiet_ns: silence kept on a serial line after it was opened, and after a request that failed; at least
-            the response time-out.
+        quiet_ns: silence kept on a serial line after a request that failed; at least the response time-out.
         gap_ns: silence between frames on a serial line.
         demote_after: requests without reply, in a row, after which a unit, or one request, is set aside.
         demotion_ns: how long it is set aside, before one request probes whether it is back; twice as long
             after each probe without reply, up to `LONGEST_DEMOTION_NS` if that is more.
+        opening_ns: silence kept on a serial line that was opened: a time-out and `quiet_ns`, as if whoever
+            had it before had just asked for something.
     """
 
     quiet_ns: int
     gap_ns: int
     demote_after: int = 3
     demotion_ns: int = 10 * NS_PER_S
+    opening_ns: int = 0
 
     @property
     def longest_demotion_ns(self) -> int:

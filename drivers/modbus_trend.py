@@ -135,7 +135,7 @@ class _TrendStream:
         lost = 0 if self._next is None else first - self._next
         self._next = first + len(rows)
         self.counters.frames_received += len(rows)
-        note_received(self.counters, self.name, samples)
+        samples = note_received(self.counters, self.name, samples)
         if lost:
             note_gap(self.counters, self.name, lost, first)
         self._deliver(
@@ -153,7 +153,7 @@ class _TrendStream:
 
 
 class TrendReader(PollingReader):
-    """Polls registers on a schedule; a sample's count is its place in the schedule.
+    """Polls registers on a schedule, which begins with the first sample; its count is its place in that.
 
     A poll that fails is a lost sample of every stream that has registers in it, and of no other; and so is
     one whose request could not go out before the next was due, because others held the line.
@@ -173,7 +173,8 @@ class TrendReader(PollingReader):
         self._period_ns = NS_PER_S / specs[0].rate_hz
         self._late_ns = max(self._period_ns, LATE_NS)
         self._start_ns = 0
-        self._done: int | None = None
+        self._done = -1
+        self._begun = False
         self._streams = [_TrendStream(spec, port) for spec in specs]
         if runs is None:
             self._read_apart()
@@ -213,7 +214,10 @@ class TrendReader(PollingReader):
         asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
         if asked_ns is None:
             return
-        self._done = max(slot, self._oldest_slot(asked_ns))
+        if self._begun:
+            self._done = max(slot, self._oldest_slot(asked_ns))
+        else:
+            self._begun, self._start_ns, self._done = True, asked_ns, 0
         for stream in self._streams:
             stream.take(self._done, self._start_ns, readings)
 
@@ -254,9 +258,8 @@ class TrendReader(PollingReader):
     async def _wait_for_slot(self) -> int:
         """Wait for the next place in the schedule that has not passed for good."""
         now_ns = self._clock.monotonic_ns()
-        if self._done is None:
+        if self._done < 0:
             self._start_ns = now_ns
-            self._done = -1
         self._done = max(self._done + 1, self._oldest_slot(now_ns))
         wait_ns = self._due_ns(self._done) - now_ns
         if wait_ns > WORTH_A_BATCH_NS:

@@ -132,13 +132,25 @@ def simulate(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
         runner.run(main())
 
 
+class _Cable:
+    """A serial cable: units on it do not know who has opened its other end, and send to whoever has."""
+
+    def __init__(self, units: Mapping[int, ModbusUnit], plan: FaultPlan) -> None:
+        self.wire = ModbusWire(units, self._send, serial=True, plan=plan, clock=LoopClock())
+        self.end: ModbusProtocol | None = None
+
+    def _send(self, data: bytes) -> None:
+        if self.end is not None:
+            self.end.send(data)
+
+
 class Responder(ModbusProtocol):
     """Units at the far end of pymodbus' null modem, which passes bytes at once and without a system call."""
 
     PORT = 5020
 
     def __init__(
-        self, units: Mapping[int, ModbusUnit], plan: FaultPlan, *, serial: bool, listening: bool = True
+        self, units: Mapping[int, ModbusUnit], plan: FaultPlan, *, cable: _Cable | None = None
     ) -> None:
         params = CommParams(
             comm_name="responder",
@@ -149,18 +161,27 @@ class Responder(ModbusProtocol):
             reconnect_delay=0,
         )
         super().__init__(params, is_server=True)
-        self._given = (units, plan, serial)
-        self._wire = ModbusWire(units, self.send, serial=serial, plan=plan, clock=LoopClock())
+        self._given = (units, plan)
+        self._cable = cable
+        if cable is not None:
+            self._wire = cable.wire
+        else:
+            self._wire = ModbusWire(units, self.send, serial=False, plan=plan, clock=LoopClock())
 
     def callback_new_connection(self) -> ModbusProtocol:
-        units, plan, serial = self._given
-        return Responder(units, plan, serial=serial)
+        connection = Responder(*self._given, cable=self._cable)
+        if self._cable is not None:
+            self._cable.end = connection
+        return connection
 
     def callback_connected(self) -> None:
         pass
 
     def callback_disconnected(self, exc: Exception | None) -> None:
-        self._wire.close()
+        if self._cable is None:
+            self._wire.close()
+        elif self._cable.end is self:
+            self._cable.end = None
 
     def callback_data(self, data: bytes, addr: tuple | None = None) -> int:
         self._wire.feed(data)
@@ -180,12 +201,15 @@ def options_of(*, serial: bool, **more: Any) -> dict[str, Any]:
 async def responding(
     units: Mapping[int, ModbusUnit], plan: FaultPlan, *, serial: bool
 ) -> AsyncIterator[Responder]:
-    responder = Responder(units, plan, serial=serial)
+    cable = _Cable(units, plan) if serial else None
+    responder = Responder(units, plan, cable=cable)
     assert await responder.listen()
     try:
         yield responder
     finally:
         responder.close()
+        if cable is not None:
+            cable.wire.close()
 
 
 def ramp(n: int, channels: int = 2, first: int = 0) -> np.ndarray:

@@ -131,7 +131,7 @@ class ModbusRtu(_Modbus):
 
     name = "Modbus RTU"
     acknowledge = ACKNOWLEDGE
-    timeout_ms = 100.0  # a line that is opened is quiet for so long, in simulated time
+    timeout_ms = 100.0  # a line that is opened is quiet for twice as long, in simulated time
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
