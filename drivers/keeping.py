@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from concurrent.futures import Future
+from functools import partial
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from daqsvc.acquisition.supervisor import Backoff
@@ -76,13 +79,44 @@ async def in_thread(
         call: blocks.
         arguments: of it.
         undo: takes back its result; blocks.
-        patience_s: how long to wait for its end when cancelled; None for as long as it takes.
+        patience_s: how long to wait for its end when cancelled; None for as long as it takes. One that takes
+            longer is left behind: what it did is undone when it ends, and the process may end before it.
     """
-    work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
+    if patience_s is None:
+        work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
+    else:
+        begun = _in_thread_of_its_own(call, *arguments)
+        work = asyncio.ensure_future(asyncio.wrap_future(begun))
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
         await asyncio.wait({work}, timeout=patience_s)
-        if undo is not None and work.done() and work.exception() is None:
+        if not work.done():
+            work.cancel()
+            if undo is not None:
+                begun.add_done_callback(partial(_undo_late, undo))
+        elif undo is not None and work.exception() is None:
             await asyncio.to_thread(undo, work.result())
         raise
+
+
+def _in_thread_of_its_own(call: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Begin a call in a thread that nobody waits for: asyncio's own are waited for when the process ends."""
+    outcome: Future[T] = Future()
+    outcome.set_running_or_notify_cancel()
+
+    def work() -> None:
+        try:
+            result = call(*arguments)
+        except BaseException as error:  # noqa: BLE001 - whoever waits for the outcome gets it
+            outcome.set_exception(error)
+        else:
+            outcome.set_result(result)
+
+    Thread(target=work, name=f"blocking {getattr(call, '__name__', 'call')}", daemon=True).start()
+    return outcome
+
+
+def _undo_late(undo: Callable[[T], object], outcome: Future[T]) -> None:
+    if outcome.exception() is None:
+        undo(outcome.result())

@@ -84,8 +84,8 @@ class TimeBase:
 
     Args:
         rate_hz: nominal sampling rate.
-        counter_bits: width of the counter, see `daqsvc.acquisition.counter`; None if the device sends none: then
-            frames are counted by their times (`daqsvc.acquisition.arrival_count`), one count a frame.
+        counter_bits: width of the counter, see `daqsvc.acquisition.counter`; None if there is none: frames
+            are then counted by their times (`daqsvc.acquisition.arrival_count`), one count a frame.
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         reorder_window_ns: how long a frame may be overtaken on its way.

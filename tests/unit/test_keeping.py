@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import threading
 from typing import TYPE_CHECKING
 
@@ -118,6 +120,36 @@ async def test_a_call_that_never_ends_is_waited_for_with_patience_only() -> None
     assert not go_on.is_set()
     go_on.set()
     await asyncio.gather(*(asyncio.all_tasks() - {asyncio.current_task()}))
+
+
+async def test_what_opens_long_after_its_driver_was_cancelled_is_closed_again_too() -> None:
+    go_on, undone = threading.Event(), threading.Event()
+    opening = asyncio.create_task(
+        in_thread(_call_that_waits(go_on), undo=lambda _opened: undone.set(), patience_s=0.02)
+    )
+    await asyncio.sleep(0.01)
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    assert not undone.is_set()
+    go_on.set()
+    assert await asyncio.to_thread(undone.wait, 10)
+
+
+def test_a_process_does_not_wait_for_a_call_that_hangs() -> None:
+    script = """
+import asyncio, threading
+from drivers.keeping import in_thread
+
+async def main():
+    task = asyncio.create_task(in_thread(threading.Event().wait, patience_s=0.02))
+    await asyncio.sleep(0.01)
+    task.cancel()
+    await asyncio.wait({task})
+
+asyncio.run(main())
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
 async def test_what_failed_needs_no_undoing() -> None:
