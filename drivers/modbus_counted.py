@@ -36,6 +36,9 @@ STANDSTILL_NS = 2 * NS_PER_S
 LEAST_SLACK = 16
 """Samples by which a count may be off the clock, however slow the device is."""
 
+SURE = 4
+"""Looks in a row by which a count is believed that neither its past nor the clock explains."""
+
 CountedT = TypeVar("CountedT", Fifo, Ring)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from drivers.modbus_counted import CountedReader
+from drivers.modbus_counted import SURE, CountedReader
 from drivers.modbus_layouts import Fifo
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus_line import ModbusLine
 
@@ -44,31 +46,28 @@ class FifoReader(CountedReader[Fifo]):
     """Empties a queue, and acknowledges what it has taken if the device waits for that.
 
     The count at the head of a reply tells what is missing before it, and what has come before. A count that
-    does not go on from the last reply is believed when the next reply goes on from it; until then nothing is
+    does not go on from the last reply is believed when the next ones go on from it; until then nothing is
     acknowledged, and the samples are held back.
     """
 
     def __init__(self, spec: StreamSpec[Fifo], port: BusPort) -> None:
         super().__init__(spec, port)
+        self._drops = spec.layout.acknowledge is None
         self._unacknowledged = 0
-        self._held: _Reply | None = None
+        self._held: list[_Reply] = []
         self._last: _Reply | None = None
         self._emptied: _Emptied | None = None
 
     def flush(self) -> None:
         """Hand over what is held back, unless its count is beyond belief."""
-        held, self._held = self._held, None
-        if held is None:
-            return
-        if self._gap(held) is None:
-            self._rows.counters.frames_rejected += held.taken
-        else:
-            self._go_on_at(held)
+        if self._held and self._gap(self._held[0]) is not None:
+            self._go_on_with(self._held)
+        self._reject_held()
 
     async def _look(self, line: ModbusLine) -> None:
         reply = await self._read(line)
         if reply is not None and self._take(reply) and self._layout.acknowledge is not None:
-            await self._acknowledge(line)
+            await self._acknowledge(line, self._layout.acknowledge)
         if reply is None or reply.taken < self._layout.samples_per_read:
             await self._clock.sleep_ns(self._layout.poll_ns)
 
@@ -86,32 +85,48 @@ class FifoReader(CountedReader[Fifo]):
             return None
         return _Reply(layout.count.decode(raw), raw[head:], taken, asked_ns, self._clock.monotonic_ns())
 
-    async def _acknowledge(self, line: ModbusLine) -> None:
+    async def _acknowledge(self, line: ModbusLine, address: int) -> None:
         """Tell the device how far its queue has been taken."""
-        assert self._layout.acknowledge is not None  # noqa: S101 - only then is there anything to tell
-        assert self._next is not None  # noqa: S101 - something has been taken
-        told = self._layout.count.encode(self._next)
+        told = self._layout.count.encode(self._following)
         words = [int.from_bytes(told[k : k + 2], "big") for k in range(0, len(told), 2)]
-        await line.write(self._layout.unit, self._layout.acknowledge, words)
+        await line.write(self._layout.unit, address, words)
         self._unacknowledged = 0
 
     def _take(self, reply: _Reply) -> bool:
         """Hand on what is new in a reply; returns whether its count is believed."""
-        held, self._held = self._held, None
-        if held is not None:
-            self._settle(held, reply)
         if self._next is None:
             self._next = self._index = reply.first
-        if not self._continues(reply):
-            self._held = reply
+        asked_again = bool(self._held)
+        self._place_held(reply)
+        if self._continues(reply):
+            self._reject_held()
+            repeated = self._repeated(reply)
+            self._rows.counters.frames_received += reply.taken - repeated
+            self._rows.counters.frames_duplicate += 0 if asked_again else repeated
+            self._hand_on_new(reply)
+            return True
+        if self._drops:
             self._rows.counters.frames_received += reply.taken
+            if self._last is not None and (reply.first, reply.rows) == (self._last.first, self._last.rows):
+                self._rows.counters.frames_duplicate += reply.taken
+                return False
+        if self._held and self._contradicts_held(reply):
+            self._reject_held()
+        self._held.append(reply)
+        if len(self._held) < (SURE if self._gap(self._held[0]) is None else 2):
             return False
-        repeated = self._repeated(reply)
-        self._rows.counters.frames_received += reply.taken - repeated
-        if held is None:  # else it was asked again what comes again
-            self._rows.counters.frames_duplicate += repeated
-        self._hand_on_new(reply)
+        *certain, last = self._held
+        self._go_on_with(certain)
+        if self._continues(last):
+            self._go_on_with([last])
+        else:
+            self._held = [last]
         return True
+
+    @property
+    def _following(self) -> int:
+        assert self._next is not None  # noqa: S101 - there is a next sample once one has been taken
+        return self._next
 
     def _continues(self, reply: _Reply) -> bool:
         """Whether a reply has the next sample, or begins with some that the device has handed out before."""
@@ -121,49 +136,62 @@ class FifoReader(CountedReader[Fifo]):
         """How many samples at the head of a reply have been taken before."""
         return min((self._following - reply.first) % self._modulus, reply.taken)
 
-    @property
-    def _following(self) -> int:
-        assert self._next is not None  # noqa: S101 - `_take` has set it
-        return self._next
-
-    def _settle(self, held: _Reply, reply: _Reply) -> None:
-        """Decide on a reply whose count did not go on from the one before, now that the next one is there."""
-        drops = self._layout.acknowledge is None
-        if self._continues(reply):
-            self._rows.counters.frames_rejected += held.taken  # it was there before, or is there again
-        elif drops and (reply.first - self._following) % self._modulus == held.taken:
-            self._hand_on_new(held._replace(first=self._following))  # only its count was damaged
-        elif self._follows(held, reply):
-            self._go_on_at(held)
-        else:
-            self._rows.counters.frames_rejected += held.taken
-
     def _follows(self, held: _Reply, reply: _Reply) -> bool:
         """Whether a reply goes on from another one, but for what the device may have dropped in between."""
-        least = held.taken if self._layout.acknowledge is None else 0
-        since_ns = reply.seen_ns - held.asked_ns
-        dropped = (reply.first - held.first - least) % self._modulus
-        return dropped <= self._sample_clock.most(since_ns) + self._sample_clock.at_once
+        dropped = self._dropped(held, reply)
+        return dropped <= self._sample_clock.most(reply.seen_ns - held.asked_ns) + self._sample_clock.at_once
 
-    def _go_on_at(self, held: _Reply) -> None:
-        gap = self._gap(held)
+    def _dropped(self, held: _Reply, reply: _Reply) -> int:
+        """Samples that the device has dropped between two replies."""
+        kept = held.taken if self._drops else 0
+        return (reply.first - held.first - kept) % self._modulus
+
+    def _place_held(self, reply: _Reply) -> None:
+        """Hand on a reply of which only the count was damaged: the replies around it tell its place."""
+        if self._drops and len(self._held) == 1:
+            (held,) = self._held
+            if (reply.first - self._following) % self._modulus == held.taken:
+                self._held = []
+                self._hand_on_new(held._replace(first=self._following))
+
+    def _contradicts_held(self, reply: _Reply) -> bool:
+        """Whether a reply does not go on from those held back, or shows that the count is where it was."""
+        if not self._follows(self._held[-1], reply):
+            return True
+        return self._gap(self._held[0]) is None and self._gap(reply) is not None
+
+    def _go_on_with(self, replies: Sequence[_Reply]) -> None:
+        """Hand on replies that were held back."""
+        self._held = []
+        for reply in replies:
+            if not self._continues(reply):
+                self._go_on_at(reply)
+            if not self._drops:
+                self._rows.counters.frames_received += reply.taken - self._repeated(reply)
+            self._hand_on_new(reply)
+
+    def _reject_held(self) -> None:
+        self._rows.counters.frames_rejected += sum(reply.taken for reply in self._held)
+        self._held = []
+
+    def _go_on_at(self, reply: _Reply) -> None:
+        """Take the first sample of a reply as the next one."""
+        gap = self._gap(reply)
         if gap is None:
-            last = self._last or held
-            elapsed_ns = held.seen_ns - last.seen_ns
-            self._begin_again(self._index + self._sample_clock.samples(elapsed_ns) - held.taken)
+            elapsed_ns = reply.seen_ns - (self._last or reply).seen_ns
+            self._begin_again(self._index + self._sample_clock.samples(elapsed_ns) - reply.taken)
+            self._emptied = None
         else:
             self._index += gap
-        self._next = held.first
+        self._next = reply.first
         self._unacknowledged = 0
-        self._hand_on_new(held)
 
     def _gap(self, reply: _Reply) -> int | None:
         """Samples that are missing before a reply; None if the clock cannot explain so many.
 
         The head of a queue moves on as samples are taken out, or as the queue is full and new ones come.
         """
-        last = self._last or reply
-        since_ns = reply.seen_ns - last.asked_ns
+        since_ns = reply.seen_ns - (self._last or reply).asked_ns
         popped = REPLIES_LOST_AT_ONCE * self._layout.samples_per_read
         most = self._sample_clock.most(since_ns) + self._sample_clock.at_once + popped
         ahead = (reply.first - self._following) % self._modulus
@@ -175,7 +203,7 @@ class FifoReader(CountedReader[Fifo]):
             new = reply.taken - repeated
             self._check_standstill(reply, new)
             self._hand_on(reply.rows[repeated * 2 * self._layout.record.registers :], reply.seen_ns)
-            self._unacknowledged += new if self._layout.acknowledge is not None else 0
+            self._unacknowledged += 0 if self._drops else new
         self._last = reply
 
     def _check_standstill(self, reply: _Reply, new: int) -> None:

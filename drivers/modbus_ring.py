@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from drivers.modbus_counted import CountedReader
+from drivers.modbus_counted import SURE, CountedReader
 from drivers.modbus_layouts import FUNCTIONS, Ring
 from drivers.registers import Run
 
@@ -84,14 +84,16 @@ class RingReader(CountedReader[Ring]):
         explained = self._advance(first) is not None
         if explained and self._checked:
             return first
-        second = await self._count(line)
         if explained:
-            return first if self._follows(first, second) else None
-        if self._advance(second) is not None:
-            return None  # the counter is where it was, and the first look was damaged
-        since_ns = second.seen_ns - first.asked_ns
-        ahead = (second.written - first.written) % self._modulus
-        return first if ahead <= self._sample_clock.most(since_ns) + self._at_once else None
+            return first if self._follows(first, await self._count(line)) else None
+        for _ in range(SURE - 1):
+            second = await self._count(line)
+            ahead = (second.written - first.written) % self._modulus
+            most = self._sample_clock.most(second.seen_ns - first.asked_ns) + self._at_once
+            if self._advance(second) is not None or ahead > most:
+                return None  # the counter is where it was, or nobody knows where
+            first = second
+        return first
 
     async def _read_until(self, look: _Look, line: ModbusLine) -> bool:
         """Read what has been written until a look; returns whether the next look bears that out."""

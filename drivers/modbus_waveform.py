@@ -12,7 +12,7 @@ from daqsvc.acquisition.assembler import StreamCounters
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
-from drivers.modbus_counted import SampleClock
+from drivers.modbus_counted import SURE, SampleClock
 from drivers.modbus_layouts import FUNCTIONS
 from drivers.modbus_reading import PollingReader
 from drivers.registers import Run
@@ -58,7 +58,7 @@ class WaveformReader(PollingReader):
     Nothing in a block tells when it was taken. But the last look at the id that found another one was before
     its end, and the first that found its own was after it: it ended midway, give or take half of that time.
 
-    A new id is believed once a second look finds it, too.
+    A new id is believed once another look finds it, too; several looks, if it is not the one that was due.
 
     Args:
         spec: the stream.
@@ -156,13 +156,17 @@ class WaveformReader(PollingReader):
         run = Run(layout.block_id, 1)
         while True:
             first = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            again = first
             block_id = int.from_bytes(first.registers, "big")
-            if block_id == self._shown:
-                self._asked_ns = first.asked_ns
-                break
-            again = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            if block_id != self._shown:
+                is_next = self._shown is not None and block_id == self._shown % IDS + 1
+                for _ in range(1 if is_next else SURE - 1):
+                    again = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+                    if again.registers != first.registers:
+                        break
             if again.registers == first.registers:
-                self._ended = _Ended.between(self._asked_ns, first.answered_ns)
+                if block_id != self._shown:
+                    self._ended = _Ended.between(self._asked_ns, first.answered_ns)
                 self._shown, self._asked_ns = block_id, again.asked_ns
                 break
             self._counters.counts_doubted += 1
