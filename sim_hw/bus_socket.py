@@ -31,7 +31,6 @@ from sim_hw.bus_socket_hub import QUEUE_FRAMES, Hub, HubError, HubTakenError, ch
 from sim_hw.bus_socket_wire import (
     LONGEST,
     Wish,
-    is_fd_frame,
     is_frame,
     overflow_message,
     pack_frame,
@@ -102,6 +101,7 @@ class UnixBus(can.BusABC):
         self._fd = fd
         wish = Wish.ECHO if receive_own_messages else Wish.NOTHING
         wish |= Wish.NOTHING if receive else Wish.DEAF
+        wish |= Wish.NOTHING if fd else Wish.CLASSIC
         self._socket = _join(self.channel, wish, queue_frames if hub == "start" else None)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
@@ -130,8 +130,6 @@ class UnixBus(can.BusABC):
 
     def _message(self, packet: bytes, timestamp_s: float) -> can.Message | None:
         if is_frame(packet):
-            if is_fd_frame(packet) and not self._fd:
-                return None
             return unpack_frame(packet, timestamp_s, self.channel)
         lost = unpack_lost(packet)
         self.frames_lost += lost

@@ -19,7 +19,15 @@ from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim_hw.bus_socket_wire import LONGEST, Wish, is_frame, pack_greeting, pack_lost, unpack_greeting
+from sim_hw.bus_socket_wire import (
+    LONGEST,
+    Wish,
+    is_fd_frame,
+    is_frame,
+    pack_greeting,
+    pack_lost,
+    unpack_greeting,
+)
 
 QUEUE_FRAMES = 8192
 """Frames that wait in the hub for a client, beside those (some 280) that its socket holds."""
@@ -69,9 +77,11 @@ class _Client:
         self._limit = limit
         self._untold = 0
 
-    def hears(self, sender: _Client) -> bool:
+    def hears(self, sender: _Client, packet: bytes) -> bool:
         """Whether a frame of that sender is for this end."""
         if not self.joined or Wish.DEAF in self.wish:
+            return False
+        if Wish.CLASSIC in self.wish and is_fd_frame(packet):
             return False
         return sender is not self or Wish.ECHO in self.wish
 
@@ -252,7 +262,7 @@ class Hub:
             client.offer(pack_greeting(wish))
         elif is_frame(packet):
             for other in list(self._clients.values()):
-                if other.hears(client):
+                if other.hears(client, packet):
                     self._deliver(other, packet)
             self.counters.frames += 1
         else:

@@ -43,6 +43,8 @@ class Wish(IntFlag):
     """To be sent its own frames too."""
     DEAF = 2
     """To be sent no frames at all."""
+    CLASSIC = 4
+    """To be sent no CAN FD frames, which a classic controller does not understand."""
 
 
 def is_frame(packet: bytes) -> bool:
@@ -109,7 +111,7 @@ def unpack_greeting(packet: bytes) -> Wish | None:
     if len(packet) != _GREETING.size:
         return None
     mark, wish = _GREETING.unpack(packet)
-    return Wish(wish & (Wish.ECHO | Wish.DEAF)) if mark == _GREETED else None
+    return Wish(wish & (Wish.ECHO | Wish.DEAF | Wish.CLASSIC)) if mark == _GREETED else None
 
 
 def pack_lost(frames: int) -> bytes:

@@ -94,6 +94,19 @@ def test_a_classic_end_neither_sees_nor_sends_fd_frames(bus_path: str) -> None:
             classic.send(frame(3, is_fd=True))
 
 
+def test_a_classic_end_loses_no_fd_frames_since_it_is_not_sent_any(bus_path: str) -> None:
+    with (
+        running(bus_path, queue_frames=16) as hub,
+        UnixBus(bus_path, fd=True) as bus,
+        UnixBus(bus_path) as classic,
+    ):
+        for k in range(2000):
+            bus.send(frame(k % 0x700, is_fd=True))
+        bus.send(frame(0x7FF))
+        assert numbers(classic, until=0x7FF) == [0x7FF]
+        assert (classic.frames_lost, hub.counters.lost) == (0, 0)
+
+
 def test_own_frames_come_back_if_asked_for(bus_path: str) -> None:
     with UnixBus(bus_path, receive_own_messages=True) as bus, UnixBus(bus_path) as other:
         bus.send(frame(1))
