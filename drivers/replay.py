@@ -22,7 +22,7 @@ from drivers.base import BusCounters, BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.frames import FrameLayout
-from drivers.keeping import Attempt, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
 from drivers.replay_can import CanLog
 from drivers.replay_channel import ChannelChoice
 from drivers.replay_files import (
@@ -139,7 +139,8 @@ class ReplayDriver:
                 assembler.flush()
 
     async def _attempt(self) -> Attempt | None:
-        while (recording := await self._open()) is not None:
+        while True:
+            recording = await self._open()
             self.link.up()
             before = self._frames
             ending = await self._play(recording)
@@ -149,22 +150,20 @@ class ReplayDriver:
                 return None
             if self._at_end == "wait" or not ending.readable or not played:
                 return Attempt(present=True, useful=played, reason=ending.reason)
-        return Attempt(present=False, useful=False, reason=self.link.reason)
 
     @property
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
-    async def _open(self) -> Recording | None:
+    async def _open(self) -> Recording:
         try:
             return await in_thread(self._open_file, undo=self._close)
         except RecordingError as error:
-            reason = f"{error}"
-        except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
-            reason = f"it cannot be opened: {words(error)}"
-        self.counters.open_failures += 1
-        self.link.down(reason)
-        return None
+            self.counters.open_failures += 1
+            raise CannotOpenError(f"{error}") from error
+        except Exception as error:
+            self.counters.open_failures += 1
+            raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
 
     def _open_file(self) -> Recording:
         if not self._path.exists():
@@ -201,7 +200,7 @@ class ReplayDriver:
                     return Ending(self._channel.missed or END_OF_FILE, readable=True)
                 if piece.notes.get("frames_malformed"):
                     self._say_once(
-                        f"what is no frame is counted (frames_malformed) and left out, first "
+                        f"what is no frame in {self._path} is counted (frames_malformed) and left out, first "
                         f"{recording.first_malformed}"
                     )
                 await self._take(piece)
@@ -220,7 +219,7 @@ class ReplayDriver:
     def _say_once(self, what: str) -> None:
         if what not in self._said:
             self._said.add(what)
-            logger.warning("%s: %s", self.link.name, what)
+            logger.warning("replayed bus %r: %s", self.name, what)
 
     def _begin_anew(self, recording: Recording) -> None:
         """The recording is played from its beginning: nothing is missing between this and what was before."""

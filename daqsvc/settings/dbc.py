@@ -147,3 +147,14 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             "is signed or a float; a counter runs from 0 upwards and wraps",
             "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
         )
+    elif counter is not None and counter.maximum is not None:
+        largest, all_ones = (counter.maximum - counter.offset) / counter.scale, 2**counter.length - 1
+        if largest != all_ones:
+            yield Finding(
+                (*at, "counter", "signal"),
+                f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were not "
+                "lost count as lost at each of its turns",
+                "see what the device sends: if it ends there, write no_counter = true in place of counter, "
+                "else correct the range in the DBC file",
+                fatal=False,
+            )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 DBC = """VERSION ""
 BU_: X
 BO_ 513 Acc: 8 X
- SG_ Seq : 0|{bits}@1+ (1,0) [0|0] "" X
+ SG_ Seq : 0|{bits}@1+ (1,0) [0|{largest}] "" X
  SG_ AX : 48|16@1- (0.001,0) [0|0] "g" X
 """
 TEXT = """
@@ -51,8 +51,8 @@ PLAIN = """layout = { id = 1, length = 64, counter = { byte = 0, bits = 8, count
 first_byte = 0, samples_per_frame = 64, channels = [{ name = "x", type = "int8", scale = 1.0 }] }"""
 
 
-def machine_file(folder: Path, bits: int = 8, old: str = "", new: str = "") -> Path:
-    (folder / "a.dbc").write_text(DBC.format(bits=bits))
+def machine_file(folder: Path, bits: int = 8, old: str = "", new: str = "", largest: int = 0) -> Path:
+    (folder / "a.dbc").write_text(DBC.format(bits=bits, largest=largest))
     assert old in TEXT
     path = folder / "fan.toml"
     path.write_text(TEXT.replace(old, new) if old else TEXT)
@@ -82,6 +82,16 @@ def test_a_counter_that_wraps_within_a_few_frames_is_refused(tmp_path: Path, bit
     path = machine_file(tmp_path, bits)
     with pytest.raises(MachineFileError, match=rf"fan.toml:18: .*{said}.*4 bits or more.*no_counter = true"):
         parse_machine_file(path.read_text(), path)
+
+
+@pytest.mark.parametrize(("largest", "warnings"), [(0, 0), (14, 1), (15, 0)])
+def test_a_counter_that_ends_before_all_ones_is_a_warning(
+    tmp_path: Path, largest: int, warnings: int
+) -> None:
+    path = machine_file(tmp_path, 4, largest=largest)
+    found = parse_machine_file(path.read_text(), path).warnings
+    assert [warning.key for warning in found] == ["streams.casing.layout.counter.signal"] * warnings
+    assert all("ends at 14 by the DBC file: unless it goes on to 15" in str(warning) for warning in found)
 
 
 def test_a_counter_that_a_frame_takes_a_quarter_of_is_refused(tmp_path: Path) -> None:
