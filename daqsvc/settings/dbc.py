@@ -152,8 +152,8 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
         if largest != all_ones:
             yield Finding(
                 (*at, "counter", "signal"),
-                f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were not "
-                "lost count as lost at each of its turns",
+                f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were "
+                "not lost count as lost at each of its turns",
                 "see what the device sends: if it ends there, write no_counter = true in place of counter, "
                 "else correct the range in the DBC file",
                 fatal=False,
