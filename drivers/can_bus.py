@@ -19,7 +19,7 @@ from drivers.can_batches import FrameSorter
 from drivers.can_errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can_reader import SHUTDOWN_S, CanReader, close_quietly, words
 from drivers.can_record import recorder_of
-from drivers.keeping import Attempt, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
 from drivers.socketcan import open_socketcan
 
 if TYPE_CHECKING:
@@ -84,8 +84,6 @@ class CanDriver:
 
     async def _attempt(self) -> Attempt:
         source = await self._open()
-        if source is None:
-            return Attempt(present=False, useful=False, reason=self.link.reason)
         self.link.up()
         self.counters.controller_state = "error-active"
         before = self._frames
@@ -96,15 +94,14 @@ class CanDriver:
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
-    async def _open(self) -> CanSource | None:
+    async def _open(self) -> CanSource:
         try:
             return await in_thread(
                 self._open_source, self._port, self._sorter, undo=close_quietly, patience_s=SHUTDOWN_S
             )
-        except Exception as error:  # noqa: BLE001 - adapters raise what they like; the driver must live on
+        except Exception as error:
             self.counters.open_failures += 1
-            self.link.down(f"it cannot be opened: {words(error)}")
-            return None
+            raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
 
     async def _receive(self, source: CanSource) -> str:
         """Read until the link fails; returns why."""

@@ -34,35 +34,47 @@ class Attempt(NamedTuple):
     reason: str
 
 
+class CannotOpenError(Exception):
+    """The link cannot be opened; says why, and what to do about it."""
+
+
 async def keep_up(
     link: Link,
     port: BusPort,
     attempt: Callable[[], Awaitable[Attempt | None]],
-    absent: str = "cannot be opened",
 ) -> None:
     """Try a link again and again, each time later unless something came over it; until cancelled.
 
     Args:
         link: its state; `attempt` says when it is up.
         port: what to do if the device is absent at first, and the clock.
-        attempt: opens the link and uses it until it is lost; None if there is nothing more to come.
-        absent: what is wrong if the device is absent, in words.
+        attempt: opens the link and uses it until it is lost; None if there is nothing more to come. It may
+            raise `CannotOpenError`, but must not put the link down: that is said here, where it is known
+            whether it is tried again.
 
     Raises:
         DeviceAbsentError: the device is absent at start and the policy is ``"error"``.
     """
     backoff = Backoff()
     first = True
-    while (outcome := await attempt()) is not None:
+    while (outcome := await _outcome(attempt)) is not None:
+        if first and not outcome.present and port.start == "error":
+            raise DeviceAbsentError(f"{link.name}: {outcome.reason}")
+        if first and not outcome.present and port.start == "ignore":
+            link.leave_out(outcome.reason)
+            return
+        first = False
         link.down(outcome.reason)
         if outcome.useful:
             backoff.reset()
-        if first and not outcome.present and port.start == "error":
-            raise DeviceAbsentError(f"{link.name} {absent}: {link.reason}")
-        if first and not outcome.present and port.start == "ignore":
-            return
-        first = False
         await port.clock.sleep_ns(backoff.next_ns())
+
+
+async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt | None:
+    try:
+        return await attempt()
+    except CannotOpenError as error:
+        return Attempt(present=False, useful=False, reason=f"{error}")
 
 
 async def in_thread(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
-from drivers.keeping import Attempt, keep_up
+from drivers.keeping import Attempt, CannotOpenError, keep_up
 from drivers.modbus_client import ModbusClient
 from drivers.modbus_line import ModbusLine, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
@@ -92,7 +92,7 @@ class ModbusDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
-            await keep_up(self.link, self._port, self._attempt, absent="does not answer")
+            await keep_up(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for reader in self._readers:
@@ -114,7 +114,7 @@ class ModbusDriver:
             try:
                 await client.connect()
             except LineLostError as error:
-                return f"{error}"
+                raise CannotOpenError(f"{error}") from error
             line = self._line = ModbusLine(
                 client,
                 self._port.clock,
@@ -171,5 +171,5 @@ def _patience(options: Mapping[str, Any], line: LineOptions) -> Patience:
         gap_ns=line.gap_ns,
         demote_after=options.get("demote_after", 3),
         demotion_ns=round(options.get("demotion_s", 10.0) * NS_PER_S),
-        opening_ns=quiet_ns + line.timeout_ns if line.transport == "rtu" else 0,
+        timeout_ns=line.timeout_ns,
     )

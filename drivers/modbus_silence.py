@@ -37,15 +37,24 @@ class Patience:
         demote_after: requests without reply, in a row, after which a unit, or one request, is set aside.
         demotion_ns: how long it is set aside, before one request probes whether it is back; twice as long
             after each probe without reply, up to `LONGEST_DEMOTION_NS` if that is more.
-        opening_ns: silence kept on a serial line that was opened: a time-out and `quiet_ns`, as if whoever
-            had it before had just asked for something.
+        timeout_ns: how long a unit may take to answer.
     """
 
     quiet_ns: int
     gap_ns: int
     demote_after: int = 3
     demotion_ns: int = 10 * NS_PER_S
-    opening_ns: int = 0
+    timeout_ns: int = 0
+
+    @property
+    def hold_ns(self) -> int:
+        """How long a request without reply holds the line."""
+        return self.timeout_ns + self.quiet_ns
+
+    @property
+    def opening_ns(self) -> int:
+        """Silence on a serial line that was opened: as if whoever had it before had just asked."""
+        return self.hold_ns if self.quiet_ns else 0
 
     @property
     def longest_demotion_ns(self) -> int:

@@ -192,7 +192,7 @@ class TrendReader(PollingReader):
             stream.flush()
 
     async def _look(self, line: ModbusLine) -> None:
-        slot = await self._wait_for_slot()
+        slot = await self._wait_for_slot(line)
         readings: list[Reading | None] = []
         lost: frozenset[_TrendStream] = frozenset()
         failure: tuple[NoReplyError | RefusedError, Run, frozenset[_TrendStream]] | None = None
@@ -255,13 +255,15 @@ class TrendReader(PollingReader):
             for place, run in enumerate(runs)
         ]
 
-    async def _wait_for_slot(self) -> int:
+    async def _wait_for_slot(self, line: ModbusLine) -> int:
         """Wait for the next place in the schedule that has not passed for good."""
         now_ns = self._clock.monotonic_ns()
         if self._done < 0:
             self._start_ns = now_ns
         self._done = max(self._done + 1, self._oldest_slot(now_ns))
-        wait_ns = self._due_ns(self._done) - now_ns
+        due_ns = self._due_ns(self._done)
+        line.expect(self, due_ns)
+        wait_ns = due_ns - now_ns
         if wait_ns > WORTH_A_BATCH_NS:
             self.flush()
         if wait_ns > EARLY_NS:

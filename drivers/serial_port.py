@@ -20,7 +20,7 @@ import serial
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusCounters, BusPort
-from drivers.keeping import Attempt, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
 from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial_lines import TIME_COUNTER_BITS, LineFraming, LineLayout
 from drivers.serial_reader import SHUTDOWN_S, Batch, SerialReader, close_port
@@ -113,8 +113,6 @@ class SerialDriver:
 
     async def _attempt(self) -> Attempt:
         device = await self._open()
-        if device is None:
-            return Attempt(present=False, useful=False, reason=self.link.reason)
         self.link.up()
         before = self._frames
         reason = await self._receive(device)
@@ -124,15 +122,15 @@ class SerialDriver:
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
-    async def _open(self) -> serial.Serial | None:
+    async def _open(self) -> serial.Serial:
         try:
             return await in_thread(
                 _open_port, self._port.options, self._characters, undo=close_port, patience_s=SHUTDOWN_S
             )
         except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
             self.counters.open_failures += 1
-            self.link.down(f"it cannot be opened: {why_not_open(error, self._port.options['port'], 'port')}")
-            return None
+            why = why_not_open(error, self._port.options["port"], "port")
+            raise CannotOpenError(f"it cannot be opened: {why}") from error
 
     async def _receive(self, device: serial.Serial) -> str:
         """Read until the link fails; returns why."""

@@ -63,23 +63,34 @@ class Link:
     state: LinkState = "down"
     losses: int = 0
     reason: str = ""
+    _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
 
     def up(self) -> None:
         """The link works."""
         if self._said_down:
-            logger.warning("%s is back", self.name)
+            logger.warning("%s is back" if self._ever_up else "%s is there now", self.name)
         elif self.state == "down":
             logger.info("%s is up", self.name)
-        self.state, self.reason, self._said_down = "up", "", False
+        self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
 
     def down(self, reason: str) -> None:
-        """The link does not work, because of ``reason``; repeated calls are silent."""
+        """The link does not work, because of ``reason``, and is tried again; repeated calls are silent."""
         if self.state == "up":
             self.losses += 1
         if not self._said_down:
-            logger.warning("%s is lost: %s; it is being tried again", self.name, reason)
+            lost = " is lost" if self._ever_up else ""
+            logger.warning("%s%s: %s; it is being tried again", self.name, lost, reason)
         self.state, self.reason, self._said_down = "down", reason, True
+
+    def leave_out(self, reason: str) -> None:
+        """The link does not work at start, because of ``reason``, and is not tried again."""
+        logger.warning(
+            "%s: %s; it is left out until the service starts again, as start = 'ignore' says",
+            self.name,
+            reason,
+        )
+        self.state, self.reason, self._said_down = "down", reason, False
 
     def end(self, reason: str) -> None:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""

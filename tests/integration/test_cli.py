@@ -122,7 +122,7 @@ def test_run_says_which_device_is_absent_where_that_is_an_error(tmp_path: Path) 
     file.write_text(text)
     done = daqsvc("run", file, "--store", tmp_path / "store")
     assert done.returncode == 1
-    assert "CAN bus 'can0' (socketcan no-such-can) cannot be opened" in done.stderr
+    assert "CAN bus 'can0' (socketcan no-such-can): it cannot be opened: " in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -130,7 +130,8 @@ def test_a_unit_lives_while_it_answers_anything(fault, demote_after, caplog):
 
 
 @pytest.mark.parametrize("order", [("dead", "one", "other"), ("one", "dead", "other")])
-def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order):
+@pytest.mark.parametrize("dead_since_s", [0.0, 30.0])
+def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order, dead_since_s):
     """With the time-out of 0.5 s that a machine file has by default: the line is held for 1 s each time."""
     numbers = {"one": 1, "other": 2, "dead": 3}
     streams = {name: (trend_of(numbers[name], 5), 1.0) for name in order}
@@ -138,7 +139,7 @@ def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order):
 
     async def main():
         def plan(unit, _pdu):
-            return Answer("silent" if unit == 3 and now_s() > 30 else "none")
+            return Answer("silent" if unit == 3 and now_s() > dead_since_s else "none", delay_ns=3_000_000)
 
         async with responding(units(), plan, serial=True), rig.running():
             await asyncio.sleep(300.8)
@@ -146,9 +147,9 @@ def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order):
     simulate(main)
     # One if the dead unit, of which nobody knows yet, is first in line: then all others are a period late.
     lost = [rig.counters(name).samples_lost for name in ("one", "other")]
-    assert sum(lost) <= (order[0] == "dead")
+    assert sum(lost) <= (order[0] == "dead" and dead_since_s > 0)
     for name in ("one", "other"):
-        assert rig.counters(name).samples_received == 300 - rig.counters(name).samples_lost
+        assert rig.counters(name).samples_received >= 298
         assert (np.diff([block.t_first_ns for block in rig.blocks[name]]) > 0).all()
     assert rig.driver.counters.units_demoted == 1
     # Set aside after three, then asked ever more rarely.

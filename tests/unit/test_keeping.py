@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import subprocess
 import sys
 import threading
@@ -12,7 +13,7 @@ import pytest
 
 from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusPort, DeviceAbsentError
-from drivers.keeping import Attempt, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,7 +78,7 @@ async def test_the_wait_grows_unless_something_came_over_the_link() -> None:
 
 
 async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_that_is_asked_for() -> None:
-    with pytest.raises(DeviceAbsentError, match="CAN bus 'can0' cannot be opened: nobody is there"):
+    with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': nobody is there$"):
         await _kept([ABSENT], start="error")
     for there_once in (USEFUL, USELESS):
         _, waits_ns, _ = await _kept([there_once, ABSENT, None], start="error")
@@ -87,6 +88,39 @@ async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_tha
 async def test_an_absent_device_may_be_gone_without() -> None:
     _, waits_ns, made = await _kept([ABSENT], start="ignore")
     assert (made, waits_ns) == (1, [])
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ("error", []),  # whoever gets the exception says it
+        ("ignore", ["it is left out until the service starts again, as start = 'ignore' says"]),
+        ("retry", ["it is being tried again"]),
+    ],
+)
+async def test_what_is_said_of_an_absent_device_is_what_is_done_about_it(
+    start: StartPolicy, said: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with contextlib.suppress(DeviceAbsentError):
+        await _kept([ABSENT, ABSENT, None], start=start)
+    assert [r.message for r in caplog.records] == [
+        f"CAN bus 'can0': nobody is there; {what}" for what in said
+    ]
+
+
+async def test_a_link_that_cannot_be_opened_is_absent() -> None:
+    left = iter([CannotOpenError("it cannot be opened: no such interface"), None])
+
+    async def attempt() -> None:
+        if (error := next(left)) is not None:
+            raise error
+
+    clock, link = _NotedWaits(), Link("CAN bus 'can0'")
+    await keep_up(link, _port(clock), attempt)
+    assert (link.reason, len(clock.waits_ns)) == ("it cannot be opened: no such interface", 1)
+    left = iter([CannotOpenError("it cannot be opened: no such interface")])
+    with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': it cannot be opened: no such interface$"):
+        await keep_up(link, _port(clock, "error"), attempt)
 
 
 def _call_that_waits(go_on: threading.Event) -> Callable[[], str]:
