@@ -42,6 +42,15 @@ def bursts(n, rng):
     return late
 
 
+def busy(n, rng):
+    """Uniform, but for two spells of 1 to 4 s in which all are 5 ms later still."""
+    late = uniform(n, rng)
+    for _ in range(2):
+        begin = int(rng.integers(0, n))
+        late[begin : begin + int(rng.uniform(1.0, 4.0) * BLOCKS_PER_S)] += 5e6
+    return late
+
+
 def rarely_small(n, rng):
     """99 of 100 blocks are 2 to 5 ms late, the others 0 to 5."""
     return np.where(rng.random(n) < 0.01, rng.uniform(0.0, LATEST_NS, n), rng.uniform(2e6, LATEST_NS, n))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from aligned_streams import Device, aligned, bursts, exponential, rarely_small, soft, uniform
+from aligned_streams import Device, aligned, bursts, busy, exponential, rarely_small, soft, uniform
 
 from daqsvc.acquisition.clock_line import Bucket, clock_line
 
@@ -66,6 +66,14 @@ def test_a_time_base_knows_how_far_off_it_is(delays, most_us, covered) -> None:
     error_us, said_us = np.array([line_after(30, delays, seed) for seed in range(150)]).T
     assert np.percentile(np.abs(error_us), 95) < most_us
     assert (np.abs(error_us) <= said_us).mean() > covered
+
+
+@pytest.mark.statistical
+def test_a_spell_in_which_the_host_was_busy_does_not_spoil_what_the_rest_tells() -> None:
+    """In the first 10 s, when such spells are much of the window: half of all lines say 8 ms otherwise."""
+    error_us, said_us = np.array([line_after(10, busy, seed) for seed in range(150)]).T
+    assert np.median(said_us) < 400.0
+    assert (np.abs(error_us) <= said_us).mean() > 0.95
 
 
 def line_after(duration_s, delays, seed, rate_hz=6400.0):
