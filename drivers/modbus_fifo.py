@@ -93,16 +93,13 @@ class FifoReader(CountedReader[Fifo]):
         self._unacknowledged = 0
 
     def _take(self, reply: _Reply) -> bool:
-        """Hand on what is new in a reply; returns whether its count is believed."""
+        """Hand on what is new in a reply, or hold it back; returns whether anything has been believed."""
         if self._next is None:
             self._next = self._index = reply.first
-        asked_again = bool(self._held)
         self._place_held(reply)
         if self._continues(reply):
             self._reject_held()
-            repeated = self._repeated(reply)
-            self._rows.counters.frames_received += reply.taken - repeated
-            self._rows.counters.frames_duplicate += 0 if asked_again else repeated
+            self._rows.counters.frames_received += reply.taken
             self._hand_on_new(reply)
             return True
         if self._drops:
@@ -113,14 +110,15 @@ class FifoReader(CountedReader[Fifo]):
         if self._held and self._contradicts_held(reply):
             self._reject_held()
         self._held.append(reply)
-        if len(self._held) < (SURE if self._gap(self._held[0]) is None else 2):
+        if len(self._held) < (2 if self._is_explained(self._held[0]) else SURE):
             return False
         *certain, last = self._held
+        self._rows.counters.frames_duplicate += self._repeated(certain[0])
         self._go_on_with(certain)
-        if self._continues(last):
-            self._go_on_with([last])
-        else:
+        if self._dropped(certain[-1], last):
             self._held = [last]
+        else:
+            self._go_on_with([last])
         return True
 
     @property
@@ -129,12 +127,18 @@ class FifoReader(CountedReader[Fifo]):
         return self._next
 
     def _continues(self, reply: _Reply) -> bool:
-        """Whether a reply has the next sample, or begins with some that the device has handed out before."""
-        return (self._following - reply.first) % self._modulus <= self._unacknowledged
+        """Whether a reply begins with the next sample."""
+        return reply.first == self._following
 
     def _repeated(self, reply: _Reply) -> int:
         """How many samples at the head of a reply have been taken before."""
-        return min((self._following - reply.first) % self._modulus, reply.taken)
+        behind = (self._following - reply.first) % self._modulus
+        repeatable = 0 if self._drops else max(self._unacknowledged, self._layout.samples_per_read)
+        return min(behind, reply.taken) if behind <= repeatable else 0
+
+    def _is_explained(self, reply: _Reply) -> bool:
+        """Whether a reply repeats samples, or the clock can explain what is missing before it."""
+        return self._repeated(reply) > 0 or self._gap(reply) is not None
 
     def _follows(self, held: _Reply, reply: _Reply) -> bool:
         """Whether a reply goes on from another one, but for what the device may have dropped in between."""
@@ -156,15 +160,18 @@ class FifoReader(CountedReader[Fifo]):
 
     def _contradicts_held(self, reply: _Reply) -> bool:
         """Whether a reply does not go on from those held back, or shows that the count is where it was."""
-        if not self._follows(self._held[-1], reply):
-            return True
-        return self._gap(self._held[0]) is None and self._gap(reply) is not None
+        last = self._held[-1]
+        if self._repeated(last):
+            return self._dropped(last, reply) > 0
+        return not self._follows(last, reply) or (
+            not self._is_explained(self._held[0]) and self._is_explained(reply)
+        )
 
     def _go_on_with(self, replies: Sequence[_Reply]) -> None:
         """Hand on replies that were held back."""
         self._held = []
         for reply in replies:
-            if not self._continues(reply):
+            if not (self._continues(reply) or self._repeated(reply)):
                 self._go_on_at(reply)
             if not self._drops:
                 self._rows.counters.frames_received += reply.taken - self._repeated(reply)
