@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol
 
 from drivers.modbus_outcomes import LineLostError, NoReplyError, RefusedError
+from drivers.modbus_replies import OTHER_REMEDY, REMEDIES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,7 +48,7 @@ class PollingReader(ABC):
     def __init__(self, streams: Sequence[str], clock: Clock) -> None:
         self._who = f"stream{'s' if len(streams) > 1 else ''} {' and '.join(map(repr, streams))}"
         self._clock = clock
-        self._said = ""
+        self._said: set[str] = set()
 
     async def run(self, line: ModbusLine) -> None:
         """See `Reader.run`."""
@@ -57,12 +58,16 @@ class PollingReader(ABC):
             except LineLostError:
                 return
             except (NoReplyError, RefusedError) as error:
-                if isinstance(error, RefusedError) and f"{error}" != self._said:
-                    self._said = f"{error}"
-                    logger.warning(
-                        "%s: %s; compare the register map of the device with the layout", self._who, error
-                    )
+                if isinstance(error, RefusedError):
+                    self._tell(error)
                 await self._pause_after_failure()
+
+    def _tell(self, error: RefusedError) -> None:
+        """Tell each refusal once; how often there are such, the counters of the bus say."""
+        if (said := f"{error}") not in self._said:
+            self._said.add(said)
+            remedy = REMEDIES.get(error.code, OTHER_REMEDY)
+            logger.warning("%s: %s, which is counted from now on; %s", self._who, said, remedy)
 
     @abstractmethod
     async def _look(self, line: ModbusLine) -> None:

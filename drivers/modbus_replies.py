@@ -32,6 +32,30 @@ EXCEPTIONS = {
     11: "gateway target device failed to respond",
 }
 
+REMEDIES = {
+    **dict.fromkeys((1, 2, 3), "compare the register map of the device with the layout"),
+    4: "see to the device",
+    5: "it takes longer than a reply may; lower the rate of what is read from it",
+    6: "it is at something else; lower the rate of what is read from it",
+    8: "its memory fails; have it repaired",
+    10: "compare unit with the routes of the gateway",
+    11: "see to the unit and its line behind the gateway, and compare unit with its address",
+}
+"""What to do about each of these."""
+
+OTHER_REMEDY = "look the exception up in the manual of the device"
+
+FAULTY: dict[Fault, str] = {
+    "truncated": "a reply that is too short",
+    "oversized": "a reply that is too long",
+    "corrupt": "bytes that are no frame",
+    "wrong_unit": "a reply in another unit's name",
+    "wrong_transaction": "a reply to another request",
+    "wrong_function": "a reply to another function",
+    "wrong_protocol": "what is not Modbus",
+}
+"""What a unit answers with, in words."""
+
 GATEWAY_CODES = frozenset({10, 11})
 """Exceptions by which a gateway says that the unit behind it is silent."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 import termios
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -14,7 +15,7 @@ from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus_outcomes import LineLostError, ModbusCounters, NoReplyError
-from drivers.modbus_replies import Expected, Verdict, judge_rtu, judge_tcp
+from drivers.modbus_replies import FAULTY, Expected, Verdict, judge_rtu, judge_tcp
 from drivers.tty import why_not_open
 
 if TYPE_CHECKING:
@@ -195,6 +196,8 @@ class ModbusWire(ModbusProtocol):
     def _why_not_open(self, error: Exception, patience_s: float) -> str:
         if self._serial:
             return why_not_open(error, self._options.serial_port, "serial_port")
+        if isinstance(error, socket.gaierror):
+            return f"no address of {self._options.host!r} is known ({error.strerror}); correct host"
         if isinstance(error, ConnectionRefusedError):
             return "nobody listens there; start the server, or correct host and tcp_port"
         if isinstance(error, TimeoutError):
@@ -225,11 +228,11 @@ class ModbusWire(ModbusProtocol):
             # Where the next frame begins is not known any more.
             where = self._options.where
             self._lose(f"{where} does not speak Modbus TCP; compare host and tcp_port with the device's")
-        elif self._expected is not None:
+        elif self._expected is not None and verdict.fault is not None:
             who = f"unit {self._expected.unit} at {self._options.where}"
             self._fail(
                 NoReplyError(
-                    f"{who} answers with a {verdict.fault} reply; compare its register map with the layout"
+                    f"{who} answers with {FAULTY[verdict.fault]}; compare its register map with the layout"
                 )
             )
         self._expected = None

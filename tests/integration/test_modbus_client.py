@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import socket
 import struct
+from unittest import mock
 
 import pytest
 import serial
@@ -107,6 +108,13 @@ def nobody(tmp_path):
 
 
 @contextlib.contextmanager
+def unknown(tmp_path):
+    nowhere = mock.Mock(side_effect=socket.gaierror(socket.EAI_NONAME, "Name or service not known"))
+    with mock.patch.object(socket, "getaddrinfo", nowhere):
+        yield LineOptions("tcp", host="no-such-host.invalid", tcp_port=502)
+
+
+@contextlib.contextmanager
 def unplugged(tmp_path):
     yield LineOptions("rtu", serial_port=str(tmp_path / "ttyUSB0"))
 
@@ -123,6 +131,10 @@ def in_use(tmp_path):
         (
             nobody,
             r"127\.0\.0\.1:\d+ cannot be opened: nobody listens there; start the server, or correct host",
+        ),
+        (
+            unknown,
+            r"no-such-host\.invalid:502 cannot be opened: no address of 'no-such-host\.invalid' is known",
         ),
         (unplugged, r"cannot be opened: there is no .*ttyUSB0; plug the device in, or correct serial_port"),
         (in_use, r"cannot be opened: another program has it open; stop that program"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import random
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from daqsvc.acquisition import supervisor
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus_layouts import Count, Fifo, Trend, sample_record
 from drivers.modbus_outcomes import ModbusCounters
-from drivers.modbus_replies import READ_FIFO
+from drivers.modbus_replies import READ_FIFO, WRITE_REGISTERS
 from drivers.modbus_silence import Enquiry, Patience, UnitSetAsideError, UnitSilence
 from drivers.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer
@@ -205,3 +206,82 @@ def test_all_that_a_dead_unit_was_asked_shares_its_probes():
     unit.answered(enquiries[0])
     for enquiry in enquiries:
         unit.check(enquiry, now_ns)
+
+
+def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
+    unit_side = units()
+    answer = unit_side[1].answer
+    codes = itertools.cycle([6, 2, 77, None])
+
+    def refusing(pdu):
+        code = next(codes)
+        return answer(pdu) if code is None else bytes([pdu[0] | 0x80, code])
+
+    unit_side[1].answer = refusing
+    rig = Rig(
+        options_of(serial=False, timeout_ms=TIMEOUT_MS), {"a": (trend_of(1, 3), 20.0)}, clock=LoopClock()
+    )
+
+    async def main():
+        async with responding(unit_side, lambda *_: Answer(), serial=False), rig.running():
+            await asyncio.sleep(10.0)
+
+    with caplog.at_level(logging.WARNING):
+        simulate(main)
+    begin = "stream 'a': unit 1 refuses function 3: {} (registers 3 to 3), which is counted from now on; {}"
+    assert [record.message for record in caplog.records if "refuses" in record.message] == [
+        begin.format(*told)
+        for told in (
+            ("server device busy", "it is at something else; lower the rate of what is read from it"),
+            ("illegal data address", "compare the register map of the device with the layout"),
+            ("exception 77", "look the exception up in the manual of the device"),
+        )
+    ]
+    assert rig.driver.counters.exceptions["server device busy"] >= 49
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("wrong function", "answers with a reply to another function; compare"),
+        ("truncated", "answers with a reply that is too short; compare"),
+        ("oversized", "answers with a reply that is too long; compare"),
+    ],
+)
+def test_what_is_wrong_with_a_reply_is_told_in_words(fault, words, caplog):
+    rig = Rig(
+        options_of(serial=False, timeout_ms=TIMEOUT_MS), {"a": (trend_of(1, 3), 20.0)}, clock=LoopClock()
+    )
+
+    async def main():
+        async with responding(units(), lambda *_: Answer(fault), serial=False), rig.running():
+            await asyncio.sleep(1.0)
+
+    with caplog.at_level(logging.WARNING):
+        simulate(main)
+    assert words in caplog.text
+
+
+@pytest.mark.parametrize("values", [[], [70_000], [-1], [1.5], ["1"], [0] * 124])
+def test_what_no_register_holds_is_not_sent(values):
+    rig = Rig(
+        options_of(serial=False, timeout_ms=TIMEOUT_MS, writes=[{"unit": 1, "address": 0, "count": 200}]),
+        {"a": (trend_of(1, 3), 20.0)},
+        clock=LoopClock(),
+    )
+    written = []
+
+    def plan(_unit, pdu):
+        written.append(pdu[0] == WRITE_REGISTERS)
+        return Answer()
+
+    async def main():
+        async with responding(units(), plan, serial=False), rig.running() as driver:
+            await asyncio.sleep(0.5)
+            with pytest.raises(ValueError, match=r"to be written; a re(gister|quest) "):
+                await driver.write(1, 0, values)
+            assert not any(written)
+            await driver.write(1, 0, [np.int64(65_535)])
+            assert any(written)
+
+    simulate(main)
