@@ -35,6 +35,8 @@ MAX_DRIFT = 0.05
 RECENT_DELAYS = 1024
 CONTRADICTION_NS = NS_PER_S // 2
 """How far arrivals must be off the line, beyond what it may err, to contradict it."""
+LATE_NS = 20_000_000
+"""By how much all arrivals of a while must be late, likewise, for the line to be in doubt."""
 CONTRADICTED_NS = 4 * NS_PER_S
 """How long late arrivals must contradict the line until it is given up."""
 CLOCK_DRIFT = 300e-6
@@ -77,6 +79,13 @@ class Placed(NamedTuple):
     kept: NDArray[np.bool_]
     restarts: list[int]
     anew: bool
+
+
+class Late(NamedTuple):
+    """Arrivals that were late: their bucket, and how late the earliest of them was by the line, in ns."""
+
+    bucket: Bucket
+    off_ns: float
 
 
 class TimeBase:
@@ -129,7 +138,7 @@ class TimeBase:
         self._error_ns = math.inf
         self._settled = False
         self._contradiction_ns = CONTRADICTION_NS + 2 * samples_per_frame * self._nominal_ns
-        self._contrary: list[tuple[Bucket, float]] = []
+        self._late: deque[Late] = deque()
 
     @property
     def state(self) -> TimeBaseState:
@@ -239,16 +248,12 @@ class TimeBase:
         ahead = max(0.0, x - last)
         return self._error_ns * (1.0 + 2.0 * ahead / (last - first))
 
-    @property
-    def _doubt_ns(self) -> float:
-        return self._contrary[-1][1] if self._contrary else 0.0
-
     def _forget(self) -> None:
         self._origin = self._bucket_best = None
         self._bucket_sums = (0, 0.0, 0.0)
         self._buckets = _NO_BUCKETS
         self._delays.clear()
-        self._contrary.clear()
+        self._late.clear()
         self._period_ns, self._offset_ns = self._nominal_ns, 0.0
         self._error_ns = math.inf
         self._settled = False
@@ -289,26 +294,39 @@ class TimeBase:
     def _take(self, bucket: Bucket) -> bool:
         """Lay the line under a bucket, unless it contradicts the line; returns whether that began anew."""
         off_ns = self._residual((bucket.x, bucket.y_ns)) - self._offset_ns if self._settled else 0.0
-        allowed_ns = self._contradiction_ns + (3.0 * self._line_error(bucket.x) if self._settled else 0.0)
-        if off_ns < -allowed_ns:
+        may_err_ns = 3.0 * self._line_error(bucket.x) if self._settled else 0.0
+        if off_ns < -self._contradiction_ns - may_err_ns:
             self._begin_anew([bucket])
             return True
-        if off_ns <= allowed_ns:
-            self._contrary.clear()
+        if off_ns <= LATE_NS + may_err_ns:
+            self._late.clear()
+        else:
+            self._late.append(Late(bucket, off_ns))
+            while len(self._late) > PARTS and bucket.y_ns - self._late[1].bucket.y_ns >= CONTRADICTED_NS:
+                self._late.popleft()
+        if off_ns <= self._contradiction_ns + may_err_ns:
             self._buckets = np.vstack([self._buckets[1 - WINDOW_BUCKETS :], bucket])
             self._support()
-            return False
-        self._contrary.append((bucket, off_ns))
-        begin, begin_off_ns = self._contrary[0]
-        span_ns = bucket.y_ns - begin.y_ns
-        if span_ns < CONTRADICTED_NS or len(self._contrary) < PARTS:
-            return False
-        if abs(off_ns - begin_off_ns) <= MAX_DRIFT * span_ns:
-            self._begin_anew([contrary for contrary, _ in self._contrary])
+        elif self._late_for(CONTRADICTED_NS):
+            self._begin_anew([late.bucket for late in self._late])
             return True
-        # They catch up, or fall further behind, faster than any clock: they are delayed.
-        del self._contrary[0]
         return False
+
+    def _late_for(self, duration_ns: int) -> bool:
+        """Whether all arrivals have been late for a while, by about as much: delayed ones catch up."""
+        first, last = self._late[0], self._late[-1]
+        span_ns = last.bucket.y_ns - first.bucket.y_ns
+        steady = abs(last.off_ns - first.off_ns) <= MAX_DRIFT * span_ns
+        return steady and span_ns >= duration_ns and len(self._late) >= PARTS
+
+    @property
+    def _doubt_ns(self) -> float:
+        """By how much the arrivals contradict the line."""
+        if not self._late:
+            return 0.0
+        if self._late[-1].off_ns > self._contradiction_ns:
+            return self._late[-1].off_ns
+        return min(late.off_ns for late in self._late) if self._late_for(CONTRADICTED_NS // 2) else 0.0
 
     def _begin_anew(self, buckets: list[Bucket]) -> None:
         origin = self._origin

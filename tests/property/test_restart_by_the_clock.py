@@ -174,3 +174,20 @@ def test_a_time_base_that_every_arrival_contradicts_begins_anew(step_s: float) -
     assert off_ns < 2 * JITTER_NS
     assert base.settled
     assert abs(base.state.drift_ppm) < 300
+
+
+@pytest.mark.parametrize("step_s", [0.05, 0.3, 0.45])
+def test_a_step_too_small_to_begin_anew_is_told_as_the_error_of_the_time_base(step_s: float) -> None:
+    """Of a device that did not count for that long: told within 2.5 s, for the minute that it lasts."""
+    base = TimeBase(RATE_HZ, 32, PER_FRAME, 1)
+    frames = sent(0, 140.0, 0.0, 1)
+    moved_ns = np.where(frames.taken_ns > START_NS + 60 * NS_PER_S, round(step_s * NS_PER_S), 0)
+    index, arrival_ns = frames.counter * PER_FRAME, frames.arrival_ns + moved_ns
+    for k in range(0, len(index), 5):
+        some = slice(k, k + 5)
+        assert not base._learn(index[some], arrival_ns[some])
+        newest = int(index[some][-1])
+        off_ns = abs(base.time_of(newest + PER_FRAME - 1) - frames.taken_ns[some][-1] - moved_ns[some][-1])
+        if not 6000 <= k < 6250:
+            assert off_ns < base.error_at(newest) + 2 * JITTER_NS
+    assert off_ns < 2 * JITTER_NS
