@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from itertools import combinations
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.settings.modbus import ModbusRtuBus
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
@@ -64,19 +66,12 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
 
 
 def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
-    """Ports are named so that they are found again, are named once, and are fast enough for their streams."""
-    owners: dict[str, str] = {}
+    """Ports are named so as to be found again, belong to one bus, and are fast enough for their streams."""
+    yield from _check_owners(draft)
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
             if not isinstance(bus, SerialBus):
                 continue
-            owner = owners.setdefault(bus.port, name)
-            if owner != name:
-                yield Finding(
-                    ("buses", name, "port"),
-                    f'belongs to bus "{owner}" already',
-                    "give each bus its own port",
-                )
             if _NUMBERED.fullmatch(bus.port):
                 yield Finding(
                     ("buses", name, "port"),
@@ -85,6 +80,26 @@ def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
                     fatal=False,
                 )
             yield from _check_streams(draft, name, bus)
+
+
+def _check_owners(draft: MachineFile) -> Iterator[Finding]:
+    """No port belongs to two buses, whatever they carry and whichever link to the port they name."""
+    owners: dict[Path, str] = {}
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if isinstance(bus, SerialBus):
+                key, port = "port", bus.port
+            elif isinstance(bus, ModbusRtuBus):
+                key, port = "serial_port", bus.serial_port
+            else:
+                continue
+            owner = owners.setdefault(Path(port).resolve(), name)
+            if owner != name:
+                yield Finding(
+                    ("buses", name, key),
+                    f'belongs to bus "{owner}" already',
+                    "give each bus its own port, or put all streams of the port on one bus",
+                )
 
 
 def _check_id(bus: CobsBus | SyncBus, name: str, layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:

@@ -169,3 +169,32 @@ def test_two_streams_of_a_port_have_marks_of_their_own():
         "1000.0\n[streams.more.layout]\nstream_id = 1", "1000.0\n[streams.more.layout]\nstream_id = 2"
     )
     assert parse_machine_file(good, SERIAL).streams["more"].layout.stream_id == 2
+
+
+RTU_BUS = """[buses.{name}]
+driver = "modbus"
+transport = "rtu"
+serial_port = "{port}"
+baud = 9600
+"""
+RTU_STREAM = """
+[streams.{name}]
+bus = "{name}"
+rate_hz = 1.0
+[streams.{name}.layout]
+way = "registers"
+unit = 1
+channels = [{{ name = "v", address = 0, type = "uint16" }}]
+"""
+
+
+def test_a_port_belongs_to_one_bus_whatever_it_carries_and_whatever_it_is_called(tmp_path):
+    (tmp_path / "ttyUSB0").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyUSB0")
+    text = SERIAL.read_text(encoding="utf-8").replace(PORT, f'"{tmp_path / "ttyUSB0"}"')
+    for name, port in (("one", tmp_path / "by-id"), ("other", "/dev/ttyS7"), ("third", "/dev/ttyS7")):
+        text += RTU_BUS.format(name=name, port=port) + RTU_STREAM.format(name=name)
+    found = "\n".join(map(str, problems_of(text, SERIAL)))
+    for name, owner in (("one", "probes"), ("third", "other")):
+        assert f'buses.{name}.serial_port = "' in found
+        assert f'belongs to bus "{owner}" already' in found
