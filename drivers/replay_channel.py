@@ -45,12 +45,14 @@ class ChannelChoice:
 
         Other channels are said once each.
         """
-        names = [message.channel for message in messages]
+        names = [None if message.channel is None else str(message.channel) for message in messages]
+        named = dict.fromkeys(name for name in names if name is not None)
         if self._chosen is None:
-            self._chosen = next((str(name) for name in names if name is not None), None)
-        self._found = self._found or self._chosen in names
-        for name in {str(name) for name in names if name is not None} - {self._chosen, *self._others}:
-            self._tell_of(name)
+            self._chosen = next(iter(named), None)
+        self._found = self._found or self._chosen in named
+        for name in named:
+            if name != self._chosen and name not in self._others:
+                self._tell_of(name)
         return [k for k, name in enumerate(names) if name is None or name == self._chosen]
 
     def _tell_of(self, name: str) -> None:
