@@ -195,6 +195,6 @@ def test_a_port_belongs_to_one_bus_whatever_it_carries_and_whatever_it_is_called
     for name, port in (("one", tmp_path / "by-id"), ("other", "/dev/ttyS7"), ("third", "/dev/ttyS7")):
         text += RTU_BUS.format(name=name, port=port) + RTU_STREAM.format(name=name)
     found = "\n".join(map(str, problems_of(text, SERIAL)))
-    for name, owner in (("one", "probes"), ("third", "other")):
+    for name, owner in (("one", "casing"), ("third", "other")):
         assert f'buses.{name}.serial_port = "' in found
         assert f'belongs to bus "{owner}" already' in found
