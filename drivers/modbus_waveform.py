@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamCounters
+from daqsvc.acquisition.books import note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
@@ -210,7 +211,9 @@ class WaveformReader(PollingReader):
 
     def _hand_on(self, rows: bytes, ended: _Ended) -> None:
         raw = np.frombuffer(rows, np.uint8).reshape(self._layout.samples, -1)
-        samples = np.ascontiguousarray(self._layout.record.decode(raw))
+        samples = note_received(
+            self._stream_counters, self._name, np.ascontiguousarray(self._layout.record.decode(raw))
+        )
         span_ns = round(len(samples) * self._period_ns)
         first, missing = 0, 0
         t_first_ns = ended.t_ns - span_ns
@@ -223,7 +226,6 @@ class WaveformReader(PollingReader):
         if missing:
             quality |= Quality.AFTER_LOSS | Quality.LOSS_ESTIMATED
             self._stream_counters.gaps += 1
-        self._stream_counters.samples_received += len(samples)
         self._end = (first + len(samples), ended.t_ns)
         self._deliver(
             SampleBlock(
