@@ -160,12 +160,9 @@ class FifoReader(CountedReader[Fifo]):
 
     def _contradicts_held(self, reply: _Reply) -> bool:
         """Whether a reply does not go on from those held back, or shows that the count is where it was."""
-        last = self._held[-1]
-        if self._repeated(last):
-            return self._dropped(last, reply) > 0
-        return not self._follows(last, reply) or (
-            not self._is_explained(self._held[0]) and self._is_explained(reply)
-        )
+        if not self._follows(self._held[-1], reply):
+            return True
+        return self._is_explained(reply) and not self._is_explained(self._held[0])
 
     def _go_on_with(self, replies: Sequence[_Reply]) -> None:
         """Hand on replies that were held back."""
@@ -178,7 +175,10 @@ class FifoReader(CountedReader[Fifo]):
             self._hand_on_new(reply)
 
     def _reject_held(self) -> None:
-        self._rows.counters.frames_rejected += sum(reply.taken for reply in self._held)
+        for reply in self._held:
+            repeated = self._repeated(reply)
+            self._rows.counters.frames_duplicate += repeated
+            self._rows.counters.frames_rejected += reply.taken - repeated
         self._held = []
 
     def _go_on_at(self, reply: _Reply) -> None:
