@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import socket
 import termios
@@ -153,6 +154,7 @@ class ModbusWire(ModbusProtocol):
         if self._alarm is None:
             self._alarm = self.loop.call_at(self._deadline_s, self._look_at_the_clock)
         self._begin_anew()
+        self._throw_away()
         try:
             self.transport.write(self._framer.encode(pdu, unit, self._transaction))  # type: ignore[attr-defined]
             return await self._reply
@@ -208,6 +210,16 @@ class ModbusWire(ModbusProtocol):
         """On a serial line, what came before a request or is left of it belongs to no reply."""
         if self._serial:
             self.recv_buffer = b""
+
+    def _throw_away(self) -> None:
+        """Throw away what waits in a serial port: it came while this process was kept from looking at it."""
+        port = getattr(self.transport, "sync_serial", None)
+        if port is None:
+            return
+        with contextlib.suppress(OSError, termios.error):  # a port that is gone: sending says so
+            if port.in_waiting:
+                port.reset_input_buffer()
+                self._counters.note("unasked")
 
     def _judge(self, data: bytes) -> Verdict:
         if len(data) > _BUFFER_BYTES:

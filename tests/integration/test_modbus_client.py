@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import select
 import socket
 import struct
 from unittest import mock
 
 import pytest
 import serial
+from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.modbus_client import ModbusClient
@@ -18,12 +21,18 @@ from drivers.modbus_wire import LineOptions
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 TIMEOUT_NS = 50_000_000
+PATIENT_S = 20.0
 
 
 def reply(request: bytes, *words: int) -> bytes:
     """The frame that answers a request to read registers."""
     data = struct.pack(f">{len(words)}H", *words)
     return request[:4] + struct.pack(">HBBB", 3 + len(data), request[6], request[7], len(data)) + data
+
+
+def rtu(body: bytes) -> bytes:
+    """A frame on a serial line."""
+    return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
 
 
 @contextlib.asynccontextmanager
@@ -148,3 +157,26 @@ async def test_why_a_line_cannot_be_opened_is_told_with_what_to_do(line, why, tm
             await client.connect()
         await client.close()
     assert counters.open_failures == 1
+
+
+async def test_what_came_while_this_process_was_suspended_is_not_the_reply_to_the_next_request(tmp_path):
+    """The quiet time has passed by the clock, but nobody has looked at what came in it."""
+    counters = ModbusCounters()
+    with PseudoTerminal(tmp_path / "port") as cable:
+        options = LineOptions(
+            "rtu", serial_port=str(cable.path), parity="none", timeout_ns=round(PATIENT_S * 1e9)
+        )
+        client = ModbusClient(options, SystemClock(), counters)
+        await client.connect()
+        fd = client._wire.transport.sync_serial.fileno()
+        late, sound = rtu(b"\1\3\2\0\1"), rtu(b"\1\3\2\0\2")
+        os.write(cable.fd, late)
+        assert select.select([fd], [], [], PATIENT_S)[0], "it is in the port, and the event loop has not run"
+        asking = asyncio.create_task(client.read(1, 3, 0, 1))
+        while not counters.requests:
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.05)
+        os.write(cable.fd, sound)
+        assert await asking == b"\0\2"
+        await client.close()
+    assert counters.replies_unasked == 1
