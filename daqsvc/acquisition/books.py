@@ -35,8 +35,9 @@ def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Sa
     absent = there.size - int(np.count_nonzero(there))
     if not counters.values_absent:
         logger.warning(
-            "stream %r: the device sends no value %d times, but says that it has none, or one beyond all "
-            "bounds; such values are missing, and are counted from now on. Look at the sensors behind it",
+            "stream %r: %d of its values are no measurements: the device says that it has none, or what it "
+            "sends is not finite; such values are missing, and are counted from now on. Look at the sensors "
+            "behind it",
             stream,
             absent,
         )

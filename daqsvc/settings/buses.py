@@ -185,7 +185,7 @@ class DbcChannel(Section):
             examples=['["AccelX"]'],
         ),
     ]
-    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW)
+    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW, examples=["[-32767, 32767]"])
 
 
 class DbcLayout(Section):

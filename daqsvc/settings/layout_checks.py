@@ -192,6 +192,16 @@ def _check_valid_raw(channels: Sequence[Channel], at: KeyPath) -> Iterator[Findi
                 f"does not lie within what {channel.type} can carry, {least:g} to {largest:g}",
                 "write the raw values as the device sends them, before scale and offset",
             )
+        elif (
+            channel.valid_raw is not None
+            and channel.type != "float32"
+            and any(v % 1 for v in channel.valid_raw)
+        ):
+            yield Finding(
+                (*at, index, "valid_raw"),
+                f"has a fraction, which no {channel.type} can carry",
+                "write whole numbers: raw values as the device sends them, before scale and offset",
+            )
 
 
 def check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:

@@ -91,7 +91,7 @@ class Channel(Section):
         float, AfterValidator(not_zero), Field(description="worth of one count", examples=[0.0005])
     ]
     offset: float = Field(default=0.0, description="wire value of the raw value 0")
-    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW)
+    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW, examples=["[-32767, 32767]"])
 
     @property
     def raw_bytes(self) -> int:

@@ -145,7 +145,7 @@ def test_absent_values_are_counted_beside_the_samples_and_said_once(caplog: pyte
     values = np.concatenate([block.samples for block in blocks])
     assert np.isnan(values).sum() == 12
     assert (values[np.isfinite(values)] == 1.0).all()
-    assert [r.message for r in caplog.records if "no value" in r.message] == [caplog.records[0].message]
+    assert [r.message for r in caplog.records if "no measurements" in r.message] == [caplog.records[0].message]
 
 
 def test_a_sensor_without_values_neither_raises_nor_clears_an_alarm() -> None:
@@ -203,6 +203,7 @@ def test_a_signal_of_a_data_base_has_them_too() -> None:
     [
         ("[32767, -32767]", "the least raw value that is a measurement must come first"),
         ("[-32768, 40000]", "does not lie within what int16 can carry, -32768 to 32767"),
+        ("[0.5, 40]", "has a fraction, which no int16 can carry"),
     ],
 )
 def test_a_range_that_cannot_be_is_refused(given: str, message: str) -> None:
