@@ -26,13 +26,15 @@ if TYPE_CHECKING:
 
 PARTS = 6
 """Parts of the window that a line is held against: the earliest arrival of each should lie on it."""
-SOFT = 0.9
+SOFT = 0.5
 """The mean line is taken if its slope is sure, at the window's end, to so much of the support's gap."""
 _LEAST_GROWTH = 1.3
 """Of the gap from parts to parts of these; 6 where small delays are frequent, nearing 1 as they get rare."""
-_SUPPORT_ERROR = (4.5, 5.4)
+_SUPPORT_ERROR = (2.5, 3.0)
 """The support's error in units of the gap, and of how far it lies above the least delay."""
-_MEAN_ERROR = (1.8, 4.5)
+_MEAN_ERROR = (1.0, 2.5)
+_CALM = 2.0
+"""The latest of six parts may make the mean gap so many times that of the rest; the host was busy then."""
 _HEARD = 0.5
 """Of its share of the arrivals, what a part must have to be held against the line."""
 _STALLED = 10.0
@@ -109,8 +111,8 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
     How that grows from the window to its parts, and to parts of these, tells how late the earliest of all is.
 
     Returns:
-        Offset of the line; mean gap between it and the earliest arrivals of all parts but the latest; how far
-        it is estimated to lie above the least delay there is.
+        Offset of the line; mean gap between it and the earliest arrivals of the parts; how far it is
+        estimated to lie above the least delay there is.
     """
     above = late - slope * x
     offset = float(above.min())
@@ -121,9 +123,9 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
         np.minimum.at(least, part, above - offset)
         # What comes at once after a stall tells how long that was, and nothing of the clock.
         heard = np.bincount(part, minlength=parts) * parts >= _HEARD * len(x)
-        # One part in which the host was busy does not spoil what the others tell.
         ranked = np.sort(least[heard])
-        gaps.append(float(ranked[: len(ranked) - round(len(ranked) / PARTS)].mean()))
+        calm = ranked[: len(ranked) - round(len(ranked) / PARTS)]
+        gaps.append(float(min(ranked.mean(), _CALM * calm.mean())))
     gap, fine_gap = gaps
     if gap <= 0.0:
         return offset, 0.0, 0.0
