@@ -82,6 +82,8 @@ class CanAdapter:
 
     def close(self) -> None:
         """See `drivers.can_batches.CanSource.close`."""
+        # With its traceback it would hold the bus until the next garbage collection.
+        self._failure = None
         self._bus.shutdown()
 
 

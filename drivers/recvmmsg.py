@@ -90,7 +90,8 @@ class DatagramBuffer:
         self._control_lengths: NDArray[np.uint64] = self._headers["control_length"]
         self._count = count
         self._used = 0
-        self._error: OSError | None = None
+        # Not the exception: with its traceback it would hold this buffer until the next garbage collection.
+        self._failed_with = 0
         self._recvmmsg = _recvmmsg()
 
     @property
@@ -110,9 +111,9 @@ class DatagramBuffer:
         Raises:
             OSError: what the socket reports; whatever came before it has been handed over.
         """
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
+        if self._failed_with:
+            code, self._failed_with = self._failed_with, 0
+            raise OSError(code, os.strerror(code))
         self._control_lengths[: self._used] = _CONTROL_BYTES  # the kernel overwrites what it used
         self._used = 0
         while self._used < self._count:
@@ -128,10 +129,9 @@ class DatagramBuffer:
             if code in {errno.EAGAIN, errno.EWOULDBLOCK}:
                 break
             if code != errno.EINTR:
-                error = OSError(code, os.strerror(code))
                 if not self._used:
-                    raise error
-                self._error = error
+                    raise OSError(code, os.strerror(code))
+                self._failed_with = code
                 break
         return self._used
 

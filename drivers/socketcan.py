@@ -83,7 +83,7 @@ class SocketCan:
         self._time = KernelTime(clock)
         self._buffer = DatagramBuffer(BATCH_FRAMES, FD_BYTES)
         self._dropped = 0
-        self._failure: OSError | None = None
+        self._failed_with = 0
         sock.setblocking(False)
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
@@ -101,11 +101,11 @@ class SocketCan:
         """
         asked_ns = self._clock.monotonic_ns()
         count = self._receive()
-        if not count and self._failure is None and self._poll.poll(1e3 * timeout_s):
+        if not count and not self._failed_with and self._poll.poll(1e3 * timeout_s):
             asked_ns = self._clock.monotonic_ns()
             count = self._receive()
-        if not count and self._failure is not None:
-            raise self._failure
+        if not count and self._failed_with:
+            raise OSError(self._failed_with, os.strerror(self._failed_with))
         stamps = self._buffer.stamps()
         drained = count < BATCH_FRAMES
         arrival_ns = self._time.monotonic(stamps.software_ns, stamps.hardware_ns, drained=drained)
@@ -151,7 +151,7 @@ class SocketCan:
         try:
             return self._buffer.receive(self._socket.fileno())
         except OSError as error:
-            self._failure = error
+            self._failed_with = error.errno or errno.EIO
             return self._buffer.receive(self._socket.fileno())
 
 

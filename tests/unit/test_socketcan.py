@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import resource
 import socket
 import struct
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -120,6 +122,24 @@ def test_the_other_end_going_away_is_an_error_after_what_it_sent(
     ours.close()
     with pytest.raises(OSError, match="the other end has closed the socket"):
         source.read(1.0)
+
+
+def test_a_bus_that_is_lost_gives_its_memory_back_at_once() -> None:
+    """A megabyte each, which a garbage collection that counts objects and not bytes would leave lying."""
+    gc.disable()
+    try:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        source = SocketCan(theirs, SystemClock())
+        memory = weakref.ref(source._buffer)
+        theirs.send(b"unread")  # what the other end has not read when it goes makes an error of its going
+        ours.close()
+        with pytest.raises(OSError, match="closed the socket"):
+            source.read(1.0)
+        source.close()
+        del source
+        assert memory() is None
+    finally:
+        gc.enable()
 
 
 def test_descriptors_past_1024_are_read() -> None:
