@@ -119,7 +119,13 @@ class RingReader(CountedReader[Ring]):
             sample_bytes = 2 * layout.record.registers
             self._rows.counters.frames_received += due - overwritten
             self._hand_on(rows[overwritten * sample_bytes :], look.seen_ns)
-        if (after.written - self._next) % self._modulus >= layout.samples_per_read:
+        unread = (after.written - self._next) % self._modulus
+        since_look = (after.written - look.written) % self._modulus
+        lately = self._sample_clock.most(after.seen_ns - look.asked_ns)
+        if since_look <= lately + self._sample_clock.standstill:
+            # Of two looks in order the later one is nearer to the truth, if the first was too low.
+            self._known = after, self._index + unread
+        if unread >= layout.samples_per_read:
             self._seen = after  # there is more already
         return True
 
