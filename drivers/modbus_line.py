@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus_client import ModbusClient
     from drivers.modbus_outcomes import ModbusCounters
-    from drivers.modbus_silence import Patience
+    from drivers.modbus_silence import Patience, Silence
     from drivers.registers import Run
 
 LONGEST_BABBLE = 4
@@ -155,44 +155,48 @@ class ModbusLine:
         self, unit: int, enquiry: Enquiry, request: Callable[[], Awaitable[Result]]
     ) -> tuple[Result, int, int]:
         """Make a request as soon as it may be; returns its result, when it went out and when it ended."""
-        silence = self._units.get(unit)
-        if silence is None:
-            silence = self._units[unit] = UnitSilence(unit, self._patience, self._counters)
-        silence.check(enquiry, self._clock.monotonic_ns())
-        if silence.doubtful(enquiry):
+        asked = self._units.get(unit)
+        if asked is None:
+            asked = self._units[unit] = UnitSilence(unit, self._patience, self._counters)
+        silence = asked.of(enquiry)
+        if asked.doubts(silence):
+            asked.check(silence, self._clock.monotonic_ns())
             await self._let_others_go_first()
         async with self._lock:
-            if self._quiet_left_ns() > 0:
-                await self._keep_quiet()
             asked_ns = self._clock.monotonic_ns()
-            silence.check(enquiry, asked_ns)
-            if silence.probes(enquiry):
-                self._counters.probes += 1
+            if self._quiet_until() > asked_ns:
+                await self._keep_quiet()
+                asked_ns = self._clock.monotonic_ns()
+            if asked.doubts(silence):
+                asked.check(silence, asked_ns)
+                self._counters.probes += asked.probes(silence)
             self._failed = True  # until a reply is there: also if this task is cancelled meanwhile
+            ended_ns = 0
             try:
                 result = await request()
             except LineLostError as error:
                 self._lose(f"{error}")
                 raise
             except NoReplyError as error:
-                self._miss(silence, enquiry, f"{error}")
+                self._miss(asked, silence, f"{error}")
                 raise
             except RefusedError as error:
                 self._failed = False
                 if error.code in GATEWAY_CODES:
-                    self._miss(silence, enquiry, f"{error}")
+                    self._miss(asked, silence, f"{error}")
                 else:
                     self._heard()
-                    silence.answered(enquiry, refused=True)
+                    asked.answered(silence, refused=True)
                 raise
             else:
                 self._failed = False
                 self._heard()
-                silence.answered(enquiry)
-                return result, asked_ns, self._clock.monotonic_ns()
+                asked.answered(silence)
+                ended_ns = self._clock.monotonic_ns()
+                return result, asked_ns, ended_ns
             finally:
                 silence_ns = self._patience.quiet_ns if self._failed else self._patience.gap_ns
-                self._quiet_until_ns = self._clock.monotonic_ns() + silence_ns
+                self._quiet_until_ns = (ended_ns or self._clock.monotonic_ns()) + silence_ns
 
     async def _let_others_go_first(self) -> None:
         """Line up behind all that is due soon: what stays without reply holds the line for long.
@@ -216,15 +220,14 @@ class ModbusLine:
     async def _keep_quiet(self) -> None:
         """Wait out the quiet time; a late reply makes it longer by a frame's gap."""
         longest_ns = self._quiet_until_ns + LONGEST_BABBLE * self._patience.quiet_ns
-        while (left_ns := min(self._quiet_left_ns(), longest_ns - self._clock.monotonic_ns())) > 0:
+        while (left_ns := min(self._quiet_until(), longest_ns) - self._clock.monotonic_ns()) > 0:
             await self._clock.sleep_ns(left_ns)
 
-    def _quiet_left_ns(self) -> int:
-        until_ns = max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
-        return until_ns - self._clock.monotonic_ns()
+    def _quiet_until(self) -> int:
+        return max(self._quiet_until_ns, self._client.last_byte_ns + self._patience.gap_ns)
 
-    def _miss(self, silence: UnitSilence, enquiry: Enquiry, why: str) -> None:
-        silence.missed(enquiry, why, self._clock.monotonic_ns())
+    def _miss(self, asked: UnitSilence, silence: Silence, why: str) -> None:
+        asked.missed(silence, why, self._clock.monotonic_ns())
         if all(unit.dead for unit in self._units.values()):
             self._lose(f"no unit answers any more; the last: {why}")
 

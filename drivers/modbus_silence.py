@@ -86,12 +86,22 @@ class Enquiry(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Silence:
-    """Requests without reply in a row, and when to ask again."""
+class Silence:
+    """Requests without reply in a row, and when to ask again.
 
+    Attributes:
+        enquiry: what was asked.
+        failures: requests without reply in a row.
+        wait_ns: how long it is set aside at a time.
+        probe_ns: when to ask again; None if it is not set aside.
+        hopeful: whether there was a reply when it was asked last, or it has not been asked yet.
+    """
+
+    enquiry: Enquiry
     failures: int = 0
     wait_ns: int = 0
     probe_ns: int | None = None
+    hopeful: bool = False
 
     def set_aside(self, patience: Patience, now_ns: int) -> bool:
         """Let nobody ask for a while; returns whether that is new."""
@@ -118,10 +128,8 @@ class UnitSilence:
         self._unit = unit
         self._patience = patience
         self._counters = counters
-        self._whole = _Silence()
-        self._enquiries: dict[Enquiry, _Silence] = {}
-        # What was answered when it was asked last, or has not been asked yet: the unit may live.
-        self._hopeful: set[Enquiry] = set()
+        self._whole = Silence(Enquiry(0, "anything"))
+        self._enquiries: dict[Enquiry, Silence] = {}
         self._last_words = ""
 
     @property
@@ -129,36 +137,39 @@ class UnitSilence:
         """Whether the whole unit is set aside."""
         return self._whole.probe_ns is not None
 
-    def check(self, enquiry: Enquiry, now_ns: int) -> None:
+    def of(self, enquiry: Enquiry) -> Silence:
+        """What is known about an enquiry; one that is new may be answered."""
+        silence = self._enquiries.get(enquiry)
+        if silence is None:
+            silence = self._enquiries[enquiry] = Silence(enquiry, hopeful=_is_repeated(enquiry))
+        return silence
+
+    def check(self, silence: Silence, now_ns: int) -> None:
         """Make sure that this may be asked now.
 
         Raises:
             UnitSetAsideError: it is not yet time.
         """
-        for silence in (self._whole, self._of(enquiry)):
-            if silence.probe_ns is not None and now_ns < silence.probe_ns:
+        for kept in (self._whole, silence):
+            if kept.probe_ns is not None and now_ns < kept.probe_ns:
                 raise UnitSetAsideError(f"unit {self._unit} is set aside: {self._last_words}")
 
-    def doubtful(self, enquiry: Enquiry) -> bool:
+    def doubts(self, silence: Silence) -> bool:
         """Whether this may well stay without reply."""
-        return self.dead or self._of(enquiry).failures > 0
+        return self.dead or silence.failures > 0
 
-    def probes(self, enquiry: Enquiry) -> bool:
+    def probes(self, silence: Silence) -> bool:
         """Whether this, asked now, is to find out if somebody is back."""
-        return self.dead or self._of(enquiry).probe_ns is not None
+        return self.dead or silence.probe_ns is not None
 
-    def answered(self, enquiry: Enquiry, *, refused: bool = False) -> None:
+    def answered(self, silence: Silence, *, refused: bool = False) -> None:
         """There was a reply.
 
         Args:
-            enquiry: to this.
-            refused: by which the unit refuses: it lives now, but need not be asked that again.
+            silence: what was asked.
+            refused: whether the unit refuses: it lives now, but need not be asked that again.
         """
-        silence = self._of(enquiry)
-        if refused:
-            self._hopeful.discard(enquiry)
-        elif enquiry.function != WRITE_REGISTERS:  # nobody need ever write again
-            self._hopeful.add(enquiry)
+        silence.hopeful = not refused and _is_repeated(silence.enquiry)
         if self.dead:
             self._counters.units_back += 1
             logger.warning("unit %d is back", self._unit)
@@ -166,18 +177,19 @@ class UnitSilence:
                 other.end()
         elif silence.probe_ns is not None:
             self._counters.requests_back += 1
-            logger.warning("unit %d answers %s again", self._unit, enquiry)
+            logger.warning("unit %d answers %s again", self._unit, silence.enquiry)
         self._whole.end()
         silence.end()
 
-    def missed(self, enquiry: Enquiry, why: str, now_ns: int) -> None:
+    def missed(self, silence: Silence, why: str, now_ns: int) -> None:
         """There was no reply, because of ``why``."""
-        whole, silence, patience = self._whole, self._of(enquiry), self._patience
+        whole, patience = self._whole, self._patience
         whole.failures += 1
         silence.failures += 1
-        self._hopeful.discard(enquiry)
+        silence.hopeful = False
         self._last_words = why
-        if not self._hopeful and whole.failures >= patience.demote_after:
+        lives = any(other.hopeful for other in self._enquiries.values())
+        if not lives and whole.failures >= patience.demote_after:
             if whole.set_aside(patience, now_ns):
                 self._counters.units_demoted += 1
                 logger.warning("%s; the unit is set aside, and %s", why, patience.of_probes)
@@ -186,11 +198,9 @@ class UnitSilence:
                 silence.probe_ns = now_ns + whole.wait_ns + patience.demotion_ns
         elif silence.failures >= patience.demote_after and silence.set_aside(patience, now_ns):
             self._counters.requests_demoted += 1
-            logger.warning("%s; %s is set aside, and %s", why, enquiry, patience.of_probes)
+            logger.warning("%s; %s is set aside, and %s", why, silence.enquiry, patience.of_probes)
 
-    def _of(self, enquiry: Enquiry) -> _Silence:
-        if enquiry not in self._enquiries:
-            self._enquiries[enquiry] = _Silence()
-            if enquiry.function != WRITE_REGISTERS:
-                self._hopeful.add(enquiry)
-        return self._enquiries[enquiry]
+
+def _is_repeated(enquiry: Enquiry) -> bool:
+    """Whether it is asked again and again: nobody need ever write again."""
+    return enquiry.function != WRITE_REGISTERS

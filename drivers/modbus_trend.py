@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from drivers.modbus_reading import PollingReader
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from daqsvc.acquisition.samples import Samples
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus_layouts import Trend
     from drivers.modbus_line import ModbusLine, Reading
@@ -111,8 +113,6 @@ class _TrendStream:
         if len(own) < len(self._places):
             return
         self._start_ns = start_ns
-        if self._rows and slot != self._rows[-1].slot + 1:
-            self.flush()
         registers = b"".join(reading.registers for reading in own)
         row = _Row(slot, registers, own[0].asked_ns, own[-1].answered_ns)
         self._rows.append(row)
@@ -123,32 +123,31 @@ class _TrendStream:
         """Hand on what has been read."""
         if not self._rows:
             return
-        rows, self._rows = self._rows, []
-        first = rows[0].slot
-        due_ns = [self._start_ns + round(row.slot * self._period_ns) for row in rows]
-        from_ns = min(row.from_ns - due for row, due in zip(rows, due_ns, strict=True))
-        to_ns = max(row.to_ns - due for row, due in zip(rows, due_ns, strict=True))
-        self._error_ns = (to_ns - from_ns) / 2
-        self._lateness_ns.extend(max(row.from_ns - due, 0) for row, due in zip(rows, due_ns, strict=True))
-        raw = np.frombuffer(b"".join(row.registers for row in rows), np.uint8).reshape(len(rows), -1)
+        slots, registers, asked_ns, answered_ns = zip(*self._rows, strict=True)
+        self._rows = []
+        raw = np.frombuffer(b"".join(registers), np.uint8).reshape(len(slots), -1)
         samples = np.ascontiguousarray(self._record.decode(raw))
+        slot = np.array(slots, np.int64)
+        due_ns = self._start_ns + np.rint(slot * self._period_ns).astype(np.int64)
+        from_ns, to_ns = np.array(asked_ns) - due_ns, np.array(answered_ns) - due_ns
+        self._lateness_ns.extend(from_ns.tolist())
+        gaps = (np.flatnonzero(np.diff(slot) != 1) + 1).tolist()
+        for begin, end in pairwise([0, *gaps, len(slots)]):
+            part = slice(begin, end)
+            earliest_ns, latest_ns = int(from_ns[part].min()), int(to_ns[part].max())
+            t_first_ns = int(due_ns[begin]) + (earliest_ns + latest_ns) // 2
+            self._hand_on(slots[begin], samples[part], t_first_ns, (latest_ns - earliest_ns) / 2)
+
+    def _hand_on(self, first: int, samples: Samples, t_first_ns: int, error_ns: float) -> None:
         lost = 0 if self._next is None else first - self._next
-        self._next = first + len(rows)
-        self.counters.frames_received += len(rows)
+        self._next, self._error_ns = first + len(samples), error_ns
+        self.counters.frames_received += len(samples)
         samples = note_received(self.counters, self.name, samples)
         if lost:
             note_gap(self.counters, self.name, lost, first)
+        quality = Quality.AFTER_LOSS if lost else Quality.GOOD
         self._deliver(
-            SampleBlock(
-                self.name,
-                first,
-                samples,
-                due_ns[0] + (from_ns + to_ns) // 2,
-                self._period_ns,
-                lost,
-                Quality.AFTER_LOSS if lost else Quality.GOOD,
-                self._error_ns,
-            )
+            SampleBlock(self.name, first, samples, t_first_ns, self._period_ns, lost, quality, error_ns)
         )
 
 
@@ -196,11 +195,11 @@ class TrendReader(PollingReader):
         readings: list[Reading | None] = []
         lost: frozenset[_TrendStream] = frozenset()
         failure: tuple[NoReplyError | RefusedError, Run, frozenset[_TrendStream]] | None = None
-        for run, takers in self._plan:
+        for run, what, takers in self._plan:
             reading = None
             if not takers <= lost:  # else nobody's sample can be whole any more
                 try:
-                    reading = await line.poll(self._unit, self._function, run, _words(run))
+                    reading = await line.poll(self._unit, self._function, run, what)
                 except (NoReplyError, RefusedError) as error:
                     failure = error, run, takers
                     lost |= takers
@@ -251,7 +250,7 @@ class TrendReader(PollingReader):
         for stream in self._streams:
             stream.take_from(runs, places[stream])
         self._plan = [
-            (run, frozenset(stream for stream in self._streams if place in places[stream]))
+            (run, _words(run), frozenset(stream for stream in self._streams if place in places[stream]))
             for place, run in enumerate(runs)
         ]
 

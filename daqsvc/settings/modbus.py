@@ -71,10 +71,12 @@ class _ModbusBus(Section):
         default=500.0, description="how long a unit may take to answer"
     )
     demote_after: Annotated[int, Field(ge=1, le=30)] = Field(
-        default=3, description="requests without reply, in a row, after which a unit is set aside"
+        default=3,
+        description="requests without reply, in a row, after which a unit or a request is set aside",
     )
     demotion_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
-        default=10.0, description="how long, before one request probes whether it is back"
+        default=10.0,
+        description="how long at first, before one request probes whether it is back; doubles up to 60 s",
     )
     writes: Annotated[tuple[Writable, ...], Field(strict=False)] = Field(
         default=(), description="registers that may be written; nothing else ever is"
@@ -120,7 +122,7 @@ class ModbusRtuBus(_ModbusBus):
     stop_bits: Literal[1, 2] = 1
     quiet_ms: Annotated[Positive, Field(le=60_000)] | None = Field(
         default=None,
-        description="silence after a request without reply; as long as timeout_ms unless more is given",
+        description="silence after a request without reply, at least timeout_ms; that longer after opening",
     )
 
     @property

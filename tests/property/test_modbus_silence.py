@@ -185,7 +185,7 @@ def test_all_that_a_dead_unit_was_asked_shares_its_probes():
     patience = Patience(0, 0, demote_after=3)
     counters = ModbusCounters()
     unit = UnitSilence(9, patience, counters)
-    enquiries = [Enquiry(3, f"registers {k}") for k in range(5)]
+    enquiries = [unit.of(Enquiry(3, f"registers {k}")) for k in range(5)]
     asked = 0
     now_ns = 0
     for enquiry in enquiries:
