@@ -94,39 +94,44 @@ async def in_thread(
         patience_s: how long to wait for its end when cancelled; None for as long as it takes. One that takes
             longer is left behind: what it did is undone when it ends, and the process may end before it.
     """
-    if patience_s is None:
-        work = asyncio.ensure_future(asyncio.to_thread(call, *arguments))
-    else:
-        begun = _in_thread_of_its_own(call, *arguments)
-        work = asyncio.ensure_future(asyncio.wrap_future(begun))
+    begun = None if patience_s is None else _in_thread_of_its_own(call, *arguments)
+    work = asyncio.ensure_future(
+        asyncio.to_thread(call, *arguments) if begun is None else asyncio.wrap_future(begun)
+    )
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
         await asyncio.wait({work}, timeout=patience_s)
         if not work.done():
             work.cancel()
-            if undo is not None:
+            if undo is not None and begun is not None:
                 begun.add_done_callback(partial(_undo_late, undo))
         elif undo is not None and work.exception() is None:
             await asyncio.to_thread(undo, work.result())
         raise
+    finally:
+        # The exception of a failed call holds this frame: were it held from here, what the call has opened
+        # would lie about until the next garbage collection.
+        del work, begun
 
 
 def _in_thread_of_its_own(call: Callable[..., T], *arguments: Any) -> Future[T]:
     """Begin a call in a thread that nobody waits for: asyncio's own are waited for when the process ends."""
     outcome: Future[T] = Future()
     outcome.set_running_or_notify_cancel()
-
-    def work() -> None:
-        try:
-            result = call(*arguments)
-        except BaseException as error:  # noqa: BLE001 - whoever waits for the outcome gets it
-            outcome.set_exception(error)
-        else:
-            outcome.set_result(result)
-
-    Thread(target=work, name=f"blocking {getattr(call, '__name__', 'call')}", daemon=True).start()
+    name = f"blocking {getattr(call, '__name__', 'call')}"
+    Thread(target=_settle, args=(outcome, call, arguments), name=name, daemon=True).start()
     return outcome
+
+
+def _settle(outcome: Future[T], call: Callable[..., T], arguments: tuple[Any, ...]) -> None:
+    try:
+        result = call(*arguments)
+    except BaseException as error:  # noqa: BLE001 - whoever waits for the outcome gets it
+        outcome.set_exception(error)
+        del outcome  # as in `in_thread`
+    else:
+        outcome.set_result(result)
 
 
 def _undo_late(undo: Callable[[T], object], outcome: Future[T]) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import subprocess
 import sys
 import threading
+import weakref
 from typing import TYPE_CHECKING
 
 import pytest
@@ -168,6 +170,31 @@ async def test_what_opens_long_after_its_driver_was_cancelled_is_closed_again_to
     assert not undone.is_set()
     go_on.set()
     assert await asyncio.to_thread(undone.wait, 10)
+
+
+class _Opened:
+    """What a call has opened when it fails; large, as buffers are."""
+
+
+@pytest.mark.parametrize("patience_s", [None, 0.5])
+async def test_what_a_call_that_failed_has_opened_is_let_go_at_once(patience_s: float | None) -> None:
+    opened: list[weakref.ref[_Opened]] = []
+
+    def fails() -> None:
+        half_open = _Opened()
+        opened.append(weakref.ref(half_open))
+        message = "the interface is down"
+        raise OSError(message)
+
+    gc.disable()
+    try:
+        with contextlib.suppress(OSError):
+            await in_thread(fails, patience_s=patience_s)
+        async with asyncio.timeout(10):
+            while opened[0]() is not None:  # its thread has yet to end
+                await asyncio.sleep(0.001)
+    finally:
+        gc.enable()
 
 
 def test_a_process_does_not_wait_for_a_call_that_hangs() -> None:
