@@ -131,7 +131,7 @@ class ModbusWire(ModbusProtocol):
         except (OSError, ValueError, termios.error) as error:  # a time-out and pyserial's own are OSErrors
             self._counters.open_failures += 1
             why = self._why_not_open(error, patience_s)
-            raise LineLostError(f"{self._options.where} cannot be opened: {why}") from error
+            raise LineLostError(f"it cannot be opened: {why}") from error
 
     async def exchange(self, request: Request) -> bytes:
         """Send a request and wait for its reply.
