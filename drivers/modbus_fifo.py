@@ -47,11 +47,18 @@ class FifoReader(CountedReader[Fifo]):
 
     The count at the head of a reply tells what is missing before it, and what has come before. A count that
     does not go on from the last reply is believed when the next ones go on from it; until then nothing is
-    acknowledged, and the samples are held back.
+    acknowledged, and the samples are held back. Where each reply has a checksum, what the clock can explain
+    is believed at once.
+
+    Args:
+        spec: the stream.
+        port: of its bus.
+        checked: whether a checksum goes with each reply, so that none is damaged unnoticed.
     """
 
-    def __init__(self, spec: StreamSpec[Fifo], port: BusPort) -> None:
+    def __init__(self, spec: StreamSpec[Fifo], port: BusPort, *, checked: bool) -> None:
         super().__init__(spec, port)
+        self._checked = checked
         self._drops = spec.layout.acknowledge is None
         self._unacknowledged = 0
         self._held: list[_Reply] = []
@@ -110,10 +117,14 @@ class FifoReader(CountedReader[Fifo]):
         if self._held and self._contradicts_held(reply):
             self._reject_held()
         self._held.append(reply)
-        if len(self._held) < (2 if self._is_explained(self._held[0]) else SURE):
+        explained = self._is_explained(self._held[0])
+        if not (self._checked and explained) and len(self._held) < (2 if explained else SURE):
             return False
+        self._rows.counters.frames_duplicate += self._repeated(self._held[0])
+        if self._checked:
+            self._go_on_with(self._held)
+            return True
         *certain, last = self._held
-        self._rows.counters.frames_duplicate += self._repeated(certain[0])
         self._go_on_with(certain)
         if self._dropped(certain[-1], last):
             self._held = [last]

@@ -29,7 +29,7 @@ def readers_for(port: BusPort, counters: ModbusCounters) -> list[Reader]:
         if isinstance(layout, Trend):
             polled.setdefault((layout.unit, layout.table, spec.rate_hz), []).append(spec)
         elif isinstance(layout, Fifo):
-            readers.append(FifoReader(spec, port))
+            readers.append(FifoReader(spec, port, checked=checked))
         elif isinstance(layout, Ring):
             readers.append(RingReader(spec, port, counters, checked=checked))
         else:
