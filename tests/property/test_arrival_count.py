@@ -126,3 +126,51 @@ def test_whoever_goes_without_a_counter_says_so() -> None:
     both = 'no_counter = true\ncounter = { byte = 7, bits = 8, counts = "frames" }'
     problem, _ = only_problem(SENSOR, ("no_counter = true", both))
     assert problem.key == "streams.foot.layout.no_counter"
+
+
+@given(
+    bursts=st.lists(st.tuples(st.integers(8, 40), st.integers(2, 4)), min_size=1, max_size=8),
+    missing=st.integers(0, 5),
+    batch=st.integers(1, 12),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_frames_that_were_held_up_and_then_come_at_once_are_no_loss(bursts, missing, batch, seed) -> None:
+    """What a busy gateway has held up catches up; what is missing besides is counted as ever."""
+    rng = np.random.default_rng(seed)
+    whole = 30 + sum(calm + held for calm, held in bursts)
+    sent = np.concatenate([np.arange(whole), whole + missing + np.arange(20)])
+    arrival_ns = sent * PERIOD_NS + rng.uniform(0, 0.3 * PERIOD_NS, len(sent))
+    at = 30
+    for calm, held in bursts:
+        arrival_ns[at : at + held] = (at + held) * PERIOD_NS
+        at += held + calm
+    arrival_ns = np.maximum.accumulate(arrival_ns).astype(np.int64)
+    blocks: list[SampleBlock] = []
+    stream = StreamAssembler(
+        "s", 100.0, counter_bits=None, samples_per_frame=1, counts_per_frame=1, deliver=blocks.append
+    )
+    for part in np.split(np.arange(len(sent)), range(batch, len(sent), batch)):
+        samples = sent[part].astype(np.float32)[:, None, None]
+        stream.accept(np.zeros(len(part), np.int64), samples, np.ones(len(part), np.bool_), arrival_ns[part])
+        stream.tick(int(arrival_ns[part[-1]]))
+    stream.flush()
+    assert stream.counters.samples_lost == missing
+    first = blocks[0].first_index
+    for block in blocks:
+        assert block.samples[:, 0].tolist() == list(range(block.first_index - first, block.end_index - first))
+
+
+def test_a_late_frame_waits_for_those_after_it_no_longer_than_said() -> None:
+    blocks: list[SampleBlock] = []
+    stream = StreamAssembler(
+        "s", 100.0, counter_bits=None, samples_per_frame=1, counts_per_frame=1, deliver=blocks.append
+    )
+    for k in [*range(50), 55]:
+        t_ns = k * PERIOD_NS
+        frame = np.full((1, 1, 1), k, np.float32)
+        stream.accept(np.zeros(1, np.int64), frame, np.ones(1, np.bool_), np.array([t_ns]))
+    assert blocks[-1].end_index == 50
+    stream.tick(55 * PERIOD_NS + 20 * PERIOD_NS)
+    stream.tick(55 * PERIOD_NS + 40 * PERIOD_NS)
+    assert blocks[-1].end_index == 56
+    assert blocks[-1].lost_before == 5
