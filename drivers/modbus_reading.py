@@ -46,7 +46,7 @@ class PollingReader(ABC):
     """
 
     def __init__(self, streams: Sequence[str], clock: Clock) -> None:
-        self._who = f"stream{'s' if len(streams) > 1 else ''} {' and '.join(map(repr, streams))}"
+        self._who = streams_in_words(streams)
         self._clock = clock
         self._said: set[str] = set()
 
@@ -62,12 +62,17 @@ class PollingReader(ABC):
                     self._tell(error)
                 await self._pause_after_failure()
 
-    def _tell(self, error: RefusedError) -> None:
-        """Tell each refusal once; how often there are such, the counters of the bus say."""
-        if (said := f"{error}") not in self._said:
+    def _tell(self, error: RefusedError, who: str = "") -> None:
+        """Tell each refusal once; how often there are such, the counters of the bus say.
+
+        Args:
+            error: what is refused.
+            who: gets no sample of it; all streams if left out.
+        """
+        if (said := f"{who or self._who}: {error}") not in self._said:
             self._said.add(said)
             remedy = REMEDIES.get(error.code, OTHER_REMEDY)
-            logger.warning("%s: %s, which is counted from now on; %s", self._who, said, remedy)
+            logger.warning("%s, which is counted from now on; %s", said, remedy)
 
     @abstractmethod
     async def _look(self, line: ModbusLine) -> None:
@@ -76,3 +81,9 @@ class PollingReader(ABC):
     @abstractmethod
     async def _pause_after_failure(self) -> None:
         """Wait until it is worth asking again."""
+
+
+def streams_in_words(names: Sequence[str]) -> str:
+    """Streams as a person would name them, e.g. ``"streams 'a', 'b' and 'c'"``."""
+    *others, last = map(repr, names)
+    return f"streams {', '.join(others)} and {last}" if others else f"stream {last}"

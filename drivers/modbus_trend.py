@@ -22,7 +22,7 @@ from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from drivers.modbus_layouts import FUNCTIONS
 from drivers.modbus_outcomes import NoReplyError, RefusedError
-from drivers.modbus_reading import PollingReader
+from drivers.modbus_reading import PollingReader, streams_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -48,6 +48,24 @@ LATE_NS = 2_000_000
 
 REFUSALS_OF_REGISTERS = frozenset({2, 3})
 """Exceptions by which a unit says that it has not these registers, or not so many at once."""
+
+APART_NS = 60 * NS_PER_S
+APART_MOST_NS = 3600 * NS_PER_S
+"""How long streams are read apart before they are tried together again; twice as long each time."""
+
+
+class _Failure(NamedTuple):
+    """A request that failed: why, for what, and whose samples it costs."""
+
+    error: NoReplyError | RefusedError
+    run: Run
+    takers: frozenset[_TrendStream]
+
+    @property
+    def of_sharing(self) -> bool:
+        """Whether the unit may have each stream's registers, and not all that lies between them."""
+        refused = isinstance(self.error, RefusedError) and self.error.code in REFUSALS_OF_REGISTERS
+        return refused and len(self.takers) > 1
 
 
 class _Row(NamedTuple):
@@ -175,10 +193,14 @@ class TrendReader(PollingReader):
         self._done = -1
         self._begun = False
         self._streams = [_TrendStream(spec, port) for spec in specs]
+        self._shared = runs
+        self._apart_ns = APART_NS
+        self._together_at_ns: int | None = None
+        """When the streams, now read apart, are tried together again."""
         if runs is None:
             self._read_apart()
         else:
-            self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
+            self._read_together(runs)
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -192,21 +214,32 @@ class TrendReader(PollingReader):
 
     async def _look(self, line: ModbusLine) -> None:
         slot = await self._wait_for_slot(line)
+        now_ns = self._clock.monotonic_ns()
+        if self._shared and self._together_at_ns is not None and now_ns >= self._together_at_ns:
+            self._read_together(self._shared)
+        readings, failure = await self._ask(line)
+        if failure is not None and failure.of_sharing:
+            self._part(failure)
+            readings, failure = await self._ask(line)
+        self._take(slot, readings)
+        if failure is not None:
+            self._fail(failure)
+
+    async def _ask(self, line: ModbusLine) -> tuple[list[Reading | None], _Failure | None]:
+        """Read all runs; the last failure that cost some stream its sample, if any."""
         readings: list[Reading | None] = []
         lost: frozenset[_TrendStream] = frozenset()
-        failure: tuple[NoReplyError | RefusedError, Run, frozenset[_TrendStream]] | None = None
+        failure: _Failure | None = None
         for run, what, takers in self._plan:
             reading = None
             if not takers <= lost:  # else nobody's sample can be whole any more
                 try:
                     reading = await line.poll(self._unit, self._function, run, what)
                 except (NoReplyError, RefusedError) as error:
-                    failure = error, run, takers
+                    failure = _Failure(error, run, takers)
                     lost |= takers
             readings.append(reading)
-        self._take(slot, readings)
-        if failure is not None:
-            self._fail(*failure)
+        return readings, failure
 
     def _take(self, slot: int, readings: Sequence[Reading | None]) -> None:
         """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
@@ -220,23 +253,33 @@ class TrendReader(PollingReader):
         for stream in self._streams:
             stream.take(self._done, self._start_ns, readings)
 
-    def _fail(self, error: NoReplyError | RefusedError, run: Run, takers: frozenset[_TrendStream]) -> None:
-        """Read the streams apart if the unit has not all that they share; else tell the failure as it is."""
-        if not isinstance(error, RefusedError):
-            raise error
-        told = RefusedError(f"{error} ({_words(run)})", error.code)
-        if error.code not in REFUSALS_OF_REGISTERS or len(takers) == 1:
-            raise told from error
-        logger.warning(
-            "%s: %s; each stream is polled by itself from now on, and from the start with a smaller max_gap "
-            "or forbidden",
-            self._who,
-            told,
-        )
+    def _part(self, failure: _Failure) -> None:
+        """Read the streams apart: the unit has not all that they share. Sooner or later try again."""
         self._read_apart()
+        self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
+        self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
+        if (said := f"{failure.error} ({_words(failure.run)})") not in self._said:
+            self._said.add(said)
+            logger.warning(
+                "%s: %s; each stream is polled by itself, and they are tried together only now and then. A "
+                "smaller max_gap, or forbidden, says so from the start",
+                self._who,
+                said,
+            )
+
+    def _fail(self, failure: _Failure) -> None:
+        """Tell a refusal with whom it concerns; whoever is silent is told by the line."""
+        if not isinstance(failure.error, RefusedError):
+            raise failure.error
+        told = RefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
+        self._tell(told, streams_in_words(sorted(stream.name for stream in failure.takers)))
 
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""
+
+    def _read_together(self, runs: Sequence[Run]) -> None:
+        self._together_at_ns = None
+        self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
 
     def _read_apart(self) -> None:
         runs: list[Run] = []

@@ -128,11 +128,61 @@ def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
     for name, value in (("one", 1016), ("other", 1020)):
         rig.check_books(name)
         assert (rig.samples(name) == value).all()
-        assert rig.counters(name).samples_received == pytest.approx(29, abs=1)
+        assert rig.counters(name).samples_received == pytest.approx(30, abs=1)
+        assert rig.counters(name).samples_lost == 0
     (said,) = [record.message for record in caplog.records if "polled by itself" in record.message]
     assert (
         "streams 'one' and 'other': unit 1 refuses function 3: illegal data address (registers 16 to 20)"
         in said
+    )
+
+
+def test_streams_that_were_parted_are_tried_together_again():
+    """A gateway that refused everything while it started is asked once for both, as before."""
+    streams = {"one": (trend([16]), 1.0), "other": (trend([20]), 1.0)}
+    unit_side = units()
+    answer, asked = unit_side[1].answer, []
+
+    def starting(pdu):
+        asked.append(Run(pdu[2], pdu[4]))
+        return b"\x83\2" if len(asked) <= 7 else answer(pdu)
+
+    unit_side[1].answer = starting
+    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
+
+    async def main():
+        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
+            await asyncio.sleep(300.0)
+
+    simulate(main)
+    assert asked[:9] == [Run(16, 5), *[Run(16, 1), Run(20, 1)] * 4]
+    assert set(asked[-100:]) == {Run(16, 5)}
+    for name in streams:
+        rig.check_books(name)
+        assert rig.counters(name).samples_received == pytest.approx(297, abs=2)
+
+
+def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(caplog):
+    streams = {name: (trend([at]), 1.0) for name, at in (("a", 16), ("b", 18), ("c", 20))}
+    unit_side = units()
+    answer = unit_side[1].answer
+    unit_side[1].answer = lambda pdu: b"\x83\2" if pdu[2] <= 18 < pdu[2] + pdu[4] else answer(pdu)
+    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
+
+    async def main():
+        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
+            await asyncio.sleep(1000.0)
+
+    with caplog.at_level(logging.WARNING):
+        simulate(main)
+    for name in ("a", "c"):
+        assert rig.counters(name).samples_lost == 0
+        assert rig.counters(name).samples_received == pytest.approx(1000, abs=1)
+    assert rig.counters("b").samples_received == 0
+    parted, refused = [record.message for record in caplog.records]
+    assert parted.startswith("streams 'a', 'b' and 'c': unit 1 refuses function 3: illegal data address")
+    assert refused.startswith(
+        "stream 'b': unit 1 refuses function 3: illegal data address (registers 18 to 18)"
     )
 
 
