@@ -128,7 +128,9 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
         gaps.append(float(min(ranked.mean(), _CALM * calm.mean())))
     gap, fine_gap = gaps
     if gap <= 0.0:
-        return offset, 0.0, 0.0
+        # So few arrivals that the line touches one in each part: the rest of them tell what there is to tell.
+        gap = float(above.mean()) - offset
+        return offset, gap, gap
     growth = min(max(fine_gap / gap - 1.0, _LEAST_GROWTH), float(PARTS))
     return offset, gap, gap / (growth - 1.0)
 
