@@ -56,6 +56,28 @@ def polled(streams, seconds, plan=lambda *_: Answer()):
     return rig, asked
 
 
+def watched(streams, unit_side, seconds):
+    """The driver after some simulated time with such units; its books close."""
+    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
+
+    async def main():
+        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
+            await asyncio.sleep(seconds)
+
+    simulate(main)
+    for name in streams:
+        rig.check_books(name)
+    return rig
+
+
+def without_register(address):
+    """Units, the first of which refuses whatever includes that register (illegal data address)."""
+    unit_side = units()
+    answer = unit_side[1].answer
+    unit_side[1].answer = lambda pdu: b"\x83\2" if pdu[2] <= address < pdu[2] + pdu[4] else answer(pdu)
+    return unit_side
+
+
 def test_two_streams_of_one_gateway_are_read_in_one_request():
     streams = {"drive-end": (trend([16, 18, 20]), 10.0), "other-end": (trend([24, 26]), 10.0)}
     rig, asked = polled(streams, 3.0)
@@ -112,21 +134,10 @@ def test_a_request_that_fails_costs_a_sample_of_those_in_it_and_of_nobody_else()
 
 def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
     streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
-    unit_side = units()
-    answer = unit_side[1].answer
-    # No register 18: the unit refuses what includes it (illegal data address).
-    unit_side[1].answer = lambda pdu: b"\x83\2" if pdu[2] <= 18 < pdu[2] + pdu[4] else answer(pdu)
-    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
-
-    async def main():
-        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
-            await asyncio.sleep(3.0)
-
     with caplog.at_level(logging.WARNING):
-        simulate(main)
+        rig = watched(streams, without_register(18), 3.0)
     assert rig.driver.counters.exceptions == {"illegal data address": 1}
     for name, value in (("one", 1016), ("other", 1020)):
-        rig.check_books(name)
         assert (rig.samples(name) == value).all()
         assert rig.counters(name).samples_received == pytest.approx(30, abs=1)
         assert rig.counters(name).samples_lost == 0
@@ -148,33 +159,17 @@ def test_streams_that_were_parted_are_tried_together_again():
         return b"\x83\2" if len(asked) <= 7 else answer(pdu)
 
     unit_side[1].answer = starting
-    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
-
-    async def main():
-        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
-            await asyncio.sleep(300.0)
-
-    simulate(main)
+    rig = watched(streams, unit_side, 300.0)
     assert asked[:9] == [Run(16, 5), *[Run(16, 1), Run(20, 1)] * 4]
     assert set(asked[-100:]) == {Run(16, 5)}
     for name in streams:
-        rig.check_books(name)
         assert rig.counters(name).samples_received == pytest.approx(297, abs=2)
 
 
 def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(caplog):
     streams = {name: (trend([at]), 1.0) for name, at in (("a", 16), ("b", 18), ("c", 20))}
-    unit_side = units()
-    answer = unit_side[1].answer
-    unit_side[1].answer = lambda pdu: b"\x83\2" if pdu[2] <= 18 < pdu[2] + pdu[4] else answer(pdu)
-    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
-
-    async def main():
-        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
-            await asyncio.sleep(1000.0)
-
     with caplog.at_level(logging.WARNING):
-        simulate(main)
+        rig = watched(streams, without_register(18), 1000.0)
     for name in ("a", "c"):
         assert rig.counters(name).samples_lost == 0
         assert rig.counters(name).samples_received == pytest.approx(1000, abs=1)
