@@ -62,11 +62,14 @@ class TextLog:
             Exception: the file cannot be read on, whatever its decompression raises then.
         """
         while True:
+            begun_at = self._lines.number
             try:
                 for message in self._reader(self._lines):  # type: ignore[arg-type]
                     yield whole(message)
             except Exception:
-                if self._lines.broken or not self._lines.can_go_on:
+                # A reader that fails at the header, which it is given again, would do so for ever.
+                stuck = self._lines.number == begun_at
+                if self._lines.broken or not self._lines.can_go_on or stuck:
                     raise
                 if not self.malformed:
                     self.first_malformed, self.first_malformed_at = self._lines.quoted, self._lines.number

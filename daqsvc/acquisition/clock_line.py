@@ -39,6 +39,8 @@ _HEARD = 0.5
 """Of its share of the arrivals, what a part must have to be held against the line."""
 _STALLED = 10.0
 """Arrivals later by more than so many times the median come from a stall, and bend the mean line."""
+_LEAST_USUAL = 6
+"""Of such means as the mean line is drawn through: one through fewer has nothing that speaks against it."""
 _SIGMAS = 2.0
 _TOUCHES_NS = 1e-3
 
@@ -96,7 +98,7 @@ def clock_line(buckets: Sequence[Bucket] | Floats, nominal_ns: float, max_slope_
     behind -= behind.min()
     usual = behind <= _STALLED * np.median(behind)
     mean_slope, spread_ns = _mean_slope(arrivals[usual], mean_x[usual], mean_late[usual])
-    if spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
+    if usual.sum() < _LEAST_USUAL or spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
         return ClockLine(slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
     offset, gap, missed = _touching(x, late, along, mean_slope)
     return ClockLine(

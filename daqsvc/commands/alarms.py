@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from daqsvc.commands.store_argument import Load
 
 HISTORY = 20
+SLOW_DISK_S = 0.5
 """Events that ``--history`` shows if nobody says how many."""
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_FILE = 0, 1, 2
@@ -100,6 +101,9 @@ def _tell_waiting(store: Path) -> None:
 
     try:
         waiting = events_waiting(store)
+        if waiting:  # on their way to a slow disk, as a rule
+            time.sleep(SLOW_DISK_S)
+            waiting = events_waiting(store)
     except ControlError:
         return  # no service, or one that this user may not ask: the journal is all there is
     if waiting:

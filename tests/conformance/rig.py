@@ -145,6 +145,12 @@ class Rig:
             while lasting_threads() - before:
                 await asyncio.sleep(LOOK_S)
 
+    async def until_closed(self, before: int) -> None:
+        """Wait until no more files are open than before: the far end is in this process, too."""
+        async with asyncio.timeout(PATIENCE_S):
+            while open_files() > before:
+                await asyncio.sleep(LOOK_S)
+
     def taken_ns(self, number: NDArray[np.int64]) -> NDArray[np.int64]:
         """When the device took the samples with these numbers."""
         return self._origin_ns + number * self.period_ns

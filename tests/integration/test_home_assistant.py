@@ -41,6 +41,7 @@ async def retained(port, topic):
     """What a client that comes now is told."""
     async with Consumer(port) as later:
         await eventually(lambda: later.on("/availability"), "the retained state arrives")
+        await asyncio.sleep(0.3)  # in any order
         return [message.payload for message in later.messages if message.topic == topic]
 
 

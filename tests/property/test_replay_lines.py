@@ -7,11 +7,13 @@ from pathlib import Path
 
 import can
 import pytest
+from can.io import TRCReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can_batches import Sorted
 from drivers.replay_can import CanLog
+from drivers.replay_lines import TextLog
 
 FRAMES = 40
 EPOCH_S = 1_640_995_200.0
@@ -82,3 +84,14 @@ def test_a_damaged_line_costs_no_other_frame(ending: str, damages: list[tuple[in
     assert all(bytes([k, 0xA5, 0, 0]) in played for k in range(FRAMES) if k not in damaged)
     assert len(found) + malformed <= FRAMES
     assert bool(log.first_malformed) == bool(malformed)
+
+
+def test_a_header_that_no_reader_takes_is_the_end_and_not_begun_for_ever(tmp_path: Path) -> None:
+    log = tmp_path / "run.trc"
+    log.write_text(
+        ";$FILEVERSION=x.1\n;$STARTTIME=y\n;---\n 1 0.000 DT 1 0101 Rx - 8 00 00 00 00 00 00 00 00\n"
+    )
+    played = TextLog(log.open(encoding="utf-8"), TRCReader)
+    with pytest.raises(ValueError, match="could not convert string to float"):
+        list(played)
+    played.close()
