@@ -189,11 +189,11 @@ class ModbusWire(ModbusProtocol):
 
     def callback_data(self, data: bytes, addr: tuple[object, ...] | None = None) -> int:
         """Never called: `data_received` takes all."""
-        raise NotImplementedError(f"{len(data)} bytes from {addr} have not come through data_received")
+        raise RuntimeError(f"{len(data)} bytes from {addr} have not come through data_received")
 
     def callback_new_connection(self) -> ModbusProtocol:
         """Never called: this end connects, and does not listen."""
-        raise NotImplementedError(f"{self._options.where} is a client's end and accepts no connection")
+        raise RuntimeError(f"{self._options.where} is a client's end and accepts no connection")
 
     def _why_not_open(self, error: Exception, patience_s: float) -> str:
         if self._serial:

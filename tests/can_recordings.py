@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,7 @@ from drivers.frames import FrameLayout
 from drivers.replay import ReplayDriver
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
+    from collections.abc import Mapping
 
     from can_standin import StandInBus
 
@@ -126,28 +125,9 @@ def recorded_driver(
     return CanDriver(port, open_source=bus.open)
 
 
-@contextlib.asynccontextmanager
-async def running(driver: CanDriver) -> AsyncIterator[None]:
-    """A driver that is up, and has been stopped afterwards."""
-    task = asyncio.create_task(driver.run())
-    try:
-        await until(lambda: driver.link.state == "up")
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
 def only_file(folder: Path) -> Path:
     [path] = folder.iterdir()
     return path
-
-
-async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(20):
-        while not true():
-            await asyncio.sleep(0.005)
 
 
 async def replayed(path: Path) -> tuple[ReplayDriver, list[SampleBlock]]:

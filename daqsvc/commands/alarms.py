@@ -64,6 +64,7 @@ class AlarmsCommand:
 
         try:
             store = chosen_store(arguments, self._load)
+            waiting = _waiting(store)
             if arguments.history is not None:
                 events = history(store, arguments.history)
             else:
@@ -71,7 +72,7 @@ class AlarmsCommand:
                 if not arguments.all:
                     events = [told for told in events if told["state"] != "normal"]
             _show(store, events, arguments)
-            _tell_waiting(store)
+            _tell_waiting(waiting)
         except BadFileError:
             return EXIT_BAD_FILE
         except (StoreNotFoundError, OutboxError) as error:
@@ -95,20 +96,24 @@ def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespa
         print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201
 
 
-def _tell_waiting(store: Path) -> None:
-    """Say so if the journal is not how things stand: the service has events that the disk has not got."""
+def _waiting(store: Path) -> int:
+    """Events that the service has and the disk cannot take: the journal is not how things stand then."""
     from daqsvc.control import ControlError, events_waiting  # noqa: PLC0415
 
     try:
-        waiting = events_waiting(store)
-        if waiting:  # on their way to a slow disk, as a rule
-            time.sleep(SLOW_DISK_S)
-            waiting = events_waiting(store)
+        if not events_waiting(store):
+            return 0
+        time.sleep(SLOW_DISK_S)  # they are on their way to a slow disk, as a rule
+        return events_waiting(store)
     except ControlError:
-        return  # no service, or one that this user may not ask: the journal is all there is
+        return 0  # no service, or one that this user may not ask: the journal is all there is
+
+
+def _tell_waiting(waiting: int) -> None:
     if waiting:
+        events = "1 event waits" if waiting == 1 else f"{waiting} events wait"
         print(  # noqa: T201 - what goes wrong goes to stderr
-            f"daqsvc alarms: {waiting} events wait in the service's memory for a disk that cannot be "
-            "written: this is not how the alarms stand by now; make room on the disk",
+            f"daqsvc alarms: {events} in the service's memory for a disk that cannot be written: this is not "
+            "how the alarms stand by now; make room on the disk",
             file=sys.stderr,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import re
 import threading
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from can_standin import frame_bytes
+from running_drivers import QuickClock, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -19,8 +19,6 @@ from drivers.can_bus import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
     from vcan_links import VcanLink
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -37,34 +35,9 @@ LAYOUT = FrameLayout.plain(
 )
 
 
-class QuickClock(SystemClock):
-    """Back-off at a hundredth of its length."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(duration_ns / 1e11)
-
-
 def driver_on(vcan: VcanLink, blocks: list[SampleBlock], **options: Any) -> CanDriver:
     chosen = {"interface": "socketcan", "channel": vcan.name, "fd": True} | options
     return CanDriver(BusPort("can0", chosen, [StreamSpec("s", LAYOUT, 3000.0)], QuickClock(), blocks.append))
-
-
-@contextlib.asynccontextmanager
-async def running(driver: CanDriver) -> AsyncIterator[None]:
-    task = asyncio.create_task(driver.run())
-    try:
-        await until(lambda: driver.link.state == "up")
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(20):
-        while not true():
-            await asyncio.sleep(0.01)
 
 
 async def call(*command: str) -> str:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
-from can_recordings import STREAMS, books, only_file, replayed, running, until
+from can_recordings import STREAMS, books, only_file, replayed
 from can_standin import frame_bytes
+from running_drivers import running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
@@ -11,15 +9,14 @@ import can
 import numpy as np
 import pytest
 from fake_can import FaultyBus
+from running_drivers import QuickClock, begun, until
 
-from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can_bus import CanDriver
 from drivers.frames import FrameLayout
 from sim_hw.bus_socket_wire import overflow_message
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -52,13 +49,6 @@ def message(frame: int, **changes: Any) -> can.Message:
     )
 
 
-class QuickClock(SystemClock):
-    """Back-off at a hundredth of its length."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(duration_ns / 1e11)
-
-
 def port(blocks: list[SampleBlock], **changes: Any) -> BusPort:
     arguments: dict[str, Any] = {
         "name": "can0",
@@ -70,23 +60,6 @@ def port(blocks: list[SampleBlock], **changes: Any) -> BusPort:
     return BusPort(**(arguments | changes))
 
 
-@contextlib.asynccontextmanager
-async def running(driver: CanDriver) -> AsyncIterator[None]:
-    task = asyncio.create_task(driver.run())
-    try:
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
-        while not true():
-            await asyncio.sleep(0.005)
-
-
 @pytest.fixture(autouse=True)
 def _renew() -> None:
     FaultyBus.renew()
@@ -96,7 +69,7 @@ async def test_frames_of_a_virtual_bus_become_blocks() -> None:
     blocks: list[SampleBlock] = []
     options = {"interface": "virtual", "channel": "test_frames_become_blocks", "fd": True}
     driver = CanDriver(port(blocks, options=options))
-    async with running(driver):
+    async with begun(driver):
         await until(lambda: driver.link.state == "up")
         with can.Bus(
             interface="virtual", channel=options["channel"], protocol=can.CanProtocol.CAN_FD
@@ -124,7 +97,7 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
         message(1, data=bytes(64)),  # CRC wrong
     ]
     with caplog.at_level(logging.WARNING):
-        async with running(driver):
+        async with begun(driver):
             for k, stray in enumerate(strays):
                 FaultyBus.inbox.put(stray)
                 FaultyBus.inbox.put(message(k))
@@ -158,7 +131,7 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
     blocks: list[SampleBlock] = []
     driver = CanDriver(port(blocks))
     with caplog.at_level(logging.WARNING):
-        async with running(driver):
+        async with begun(driver):
             for frame in range(5):
                 FaultyBus.inbox.put(message(frame))
             await until(lambda: driver.streams["shaft"][0].frames_received == 5)
@@ -181,7 +154,7 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
 
 async def test_an_adapter_that_reports_bus_off_by_its_state_is_opened_again() -> None:
     driver = CanDriver(port([]))
-    async with running(driver):
+    async with begun(driver):
         await until(lambda: driver.link.state == "up")
         FaultyBus.dead = True
         await until(lambda: driver.counters.bus_off >= 1)
@@ -195,7 +168,7 @@ async def test_a_hundred_losses_leave_no_thread_behind() -> None:
     blocks: list[SampleBlock] = []
     driver = CanDriver(port(blocks))
     before = threading.active_count()
-    async with running(driver):
+    async with begun(driver):
         for k in range(100):
             await until(lambda: driver.link.state == "up")
             FaultyBus.inbox.put(message(k))
@@ -219,7 +192,7 @@ async def test_absent_at_start_follows_the_policy() -> None:
     assert ignoring.counters.open_failures == 1
     FaultyBus.open_errors = [OSError("no"), can.CanInitializationError("no"), ValueError("no")]
     retrying = CanDriver(port([]))
-    async with running(retrying):
+    async with begun(retrying):
         await until(lambda: retrying.link.state == "up")
     assert retrying.counters.open_failures == 3
 
@@ -227,7 +200,7 @@ async def test_absent_at_start_follows_the_policy() -> None:
 async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
     blocks: list[SampleBlock] = []
     driver = CanDriver(port(blocks, streams=[StreamSpec("shaft", layout(), 1000.0, 10_000_000_000)]))
-    async with running(driver):
+    async with begun(driver):
         for frame in (0, 1, 3):
             FaultyBus.inbox.put(message(frame))
         await until(lambda: driver.streams["shaft"][0].frames_received == 3)
@@ -240,7 +213,7 @@ async def test_the_virtual_bus_tells_of_its_overflows_as_a_controller_does(tmp_p
     path = str(tmp_path / "can0")
     blocks: list[SampleBlock] = []
     driver = CanDriver(port(blocks, options={"interface": "unixbus", "channel": path, "fd": True}))
-    async with running(driver):
+    async with begun(driver):
         await until(lambda: driver.link.state == "up")
         with can.Bus(interface="unixbus", channel=path, fd=True, hub="join") as peer:
             peer.send(overflow_message(0.0, path))

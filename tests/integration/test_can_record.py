@@ -23,12 +23,11 @@ from can_recordings import (
     only_file,
     recorded_driver,
     replayed,
-    running,
     samples,
     traffic,
-    until,
 )
 from can_standin import StandInBus, frame_bytes
+from running_drivers import running, until
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from drivers import can_record
@@ -336,19 +335,25 @@ async def test_a_folder_that_cannot_be_written_stops_nothing(
     assert f"in {place}: " in said[0]
 
 
+def hung(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """A disk that takes nothing until the event is set."""
+    go_on = threading.Event()
+    flush = LogFile.flush
+
+    def held_up(log: LogFile) -> None:
+        go_on.wait()
+        flush(log)
+
+    monkeypatch.setattr(LogFile, "flush", held_up)
+    return go_on
+
+
 async def test_a_slow_disk_costs_its_own_frames_only(
     bus: StandInBus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
     monkeypatch.setattr(can_record, "MOST_FRAMES_HELD", 500)
-    go_on = threading.Event()
-    flush = LogFile.flush
-
-    def slow(log: LogFile) -> None:
-        go_on.wait()
-        flush(log)
-
-    monkeypatch.setattr(LogFile, "flush", slow)
+    go_on = hung(monkeypatch)
     sent = traffic(1000)
     driver = recorded_driver(bus, folder(tmp_path, "candump"))
     async with running(driver):
@@ -372,14 +377,7 @@ async def test_a_disk_that_hangs_does_not_keep_the_service_from_stopping(
 ) -> None:
     caplog.set_level(logging.WARNING)
     monkeypatch.setattr(can_record, "PATIENCE_S", 0.05)
-    go_on = threading.Event()
-    flush = LogFile.flush
-
-    def hangs(log: LogFile) -> None:
-        go_on.wait()
-        flush(log)
-
-    monkeypatch.setattr(LogFile, "flush", hangs)
+    go_on = hung(monkeypatch)
     sent = traffic(10)
     driver = recorded_driver(bus, folder(tmp_path, "blf"))
     async with running(driver):

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from can_recordings import running, until
 from can_standin import StandInBus, frame_bytes
+from running_drivers import running, until
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.assembly_drivers import drivers, frame_layout

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from can_standin import StandInBus, frame_bytes
+from running_drivers import running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -18,7 +17,7 @@ from drivers.can_bus import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from daqsvc.acquisition.samples import SampleBlock
 
@@ -42,24 +41,6 @@ def driver_on(bus: StandInBus, blocks: list[SampleBlock]) -> CanDriver:
     options = {"interface": "socketcan", "channel": "can7"}
     port = BusPort("can0", options, [StreamSpec("s", LAYOUT, 3000.0)], SystemClock(), blocks.append)
     return CanDriver(port, open_source=bus.open)
-
-
-@contextlib.asynccontextmanager
-async def running(driver: CanDriver) -> AsyncIterator[None]:
-    task = asyncio.create_task(driver.run())
-    try:
-        await until(lambda: driver.link.state == "up")
-        yield
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(true: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
-        while not true():
-            await asyncio.sleep(0.005)
 
 
 @pytest.fixture
