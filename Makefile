@@ -1,5 +1,6 @@
 # make demo   the whole service against a simulated machine, live in the terminal
 # make test   the tests
+# make test-long  the long ones: statistics over hundreds of runs, soak, fuzz
 # make hil    tests on real CAN interfaces (vcan), in a guest kernel where this one has none; as root
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
@@ -19,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test hil check bench bench-data nothing-lost lock clean
+.PHONY: help demo test test-long hil check bench bench-data nothing-lost lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -37,7 +38,10 @@ demo: $(READY)
 	@$(BIN)/daqsvc demo $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(ARGS)
+
+test-long: $(READY)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist load -m long $(ARGS)
 
 hil: $(READY)
 	@tests/hil/run.sh $(ARGS)
