@@ -84,6 +84,11 @@ class Alarm:
     def _shown(self) -> AlarmState:
         return shown(self._state, self._holds)
 
+    @property
+    def shelved_until_ns(self) -> int | None:
+        """End of shelving by the monotonic clock; None if it is not shelved."""
+        return self._shelved_until_ns
+
     def is_held(self, hold: Hold) -> bool:
         """Whether ``hold`` covers the state."""
         return hold in self._holds

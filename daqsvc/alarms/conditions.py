@@ -9,8 +9,6 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.record import Diagnosis
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.status import Instant
 
@@ -33,12 +31,12 @@ def no_statement(machine: str, at: Instant) -> Diagnosis:
     return _statement(machine, UNDETERMINED, Level.NORMAL, at)
 
 
-def unjudged(machine: str, name: str, conditions: Collection[str], at: Instant) -> Diagnosis:
+def unjudged(machine: str, name: str, at: Instant, *, is_condition: bool) -> Diagnosis:
     """The cause of what people do with alarm ``name`` before anybody has judged it.
 
-    For one of the ``conditions`` of the service it names that, so that it is known again after a restart.
+    For a condition of the service it names that, so that it is known again after a restart.
     """
-    return statement(machine, name, Level.NORMAL, at) if name in conditions else no_statement(machine, at)
+    return statement(machine, name, Level.NORMAL, at) if is_condition else no_statement(machine, at)
 
 
 def is_condition(event: AlarmEvent) -> bool:

@@ -23,7 +23,8 @@ class Expected:
     def __init__(self, handling: AlarmHandling) -> None:
         self.conditions = set(handling_conditions(flood=handling.flood, start_up=handling.start_up))
         """Those of the service itself."""
-        self._quality: set[str] = set()
+        self.quality: set[str] = set()
+        """Those that say whether a sensor can be judged."""
 
     def take(self, speakers: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
         """Learn more of them.
@@ -32,13 +33,13 @@ class Expected:
             speakers: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself.
         """
-        self._quality.update(quality_alarm(detector, sensors) for detector, sensors in speakers.items())
+        self.quality.update(quality_alarm(detector, sensors) for detector, sensors in speakers.items())
         self.conditions.update(conditions)
 
     @property
     def names(self) -> set[str]:
         """All of them."""
-        return self._quality | self.conditions
+        return self.quality | self.conditions
 
 
 def handling_conditions(*, flood: object | None, start_up: object | None) -> list[str]:

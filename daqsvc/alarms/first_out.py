@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from daqsvc.alarms.states import AlarmState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from daqsvc.alarms.events import AlarmEvent
 
@@ -65,10 +65,9 @@ class FirstOut:
             self._first.pop(group, None)
         return self.is_first(event.alarm)
 
-    @property
-    def marked(self) -> tuple[str, ...]:
-        """The alarms that hold the mark of their group, by name."""
-        return tuple(sorted(self._first.values()))
+    def marked(self) -> Iterator[str]:
+        """The alarms that hold the mark of their group, by name; sorted only once somebody looks."""
+        yield from sorted(self._first.values())
 
     def is_first(self, alarm: str) -> bool:
         """Whether ``alarm`` holds the mark of its group."""

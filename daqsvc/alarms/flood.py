@@ -7,7 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable
+
+MOST_FIRST_OUT = 5
+"""Alarms that stood first in their groups and are named: nobody reads a sentence that names a hundred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,7 @@ class FloodWatch:
         if self._limit is not None:
             self._called_ns.append(now_ns)
 
-    def sentence(self, now_ns: int, first_out: Sequence[str] = ()) -> str | None:
+    def sentence(self, now_ns: int, first_out: Iterable[str] = ()) -> str | None:
         """What has changed by ``now_ns``, in words for a person; None if nothing has.
 
         Args:
@@ -74,11 +77,17 @@ class FloodWatch:
         if not self.flooding and count > limit.events:
             self.flooding = True
             self.floods += 1
-            begin = f"look at {' and '.join(first_out)} first (first out), " if first_out else ""
+            first = list(first_out)
+            more = f" and {len(first) - MOST_FIRST_OUT} more" if len(first) > MOST_FIRST_OUT else ""
+            named = " and ".join(first[:MOST_FIRST_OUT])
+            begin = f"look at {named}{more} first (first out), " if first else ""
             return (
                 f"{count} alarms within {minutes:g} min are more than a person can attend to (limit "
                 f"{limit.events}); {begin}shelve what is known"
             )
+        while len(self._called_ns) > limit.events + 1:
+            # So many say that it is a flood; a longer list of them would only take memory.
+            self._called_ns.popleft()
         if self.flooding and 2 * count < limit.events:
             self.flooding = False
             return f"only {count} alarms in the last {minutes:g} min"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import uuid
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -23,32 +25,27 @@ from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
 from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
-from daqsvc.alarms.quality import PREFIXES, Doubts, quality_alarm
+from daqsvc.alarms.quality import PREFIXES, Doubts
+from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, Finding, LevelRule
+from daqsvc.alarms.shelving import ShelvingEnds
 from daqsvc.alarms.start_up import StartUpSignal
 from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError
 from daqsvc.alarms.status import Instant, Request
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand
-    from daqsvc.alarms.rules import Rule, Watch
+    from daqsvc.alarms.rules import Rule
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
 
 __all__ = ["AlarmHandling", "AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
 
-
-class _Ruled:
-    """An alarm with its rule, the rule's memory, and the sensors that it rests on."""
-
-    def __init__(self, alarm: Alarm, rule: Rule) -> None:
-        self.alarm = alarm
-        self.rule = rule
-        self.sensors = frozenset(rule.sensors)
-        self.watch: Watch = rule.watch()
+MOST_NAMED = 20
+"""Alarms that a refusal still lists by name."""
 
 
 class AlarmManager:
@@ -90,8 +87,12 @@ class AlarmManager:
         self._new_occurrence = new_occurrence
         self._handling = handling or AlarmHandling()
         self._expected = Expected(self._handling)
-        self._ruled: list[_Ruled] = []
+        self._ruled = RuledAlarms()
         self._alarms: dict[str, Alarm] = {}
+        self._shown: Counter[AlarmState] = Counter()
+        self._shelving_ends = ShelvingEnds()
+        self._unlooked = False
+        """Whether no diagnosis has come since `resume`: what was doubted before may silence any alarm."""
         self._conditions: set[str] = set()
         self._doubts = Doubts()
         self._start_up = StartUpSignal(self._handling.start_up)
@@ -104,20 +105,20 @@ class AlarmManager:
                 raise ValueError(f"alarm name {rule.alarm!r} is taken by the sensor checks; choose another")
             if rule.alarm in RESERVED:
                 raise ValueError(f"alarm name {rule.alarm!r} is taken by the service; choose another")
-            self._ruled.append(_Ruled(self._add(rule.alarm, latching=rule.latching), rule))
+            self._ruled.add(self._add(rule.alarm, latching=rule.latching), rule)
 
     @property
     def alarms(self) -> Mapping[str, AlarmStatus]:
-        """How every alarm stands by now, by name.
+        """How every alarm stands at any time, by name.
 
         A quality alarm or a condition of the service appears when it is first raised, or acted on.
         """
-        return MappingProxyType(
-            {
-                name: alarm.status._replace(first_out=self._first_out.is_first(name))
-                for name, alarm in self._alarms.items()
-            }
-        )
+        return _Statuses(self._alarms, self._first_out)
+
+    @property
+    def shown(self) -> Mapping[AlarmState, int]:
+        """How many alarms consumers see in each state but normal by now."""
+        return MappingProxyType(self._shown)
 
     @property
     def conditions(self) -> frozenset[str]:
@@ -178,6 +179,8 @@ class AlarmManager:
             raise
         self._alarms[alarm.name] = alarm
         self._conditions.update({alarm.name} & self._expected.conditions)
+        if command.verb is Verb.SHELVE:
+            self._await_end_of_shelving(alarm)
         self.counters.commands += 1
         return self._tell([event])
 
@@ -207,9 +210,10 @@ class AlarmManager:
         self._expected.take(speakers, conditions)
         for ruled in self._ruled:
             named = {sensor for d in ruled.rule.detectors for sensor in speakers.get(d, ())}
-            ruled.sensors = frozenset(named) or ruled.sensors
+            self._ruled.rest(ruled, frozenset(named) or ruled.sensors)
         self._first_out.resume(event for event in told if event.identity == self._identity)
         withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, speakers)]
+        self._unlooked = True
         for ruled in self._ruled:
             if (
                 ruled.alarm.is_held(Hold.SUPPRESSED)
@@ -241,7 +245,7 @@ class AlarmManager:
         """Mark and count events as they come about, and say if they are a flood."""
         told = [self._marked(event) for event in events]
         now = self._now()
-        sentence = self._flood.sentence(now.t_ns, self._first_out.marked)
+        sentence = self._flood.sentence(now.t_ns, self._first_out.marked())
         if sentence is not None:
             level = Level.ALERT if self._flood.flooding else Level.NORMAL
             told += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]
@@ -254,18 +258,24 @@ class AlarmManager:
         if event.kind in ANNUNCIATIONS and event.alarm != ALARM_FLOOD:
             self.counters.annunciations += 1
             self._flood.called(self._clock.monotonic_ns())
-        return replace(event, first_out=self._first_out.marks(event))
+        self._count(event.from_state, event.to_state)
+        return replace(event, first_out=True) if self._first_out.marks(event) else event
+
+    def _count(self, before: AlarmState, now: AlarmState) -> None:
+        self._shown[before] -= before is not AlarmState.NORMAL
+        self._shown[now] += now is not AlarmState.NORMAL
 
     def _events(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         self._start_up.take(diagnosis)
-        yield from self._quality(diagnosis, at)
-        followers = [ruled for ruled in self._ruled if diagnosis.detector in ruled.rule.detectors]
+        touched = self._doubts.take(diagnosis)
+        yield from self._quality(touched.alarms, diagnosis, at)
+        followers = self._ruled.fed_by(diagnosis.detector)
         for ruled in followers:
             # A statement without data changes nothing, not even what an alarm is known to rest on.
             if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":
-                ruled.sensors = frozenset(diagnosis.sensors)
-        yield from self._suppression(diagnosis, at)
-        given = Circumstances(self._start_up.multiplies(at.t_ns), frozenset(self._doubts.not_ok_sensors()))
+                self._ruled.rest(ruled, frozenset(diagnosis.sensors))
+        yield from self._suppression(touched.sensors, diagnosis, at)
+        given = Circumstances(self._start_up.multiplies(at.t_ns), self._doubts.not_ok_sensors)
         for ruled in followers:
             if diagnosis.quality != "good" or ruled.alarm.is_held(Hold.SUPPRESSED):
                 ruled.watch.hold(diagnosis)
@@ -275,9 +285,9 @@ class AlarmManager:
             if finding is not None:
                 yield from ruled.alarm.apply(finding, diagnosis, at)
 
-    def _quality(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
+    def _quality(self, names: Iterable[str], diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         """Raise, change or return the quality alarms that the diagnosis bears on."""
-        for name in self._doubts.take(diagnosis):
+        for name in names:
             doubts = self._doubts.of(name)
             if name not in self._alarms:
                 if not doubts:
@@ -287,9 +297,16 @@ class AlarmManager:
             alarm.doubts = doubts
             yield from alarm.apply(self._doubts.finding(name), diagnosis, at)
 
-    def _suppression(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
-        """Suppress what rests on a sensor that is not OK, and lift that when it is good again."""
-        for ruled in self._ruled:
+    def _suppression(
+        self, sensors: Collection[str], diagnosis: Diagnosis, at: Instant
+    ) -> Iterator[AlarmEvent]:
+        """Suppress what rests on a sensor that is not OK, and lift that when it is good again.
+
+        Nothing has changed for an alarm that the detector does not feed and that rests on no other sensor.
+        """
+        touched = self._ruled if self._unlooked else self._ruled.touched(diagnosis.detector, sensors)
+        self._unlooked = False
+        for ruled in touched:
             reason = self._doubts.silences(ruled.rule, ruled.sensors)
             if (reason is not None) == ruled.alarm.is_held(Hold.SUPPRESSED):
                 continue
@@ -299,11 +316,16 @@ class AlarmManager:
                 yield ruled.alarm.unsuppress("its sensors are good again", diagnosis, at)
 
     def _timed(self, now: Instant) -> Iterator[AlarmEvent]:
-        for alarm in self._alarms.values():
-            expired = alarm.expire(now, self._unjudged(alarm.name, now))
+        for name in self._shelving_ends.due(now.t_ns):
+            expired = self._alarms[name].expire(now, self._unjudged(name, now))
             if expired is not None:
                 yield expired
         yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
+
+    def _await_end_of_shelving(self, alarm: Alarm) -> None:
+        until_ns = alarm.shelved_until_ns
+        if until_ns is not None:
+            self._shelving_ends.put(alarm.name, until_ns)
 
     def _stand(self, name: str, level: Level, sentence: str, at: Instant) -> list[AlarmEvent]:
         if name in self._alarms and name not in self._conditions:
@@ -314,7 +336,7 @@ class AlarmManager:
             self._add(name, latching=False)
             self._conditions.add(name)
         cause = statement(self._identity.machine, name, level, at)
-        return self._alarms[name].apply(Finding(level, "", sentence), cause, at)
+        return self._alarms[name].apply(Finding(level, "", lambda: sentence), cause, at)
 
     def _obeyed(self, command: AlarmCommand, alarm: Alarm) -> AlarmEvent:
         standing = alarm.status.occurrence
@@ -324,10 +346,7 @@ class AlarmManager:
                 f"cannot {command.verb} {alarm.name}: occurrence {command.occurrence} is over, {stands}"
             )
         now = self._now()
-        request, nothing = (
-            Request(command.by, now, command.reason),
-            self._unjudged(alarm.name, now),
-        )
+        request, nothing = Request(command.by, now, command.reason), self._unjudged(alarm.name, now)
         match command.verb:
             case Verb.ACKNOWLEDGE:
                 return alarm.acknowledge(request)
@@ -343,7 +362,8 @@ class AlarmManager:
                 return alarm.unbypass(request, nothing)
 
     def _unjudged(self, name: str, at: Instant) -> Diagnosis:
-        return unjudged(self._identity.machine, name, self._conditions | self._expected.conditions, at)
+        is_condition = name in self._conditions or name in self._expected.conditions
+        return unjudged(self._identity.machine, name, at, is_condition=is_condition)
 
     def _named(self, name: str) -> Alarm:
         """The alarm of that name, or a new one if it can come by itself."""
@@ -351,18 +371,21 @@ class AlarmManager:
             return self._alarms[name]
         if name in self._expected.names:
             return self._made(name, latching=False)
-        known = ", ".join(sorted({*self._alarms, *self._expected.names})) or "none"
-        raise RefusedError(f"no alarm is named {name!r}; there are: {known}")
+        known = {*self._alarms, *self._expected.names}
+        there_are = f"there are: {', '.join(sorted(known)) or 'none'}"
+        if len(known) > MOST_NAMED:
+            there_are = f"there are {len(known)} others; daqsvc check lists those of the machine file"
+        raise RefusedError(f"no alarm is named {name!r}; {there_are}")
 
     def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
         """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
         ours, name = event.identity == self._identity, event.alarm
-        by_name = {ruled.alarm.name: ruled for ruled in self._ruled}
-        if ours and name in by_name:
-            self._resume_ruled(by_name[name], event)
+        ruled = self._ruled.named(name)
+        if ours and ruled is not None:
+            self._resume_ruled(ruled, event)
         elif event.own_state is AlarmState.NORMAL and not event.holds:
             return True
-        elif ours and name in {quality_alarm(detector, sensors) for detector, sensors in speakers.items()}:
+        elif ours and name in self._expected.quality:
             self._resume_unruled(event)
             self._doubts.resume(doubt for doubt in event.doubts if doubt.detector in speakers)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
@@ -374,14 +397,17 @@ class AlarmManager:
             return False
         return True
 
-    def _resume_ruled(self, ruled: _Ruled, event: AlarmEvent) -> None:
+    def _resume_ruled(self, ruled: Ruled, event: AlarmEvent) -> None:
         level = event.to_level if event.own_state.is_active else Level.NORMAL
-        found = ruled.watch.resume(level, event)
-        ruled.alarm.resume(event, found, self._since(event.wall_ns), self._now())
+        self._resume_alarm(ruled.alarm, event, ruled.watch.resume(level, event))
 
     def _resume_unruled(self, event: AlarmEvent) -> None:
-        alarm = self._add(event.alarm, latching=False)
-        alarm.resume(event, event.found, self._since(event.wall_ns), self._now())
+        self._resume_alarm(self._add(event.alarm, latching=False), event, event.found)
+
+    def _resume_alarm(self, alarm: Alarm, event: AlarmEvent, found: str) -> None:
+        alarm.resume(event, found, self._since(event.wall_ns), self._now())
+        self._count(AlarmState.NORMAL, alarm.status.state)
+        self._await_end_of_shelving(alarm)
 
     def _withdraw(self, event: AlarmEvent) -> AlarmEvent:
         alarm = Alarm(event.identity, event.alarm, latching=False, new_occurrence=self._new_occurrence)
@@ -408,3 +434,20 @@ class AlarmManager:
     def _instant(self, t_ns: int) -> Instant:
         """The wall-clock label of a monotonic time."""
         return Instant(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
+
+
+class _Statuses(Mapping[str, "AlarmStatus"]):
+    """How each alarm stands when it is asked for, so that nobody pays for those that nobody asks for."""
+
+    def __init__(self, alarms: Mapping[str, Alarm], first_out: FirstOut) -> None:
+        self._alarms = alarms
+        self._first_out = first_out
+
+    def __getitem__(self, name: str) -> AlarmStatus:
+        return self._alarms[name].status._replace(first_out=self._first_out.is_first(name))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._alarms)
+
+    def __len__(self) -> int:
+        return len(self._alarms)

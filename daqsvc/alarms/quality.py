@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections import defaultdict
+from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.events import Doubt
 from daqsvc.alarms.rules import Finding
@@ -10,6 +11,7 @@ from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
@@ -25,6 +27,18 @@ def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
     return f"detector-ok/{detector}"
 
 
+class Touched(NamedTuple):
+    """What a statement bears on.
+
+    Attributes:
+        alarms: names of quality alarms.
+        sensors: those of which it says, or takes back, that they are not OK.
+    """
+
+    alarms: tuple[str, ...]
+    sensors: frozenset[str]
+
+
 class Doubts:
     """What each detector has against its sensors, from a statement that is not good to the next good one.
 
@@ -33,56 +47,61 @@ class Doubts:
 
     def __init__(self) -> None:
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
+        self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
+        # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
+        self._blamed: dict[str, dict[str, str]] = {}
         self._unsettled: dict[str, set[str]] = {}
+        self._unsettled_by: defaultdict[str, set[str]] = defaultdict(set)
 
-    def take(self, diagnosis: Diagnosis) -> list[str]:
-        """Take in a statement; the quality alarms that it bears on."""
+    @property
+    def not_ok_sensors(self) -> AbstractSet[str]:
+        """The sensors that somebody blames by name, as it is at any time."""
+        return self._blamed.keys()
+
+    def take(self, diagnosis: Diagnosis) -> Touched:
+        """Take in a statement; what it bears on."""
         detector = diagnosis.detector
         name = quality_alarm(detector, diagnosis.sensors)
-        before = self._by_detector.pop(detector, None)
+        before = self._forget(detector)
+        touched: set[str] = set() if before is None else _blames(before[1])
         if diagnosis.quality == "good":
-            for detectors in self._unsettled.values():
-                detectors.discard(detector)
+            for alarm in self._unsettled_by.pop(detector, ()):
+                self._unsettled[alarm].discard(detector)
         else:
             not_ok = diagnosis.quality == "not_ok" or (before is not None and before[1].not_ok)
             doubt = Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
-            self._by_detector[detector] = (name, doubt)
+            self._remember(name, doubt)
+            touched |= _blames(doubt)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
-        return [name] if before is None or before[0] == name else [before[0], name]
+        alarms = (name,) if before is None or before[0] == name else (before[0], name)
+        return Touched(alarms, frozenset(touched))
 
     def resume(self, doubts: Iterable[Doubt]) -> None:
         """Go on from before a restart."""
         for doubt in doubts:
-            self._by_detector[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
+            self._forget(doubt.detector)
+            self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
 
     def unsettle(self, rule: Rule) -> None:
         """Whoever found a sensor of ``rule`` not OK is gone; now its own detectors must find them good."""
         self._unsettled[rule.alarm] = set(rule.detectors)
+        for detector in rule.detectors:
+            self._unsettled_by[detector].add(rule.alarm)
 
     def of(self, name: str) -> tuple[Doubt, ...]:
         """What is said against the subject of the quality alarm ``name``, by detector."""
-        return tuple(
-            sorted(doubt for alarm, doubt in self._by_detector.values() if alarm == name),
-        )
+        return tuple(sorted(self._by_alarm.get(name, {}).values()))
 
     def finding(self, name: str) -> Finding:
         """What the quality alarm ``name`` is to say."""
         subject, doubts = name.partition("/")[2], self.of(name)
         if not doubts:
-            return Finding(Level.NORMAL, "good", f"{subject} is good again")
+            return Finding(Level.NORMAL, "good", lambda: f"{subject} is good again")
         worst = min(doubts, key=lambda doubt: doubt.quality != "not_ok")
         what = "cannot be judged" if worst.quality == "missing" else "not OK"
         because = f": {worst.reason}" if worst.reason else ""
         said = "|".join(f"{d.detector}={d.quality}{'+not_ok' if d.not_ok else ''}" for d in doubts)
-        return Finding(Level.ALERT, said, f"{subject} {what}{because}")
-
-    def not_ok_sensors(self) -> dict[str, str]:
-        """The sensors that somebody blames by name, with the reason."""
-        return {
-            doubt.sensors[0]: doubt.reason or "a sensor is not OK"
-            for _, doubt in self._by_detector.values()
-            if doubt.not_ok and len(doubt.sensors) == 1
-        }
+        return Finding(Level.ALERT, said, lambda: f"{subject} {what}{because}")
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` cannot speak while it rests on ``sensors``; None if it can.
@@ -92,10 +111,44 @@ class Doubts:
         """
         if self._unsettled.get(rule.alarm):
             return "a sensor was not OK before the restart"
-        for detector in rule.detectors:
-            blamed = self._by_detector.get(detector)
-            if rule.spare == 0 and blamed is not None and blamed[1].not_ok:
-                return blamed[1].reason or "a sensor is not OK"
-        blamed_sensors = self.not_ok_sensors()
-        lost = [sensor for sensor in sorted(sensors) if sensor in blamed_sensors]
-        return blamed_sensors[lost[0]] if len(lost) > rule.spare else None
+        if rule.spare == 0:
+            for detector in rule.detectors:
+                blamed = self._by_detector.get(detector)
+                if blamed is not None and blamed[1].not_ok:
+                    return _reason(blamed[1])
+        lost = self._blamed.keys() & sensors if self._blamed else ()
+        return next(reversed(self._blamed[min(lost)].values())) if len(lost) > rule.spare else None
+
+    def _remember(self, name: str, doubt: Doubt) -> None:
+        self._by_detector[doubt.detector] = (name, doubt)
+        self._by_alarm[name][doubt.detector] = doubt
+        for sensor in _blames(doubt):
+            self._blamed.setdefault(sensor, {})[doubt.detector] = _reason(doubt)
+
+    def _forget(self, detector: str) -> tuple[str, Doubt] | None:
+        """Take back what a detector had against its sensors, and say what that was."""
+        before = self._by_detector.pop(detector, None)
+        if before is None:
+            return None
+        name, doubt = before
+        _drop(self._by_alarm, name, detector)
+        for sensor in _blames(doubt):
+            _drop(self._blamed, sensor, detector)
+        return before
+
+
+def _blames(doubt: Doubt) -> set[str]:
+    """The sensor that a doubt is about, if it is one and not OK: of several nobody knows which it is."""
+    return {doubt.sensors[0]} if doubt.not_ok and len(doubt.sensors) == 1 else set()
+
+
+def _reason(doubt: Doubt) -> str:
+    return doubt.reason or "a sensor is not OK"
+
+
+def _drop(table: dict[str, dict[str, Doubt]] | dict[str, dict[str, str]], key: str, detector: str) -> None:
+    """Take a detector out of the row of ``key``, and the row with the last of them."""
+    row = table[key]
+    del row[detector]
+    if not row:
+        del table[key]

@@ -11,6 +11,9 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from collections.abc import Set as AbstractSet
+
     from daqsvc.alarms.events import AlarmEvent
     from daqsvc.alarms.setpoints import Setpoint
     from daqsvc.diagnosis.record import Diagnosis
@@ -51,12 +54,17 @@ class Finding(NamedTuple):
     Attributes:
         level: the level by now.
         identity: what is found, where a level can have several causes, e.g. ``"F1L2"``.
-        sentence: the finding for a person, without the name of the alarm.
+        say: puts the finding into words. Few findings become an event; what is not asked for is not made.
     """
 
     level: Level
     identity: str
-    sentence: str
+    say: Callable[[], str]
+
+    @property
+    def sentence(self) -> str:
+        """The finding for a person, without the name of the alarm; to be asked before the next diagnosis."""
+        return self.say()
 
 
 class Circumstances(NamedTuple):
@@ -68,7 +76,7 @@ class Circumstances(NamedTuple):
     """
 
     starting: bool = False
-    not_ok: frozenset[str] = frozenset()
+    not_ok: AbstractSet[str] = frozenset()
 
 
 class Watch(Protocol):
@@ -300,8 +308,9 @@ class _LevelWatch:
         if found is None:
             return None
         level, value = found
-        sentence = self._watch.in_words(diagnosis, self._sensor, value)
-        return Finding(level, self._watch.side(value), sentence)
+        return Finding(
+            level, self._watch.side(value), lambda: self._watch.in_words(diagnosis, self._sensor, value)
+        )
 
     def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
         self._watch.monitor.hold()
@@ -327,7 +336,11 @@ class _DecisionWatch:
             # A group may flicker with the evidence from statement to statement; only what the detector itself
             # calls a change makes another finding of it.
             self._group = diagnosis.group
-        return Finding(level, _identity(diagnosis.decision, self._group), self._sentence(diagnosis, evidence))
+        return Finding(
+            level,
+            _identity(diagnosis.decision, self._group),
+            lambda: self._sentence(diagnosis, evidence),
+        )
 
     def hold(self, diagnosis: Diagnosis) -> None:
         """The detector itself holds its decision."""

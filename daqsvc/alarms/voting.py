@@ -104,7 +104,7 @@ class _VotingWatch:
             elif votes + silent < self._rule.vote and level >= reached:
                 level = Level(reached - 1)
         self._level = level
-        return Finding(level, "", self._sentence(watch.in_words(diagnosis, sensor, value), valid))
+        return Finding(level, "", lambda: self._sentence(watch.in_words(diagnosis, sensor, value), valid))
 
     def hold(self, diagnosis: Diagnosis) -> None:
         sensor = self._sensor_of[diagnosis.detector]
