@@ -20,7 +20,7 @@ from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.states import AlarmState, Level, RefusedError
 from daqsvc.audit import AuditError, AuditLog
 from daqsvc.outbox.limits import OutboxLimits
-from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload
@@ -273,7 +273,7 @@ class AlarmDesk:
         return CommandOutcome(
             accepted=True,
             reason=_not_on_disk(committed),
-            events=tuple(f"{self.identity.box}-{sequence}" for sequence in _sequences(committed)),
+            events=tuple(event_id(self.outbox.series, number) for number in _sequences(committed)),
         )
 
     async def _write_down(
@@ -329,7 +329,9 @@ class AlarmDesk:
         topic = self.topics.alarm(event.identity.machine, event.alarm)
         try:
             committed = self.outbox.submit(
-                topic, lambda sequence: alarm_payload(event, sequence).to_json(), retain=True
+                topic,
+                lambda sequence: alarm_payload(event, sequence, self.outbox.series).to_json(),
+                retain=True,
             )
         except OutboxError as error:
             committed = asyncio.get_running_loop().create_future()

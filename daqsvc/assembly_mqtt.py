@@ -79,7 +79,7 @@ def sparkplug_settings(machine: MachineFile, store: Path) -> SparkplugSettings |
         servers=tuple(
             Server(host_of(url), port_of(url), is_tls(url)) for url in given.servers or (mqtt.url,)
         ),
-        client_id=given.client_id or f"{machine.mqtt_client_id}-sparkplug",
+        client_id=given.client_id or f"{machine.mqtt_client_id}:sparkplug",
         memory=store / "sparkplug.json",
         primary_host=given.primary_host,
         alarms=(*(alarm.name for alarm in machine.alarms), *_services(machine, mqtt_settings(machine))),

@@ -57,13 +57,13 @@ class AlarmRig:
             last[event.alarm] = event
         after = AlarmRig(*self.rules, handling=self.handling, clock=self.clock)
         after.events = list(self.events)
-        told = [alarm_event(alarm_payload(event, 1).to_json()) for event in last.values()]
+        told = [alarm_event(alarm_payload(event, 1, "series").to_json()) for event in last.values()]
         after.told(after.manager.resume(told, speakers or {}, conditions))
         return after
 
     def told(self, events):
         for event in events:
-            back = alarm_event(alarm_payload(event, 1).to_json())
+            back = alarm_event(alarm_payload(event, 1, "series").to_json())
             assert replace(back, cause=event.cause) == event  # what JSON cannot say is NaN in the cause
         self.events += events
         return events

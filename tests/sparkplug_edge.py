@@ -77,7 +77,9 @@ class Machine:
         for event in events:
             topic = TOPICS.alarm("rig", event.alarm)
             await self._outbox.append(
-                topic, lambda sequence, event=event: alarm_payload(event, sequence).to_json(), retain=True
+                topic,
+                lambda sequence, event=event: alarm_payload(event, sequence, "series").to_json(),
+                retain=True,
             )
 
     async def flips(self, times: int) -> None:

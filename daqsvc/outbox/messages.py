@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -68,6 +69,19 @@ class Draft:
             raise TypeError(f"the payload for {self.topic} is of type {type(payload).__name__}; give bytes")
         self.topic.encode()  # or the database refuses it later, for all others of the commit as well
         return OutboxMessage(sequence, self.topic, payload, self.retain)
+
+
+def new_series() -> str:
+    """What the ids of one opening of the outbox begin with: 80 random bits.
+
+    So no copy, no older state and no damage of a store can bring an id back, and no two boxes share one.
+    """
+    return secrets.token_hex(10)
+
+
+def event_id(series: str, sequence: int) -> str:
+    """The id of a message, unique in the world; it stays with the message however often that is sent."""
+    return f"{series}-{sequence}"
 
 
 def is_sound(number: object, topic: object, payload: object, told: object) -> bool:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 from daqsvc.outbox.counters import OutboxCounters, TelemetryCounters
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
-from daqsvc.outbox.messages import Draft, OutboxError, OutboxMessage, TelemetryMessage
+from daqsvc.outbox.messages import Draft, OutboxError, OutboxMessage, TelemetryMessage, new_series
 from daqsvc.outbox.telemetry import Telemetry
 from daqsvc.outbox.writer import Batch, JournalWriter, fail, succeed
 
@@ -54,9 +54,14 @@ class Outbox:
             stands beside it, ``outbox-telemetry.sqlite``.
         clock: the service's clock.
         limits: how much is kept.
+
+    Attributes:
+        counters: what was done so far.
+        series: what the ids of new messages begin with (see `outbox.messages.event_id`).
     """
 
     def __init__(self, path: Path, clock: Clock, limits: OutboxLimits | None = None) -> None:
+        self.series = new_series()
         self.counters = OutboxCounters()
         self._limits = OutboxLimits() if limits is None else limits
         self._journal = Journal(path, clock.wall_ns, self._limits)

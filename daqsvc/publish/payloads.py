@@ -14,6 +14,7 @@ from daqsvc.acquisition.clock import iso_utc
 from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import HOLDS, AlarmState, Level
 from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
+from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -162,12 +163,12 @@ class AvailabilityPayload(Stamped):
     reason: str
 
 
-def alarm_payload(event: AlarmEvent, sequence: int) -> AlarmPayload:
-    """The payload of an alarm event that the outbox has given ``sequence``."""
+def alarm_payload(event: AlarmEvent, sequence: int, series: str) -> AlarmPayload:
+    """The payload of an alarm event that the outbox has given ``sequence`` in ``series``."""
     identity = event.identity
     return AlarmPayload(
         **_stamp(identity.site, identity.box, event.t_ns, event.wall_ns),
-        id=f"{identity.box}-{sequence}",
+        id=event_id(series, sequence),
         sequence=sequence,
         machine=identity.machine,
         alarm=event.alarm,

@@ -230,9 +230,7 @@ def _sparkplug(draft: MachineFile, mqtt: Mqtt) -> Iterator[Finding]:
                 "has other encryption than mqtt.url, whose credentials it would get",
                 f"write {'mqtts' if mqtt.tls else 'mqtt'}:// in both",
             )
-    if given.client_id is not None and given.client_id == (
-        mqtt.client_id or f"daqsvc-{draft.site}-{draft.box}"
-    ):
+    if given.client_id is not None and given.client_id == draft.mqtt_client_id:
         yield Finding(
             ("mqtt", "sparkplug", "client_id"),
             f'is "{given.client_id}" like that of [mqtt]: a broker ends one connection for the other',

@@ -232,7 +232,8 @@ class MachineFile(Section):
     def mqtt_client_id(self) -> str:
         """The client id for the broker: as in the file, else from site and box."""
         given = self.mqtt.client_id if self.mqtt is not None else None
-        return given or f"daqsvc-{self.site}-{self.box}"
+        # No name holds a colon, so that no two boxes come to the same.
+        return given or f"daqsvc-{self.site}:{self.box}"
 
     def resolve(self, path: Path) -> Path:
         """A path of the file, made absolute: relative ones start at the directory of the machine file."""

@@ -56,7 +56,7 @@ class Mqtt(Section):
     ]
     insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
     client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
-        default=None, description="how the broker knows this box; daqsvc-<site>-<box> if absent"
+        default=None, description="how the broker knows this box; daqsvc-<site>:<box> if absent"
     )
     username: Annotated[str, Field(min_length=1)] | None = Field(
         default=None, description="user at the broker"

@@ -20,7 +20,7 @@ class Sparkplug(Section):
     edge_node: Name | None = Field(default=None, description="edge node id; the box if absent")
     device: Name | None = Field(default=None, description="device id; the machine's name if absent")
     client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
-        default=None, description="MQTT client id; that of [mqtt] with -sparkplug if absent"
+        default=None, description="MQTT client id; that of [mqtt] with :sparkplug if absent"
     )
     primary_host: Name | None = Field(
         default=None, description="host application to wait for; waits for nobody if absent"

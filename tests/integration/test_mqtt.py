@@ -78,10 +78,10 @@ class Service:
         for event in self._manager.take(diagnosis):
             sequence = await self._outbox.append(
                 TOPICS.alarm("rig", event.alarm),
-                lambda number, event=event: alarm_payload(event, number).to_json(),
+                lambda number, event=event: alarm_payload(event, number, "series").to_json(),
                 retain=True,
             )
-            self.ids.append(f"edge-1-{sequence}")
+            self.ids.append(f"series-{sequence}")
 
     async def cycle(self, times=1):
         for _ in range(times):
@@ -314,7 +314,7 @@ async def test_without_a_broker_it_stops_at_once_and_keeps_everything(outbox, ca
         async with asyncio.timeout(1.0):
             await publisher.stop()
     assert [m.sequence for m in await outbox.pending(0, 10)] == [
-        int(one.removeprefix("edge-1-")) for one in service.ids
+        int(one.removeprefix("series-")) for one in service.ids
     ]
     assert len(caplog.records) == 1
 

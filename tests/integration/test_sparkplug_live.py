@@ -53,7 +53,7 @@ def test_what_is_not_said_follows_from_the_box(tmp_path: Path) -> None:
     settings = sparkplug_settings(machine, tmp_path)
     assert (settings.group, settings.edge_node, settings.device) == ("lab", "edge-1", "laval-rig")
     assert settings.servers == (Server("broker.example", 8883, tls=True),)
-    assert settings.client_id == "daqsvc-lab-edge-1-sparkplug"
+    assert settings.client_id == "daqsvc-lab:edge-1:sparkplug"
     assert "rotor-fault" in settings.alarms
     assert "Sparkplug B edge node lab/edge-1" in " ".join(describe(machine).split())
 
@@ -68,7 +68,7 @@ def test_without_the_table_there_is_no_edge_node(tmp_path: Path) -> None:
     [
         ('servers = ["mqtt://other.example"]', "mqtt.sparkplug.servers[0]", "other encryption"),
         ('servers = ["other"]', "mqtt.sparkplug.servers[0]", "not the address"),
-        ('client_id = "daqsvc-lab-edge-1"', "mqtt.sparkplug.client_id", "ends one connection"),
+        ('client_id = "daqsvc-lab:edge-1"', "mqtt.sparkplug.client_id", "ends one connection"),
         ('group = "a/b"', "mqtt.sparkplug.group", "a/b"),
     ],
 )

@@ -131,7 +131,7 @@ def _ids(evidence: Evidence) -> set[str]:
 
 def _committed(evidence: Evidence) -> set[str]:
     """The ids of what the teller was told to be on disk."""
-    return {f"{evidence.script.identity.box}-{sequence}" for sequence in evidence.witness.committed_ns}
+    return evidence.witness.committed_ids
 
 
 def _finished(evidence: Evidence) -> Iterable[str]:

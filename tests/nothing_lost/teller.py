@@ -26,6 +26,7 @@ from nothing_lost.script import RULES, SENSORS, Script
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.outbox.messages import event_id
 from daqsvc.publish.mqtt import MqttSettings
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ class Witness:
 
     Attributes:
         committed_ns: when it learnt that a number is on disk (CLOCK_MONOTONIC), by number.
+        committed_ids: the ids of these.
         committed_twice: numbers that were given twice.
         settled: steps whose events are all on disk: these and all before.
         starts: how often the process has begun to tell.
@@ -61,6 +63,7 @@ class Witness:
     """
 
     committed_ns: dict[int, int] = field(default_factory=dict)
+    committed_ids: set[str] = field(default_factory=set)
     committed_twice: list[int] = field(default_factory=list)
     settled: int = -1
     starts: int = 0
@@ -71,10 +74,11 @@ class Witness:
         witness = cls()
         for line in path.read_text().splitlines() if path.exists() else ():
             match line.split():
-                case ["committed", sequence, t_ns]:
+                case ["committed", sequence, t_ns, series]:
                     if int(sequence) in witness.committed_ns:
                         witness.committed_twice.append(int(sequence))
                     witness.committed_ns[int(sequence)] = int(t_ns)
+                    witness.committed_ids.add(event_id(series, int(sequence)))
                 case ["settled", step]:
                     witness.settled = int(step)
                 case ["started"]:
@@ -107,7 +111,9 @@ class Teller:
     def _witnessed_submit(self, *arguments: Any, **options: Any) -> asyncio.Future[int]:
         committed = self._submit(*arguments, **options)
         committed.add_done_callback(
-            lambda future: self.write("committed", future.result(), time.monotonic_ns())
+            lambda future: self.write(
+                "committed", future.result(), time.monotonic_ns(), self._desk.outbox.series
+            )
         )
         self._under_way.append(committed)
         return committed

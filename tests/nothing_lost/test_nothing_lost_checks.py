@@ -17,6 +17,7 @@ from daqsvc.publish.payloads import alarm_payload
 
 SCRIPT = Script.of_seed(7)
 FIRST = 1000
+SERIES = "series"
 
 
 @pytest.fixture
@@ -28,11 +29,14 @@ def evidence():
     for step in SCRIPT.steps:
         clock.advance_to(clock.monotonic_ns() + 1_000_000)
         for event in manager.take(step.diagnosis(SCRIPT.identity.machine, clock.monotonic_ns())):
-            payloads.append(alarm_payload(event, FIRST + len(payloads)).to_json())
+            payloads.append(alarm_payload(event, FIRST + len(payloads), SERIES).to_json())
     return Evidence(
         script=SCRIPT,
         witness=Witness(
-            {FIRST + n: 0 for n in range(len(payloads))}, settled=len(SCRIPT.steps) - 1, done=True
+            {FIRST + n: 0 for n in range(len(payloads))},
+            {f"{SERIES}-{FIRST + n}" for n in range(len(payloads))},
+            settled=len(SCRIPT.steps) - 1,
+            done=True,
         ),
         journal={json.loads(payload)["id"]: payload for payload in payloads},
         arrivals=[Arrival(n, "t/alarms/a", payload) for n, payload in enumerate(payloads)],
@@ -114,6 +118,7 @@ def test_an_event_that_the_script_does_not_know_is_seen(evidence):
 def test_a_script_that_was_not_told_to_the_end_is_seen(evidence):
     last = evidence.arrivals.pop().alarm
     del evidence.journal[last["id"]], evidence.witness.committed_ns[last["sequence"]]
+    evidence.witness.committed_ids.remove(last["id"])
     evidence.witness.done = False
     found = violations(evidence)
     assert "never came to an end" in found

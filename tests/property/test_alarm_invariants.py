@@ -104,7 +104,7 @@ class Alarms(RuleBasedStateMachine):
     def tell(self, events):
         """A consumer that knows nothing but the payloads."""
         for sent in events:
-            payload = alarm_payload(sent, next(self.sequence)).to_json()
+            payload = alarm_payload(sent, next(self.sequence), "series").to_json()
             self.journal.pop(sent.alarm, None)
             self.journal[sent.alarm] = payload
             event = alarm_event(payload)

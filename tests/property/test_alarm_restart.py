@@ -74,7 +74,7 @@ class Box:
                 events = self.manager.obey(AlarmCommand(verb=what, alarm=which, by="ann"))
         for event in events:
             self.journal.pop(event.alarm, None)
-            self.journal[event.alarm] = alarm_payload(event, 1).to_json()
+            self.journal[event.alarm] = alarm_payload(event, 1, "series").to_json()
         return [
             (event.alarm, event.kind, event.from_state, event.to_state, event.to_level, event.occurrence)
             for event in events

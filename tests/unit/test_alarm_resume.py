@@ -175,7 +175,7 @@ def test_when_it_was_is_told_by_the_wall_clock_after_a_reboot():
 def test_what_cannot_be_read_is_left_out_and_logged_once(caplog):
     topics = Topics("daqsvc", "lab", "edge-1")
     (event,) = history(manager(ROTOR), mode("F1", "alert"))
-    good = alarm_payload(event, 7).to_json()
+    good = alarm_payload(event, 7, "series").to_json()
     shelved = json.dumps(json.loads(good) | {"state": "shelved"}).encode()
     topic = topics.alarm("rig", "rotor-fault")
     other_box = topic.replace("edge-1", "edge-2")
@@ -199,7 +199,7 @@ def test_what_cannot_be_read_is_left_out_and_logged_once(caplog):
 def test_a_suppression_that_an_earlier_version_told_is_taken_over():
     (_, event) = history(manager(ROTOR), mode("F1", "alert"), rms(9.0, "not_ok"))[::-1]
     assert event.kind is K.SUPPRESSED
-    told = json.loads(alarm_payload(event, 7).to_json())
+    told = json.loads(alarm_payload(event, 7, "series").to_json())
     for key in ("reason", "holds", "covered", "shelved_until_wall_ns", "first_out", "chattering", "found"):
         del told[key]
     del told["doubts"]
@@ -226,6 +226,6 @@ def test_a_suppression_that_an_earlier_version_told_is_taken_over():
 )
 def test_a_payload_whose_covers_contradict_each_other_is_refused(forged):
     (event,) = history(manager(ROTOR), mode("F1", "alert"))
-    payload = json.loads(alarm_payload(event, 7).to_json()) | forged
+    payload = json.loads(alarm_payload(event, 7, "series").to_json()) | forged
     with pytest.raises(ValueError, match="none of this program's"):
         alarm_event(json.dumps(payload).encode())

@@ -128,3 +128,15 @@ def test_home_assistant_and_sparkplug_are_told_of_what_the_machine_file_makes_po
     assert services <= set(sparkplug_settings(told, tmp_path).alarms)
     calm = machine((ROOT, asked.replace(START_UP, "")), ("flood_alarms = 10", "flood_alarms = 0"))
     assert not {"alarm-flood", "trip-multiply"} & set(mqtt_settings(calm).home_assistant.services)
+
+
+def test_no_two_boxes_get_the_same_client_id():
+    named = ["a", "b", "a-b", "b-c", "c", "b-c-sparkplug", "c-sparkplug", "a.b", "a_b"]
+    machines = [
+        machine(('site = "lab"', f'site = "{site}"'), ('box = "edge-1"', f'box = "{box}"'))
+        for site in named
+        for box in named
+    ]
+    ids = [each.mqtt_client_id for each in machines]
+    ids += [f"{each.mqtt_client_id}:sparkplug" for each in machines]
+    assert len(set(ids)) == len(ids)

@@ -62,11 +62,11 @@ EVENT = AlarmEvent(
 
 
 def test_an_alarm_says_everything_that_the_event_knows():
-    said = json.loads(alarm_payload(EVENT, 42).to_json())
+    said = json.loads(alarm_payload(EVENT, 42, "series").to_json())
     cause = said.pop("cause")
     assert said == {
         "schema": "daqsvc.alarm/1",
-        "id": "edge-1-42",
+        "id": "series-42",
         "sequence": 42,
         "site": "lab",
         "box": "edge-1",
@@ -100,7 +100,7 @@ def test_an_alarm_says_everything_that_the_event_knows():
 
 
 def test_what_json_cannot_say_is_null():
-    text = alarm_payload(EVENT, 1).to_json()
+    text = alarm_payload(EVENT, 1, "series").to_json()
     assert b"NaN" not in text
     assert b"Infinity" not in text
     assert json.loads(text)["cause"]["statistics"] == {"rms": None, "peak": None, "mean": 1.5}
@@ -131,7 +131,7 @@ def test_status_takes_nested_numbers_and_words_and_nothing_else():
 @pytest.mark.parametrize(
     ("model", "payload"),
     [
-        (AlarmPayload, alarm_payload(EVENT, 42)),
+        (AlarmPayload, alarm_payload(EVENT, 42, "series")),
         (DiagnosisPayload, diagnosis_payload(RIG, CAUSE, CLOCK)),
         (StatusPayload, status_payload("lab", "edge-1", {"a": {"b": 1, "c": 0.5}}, CLOCK)),
         (AvailabilityPayload, availability_payload("lab", "edge-1", "offline", "stopped", CLOCK)),
@@ -143,7 +143,7 @@ def test_payloads_come_back_as_they_were(model, payload):
 
 def test_the_published_schema_requires_every_key_that_is_sent():
     schemas = json_schemas()
-    sent = json.loads(alarm_payload(EVENT, 42).to_json())
+    sent = json.loads(alarm_payload(EVENT, 42, "series").to_json())
     schema = schemas["daqsvc.alarm/1"]
     assert set(schema["required"]) == set(schema["properties"]) == set(sent)
     assert schema["properties"]["schema"]["const"] == sent["schema"]

@@ -64,7 +64,7 @@ def test_the_laval_rig_as_it_is_read():
     assert probe.gain * -10.0 + probe.shift == pytest.approx(0.0)  # the gap voltage of a centred shaft
     assert probe.gain * -9.213 + probe.shift == pytest.approx(100.0)
     assert machine.detectors == ("rotor-bank",)
-    assert machine.mqtt_client_id == "daqsvc-lab-edge-1"
+    assert machine.mqtt_client_id == "daqsvc-lab:edge-1"
     assert (machine.mqtt.tls, machine.mqtt.host, machine.mqtt.port) == (True, "broker.example", 8883)
     with pytest.raises(KeyError, match="no sensor 'probe-z'; there are probe-x, probe-y, keyphasor"):
         machine.sensor("probe-z")
