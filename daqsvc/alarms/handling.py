@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from daqsvc.alarms.flood import FloodLimit
     from daqsvc.alarms.start_up import StartUp
 
+_UNITS = ((86_400, "d"), (3600, "h"), (60, "m"))
+_LONGEST_S = 1e9
+"""Longer times are no more of use in days than in seconds."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmHandling:
@@ -39,11 +43,27 @@ class AlarmHandling:
         """
         longest_s, duration_s = self.shelve_at_most_s, command.duration_s
         if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
-            stated = "no time" if duration_s is None else f"{duration_s:g} s"
+            stated = "no time" if duration_s is None else in_units(duration_s)
             raise RefusedError(
-                f"cannot shelve {command.alarm} for {stated}; state a time above 0 and up to {longest_s:g} s"
+                f"cannot shelve {command.alarm} for {stated}; "
+                f"state a time above 0 and up to {in_units(longest_s)}"
             )
         return round(duration_s * 1e9)
+
+
+def in_units(duration_s: float) -> str:
+    """A time as people write it after ``--for``, e.g. ``8h`` or ``1h30m``.
+
+    Args:
+        duration_s: the time in s; what is no time, such as a negative one, stays a number of seconds.
+    """
+    if not 0.0 < duration_s < _LONGEST_S:
+        return f"{duration_s:g} s"
+    left_s, words = duration_s, ""
+    for size_s, unit in _UNITS:
+        count, left_s = divmod(left_s, size_s)
+        words += f"{count:.0f}{unit}" if count else ""
+    return f"{words}{left_s:g}s" if left_s or not words else words
 
 
 @dataclass(slots=True)

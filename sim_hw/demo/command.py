@@ -99,14 +99,13 @@ class DemoCommand:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    import logging  # noqa: PLC0415
+
     from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
 
     start_logging(verbose=False)
-    if not arguments.json:
-        import logging  # noqa: PLC0415
-
-        # The view shows every alarm; the service's log would say it twice.
-        logging.getLogger("daqsvc.service").setLevel(logging.ERROR)
+    # Every alarm comes back from the broker and is shown; the service's log would say it twice.
+    logging.getLogger("daqsvc.alarm_desk").setLevel(logging.ERROR)
     prepare_kernel_cache()
     try:
         import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?

@@ -328,7 +328,7 @@ async def test_commands_over_mqtt_reach_the_alarms_and_the_audit_log(tmp_path: P
                 assert [consumer.on("/alarms/shaking")[-1].payload["id"]] == acknowledged["events"]
                 assert not (await ask("acknowledge", "none", "c3"))["accepted"]
                 too_long = await ask("shelve", "shaking", "c4", duration_s=61)
-                assert "state a time above 0 and up to 60 s" in too_long["reason"]
+                assert "state a time above 0 and up to 1m" in too_long["reason"]
                 assert not (await ask("bypass", "shaking", "c5"))["accepted"]
                 assert (service.desk.commands.accepted, service.desk.commands.refused) == (1, 3)
     told = [(line["source"], line["verb"], line["outcome"]) for line in log(tmp_path / "store")][1::2]

@@ -249,6 +249,17 @@ def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_an_alarm_is_shown_once_where_no_terminal_is(form: list[str], tmp_path: Path) -> None:
+    path = save(tmp_path / "rig.npz", a=3.0 * noise(6))
+    healthy = save(tmp_path / "healthy.npz", a=noise(6))
+    playing = ["--recording", str(path), "--baseline", str(healthy), "--speed", "20", *form]
+    with demo(*playing, env=elsewhere(tmp_path), stderr=subprocess.STDOUT) as running:
+        said, _ = running.communicate()
+    assert running.returncode == 0
+    assert said.count("danger limit") == 1, said
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
     path = save(tmp_path / "rig.npz", a=noise(600))

@@ -65,10 +65,29 @@ def test_shelving_again_sets_the_time_anew():
 @pytest.mark.parametrize("seconds", [None, 0.0, -1.0, math.nan, math.inf, 100.5])
 def test_shelving_needs_a_time_that_is_allowed(seconds):
     rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=100.0))
-    with pytest.raises(RefusedError, match="state a time above 0 and up to 100 s"):
+    with pytest.raises(RefusedError, match="state a time above 0 and up to 1m40s"):
         rig.shelve("vibration-x", seconds)
     assert rig.status("vibration-x").state is S.NORMAL
     assert (rig.manager.counters.refused, rig.manager.counters.commands) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("asked_s", "longest_s", "words"),
+    [
+        (43_200.0, 28_800.0, "for 12h; state a time above 0 and up to 8h"),
+        (28_800.5, 28_800.0, "for 8h0.5s; state a time above 0 and up to 8h"),
+        (5400.0, 90.0, "for 1h30m; state a time above 0 and up to 1m30s"),
+        (2 * 86_400.0, 0.5, "for 2d; state a time above 0 and up to 0.5s"),
+        (-1.0, 45.0, "for -1 s; state a time above 0 and up to 45s"),
+        (math.inf, 86_460.0, "for inf s; state a time above 0 and up to 1d1m"),
+        (None, 60.0, "for no time; state a time above 0 and up to 1m"),
+    ],
+)
+def test_a_refusal_says_times_as_people_write_them(asked_s, longest_s, words):
+    rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=longest_s))
+    with pytest.raises(RefusedError) as refused:
+        rig.shelve("vibration-x", asked_s)
+    assert f"{refused.value}" == f"cannot shelve vibration-x {words}"
 
 
 def test_out_of_service_lasts_until_somebody_puts_it_back():
