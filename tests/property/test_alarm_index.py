@@ -173,7 +173,7 @@ class Twins:
         assert ours == walked
         for event in ours:
             self.journal.pop(event.alarm, None)
-            self.journal[event.alarm] = alarm_payload(event, 1).to_json()
+            self.journal[event.alarm] = alarm_payload(event, 1, "series").to_json()
         manager = self.both[0]
         assert dict(manager.alarms) == dict(self.both[1].alarms)
         shown = Counter(status.state for status in manager.alarms.values())
