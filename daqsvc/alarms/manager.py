@@ -57,7 +57,8 @@ class AlarmManager:
     ``detector-ok/<detector>``.
 
     - Not OK suppresses every alarm that rests on the sensor, until a good statement comes.
-    - Missing holds every state. It never clears anything.
+    - Missing holds every state. It never clears anything. Where a statement says between what bounds its
+      values lie all the same, they may raise an alarm.
     - Shelved and out of service cover an alarm, which goes on behind the cover and is told of.
 
     Not thread-safe: one task takes the diagnoses of a machine in their order.
@@ -277,13 +278,16 @@ class AlarmManager:
         yield from self._suppression(touched.sensors, diagnosis, at)
         given = Circumstances(self._start_up.multiplies(at.t_ns), self._doubts.not_ok_sensors)
         for ruled in followers:
-            if diagnosis.quality != "good" or ruled.alarm.is_held(Hold.SUPPRESSED):
+            told = diagnosis.quality == "good" or diagnosis.partial
+            if not told or ruled.alarm.is_held(Hold.SUPPRESSED):
                 ruled.watch.hold(diagnosis)
                 ruled.alarm.hold()
                 continue
             finding = ruled.watch.find(diagnosis, given)
             if finding is not None:
                 yield from ruled.alarm.apply(finding, diagnosis, at)
+            elif diagnosis.partial:
+                ruled.alarm.hold()
 
     def _quality(self, names: Iterable[str], diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         """Raise, change or return the quality alarms that the diagnosis bears on."""

@@ -27,6 +27,10 @@ def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
     return f"detector-ok/{detector}"
 
 
+LASTING = 8
+"""So many partial statements more than good ones make a quality alarm, and as many good ones end it."""
+
+
 class Touched(NamedTuple):
     """What a statement bears on.
 
@@ -39,13 +43,35 @@ class Touched(NamedTuple):
     sensors: frozenset[str]
 
 
-class Doubts:
-    """What each detector has against its sensors, from a statement that is not good to the next good one.
+class _Patience:
+    """Weighs the partial statements of a detector against the good ones.
 
-    Missing samples do not take back that a sensor was not OK.
+    A frame lost now and then makes one window in some dozen partial. Its values are held, which is enough: a
+    quality alarm with each of them would be a flood that says nothing. It is raised when they prevail.
     """
 
     def __init__(self) -> None:
+        self._weight = 0
+        self._lasts = False
+
+    def lasts(self, *, partial: bool) -> bool:
+        """Take in a statement; whether samples are missing for good."""
+        self._weight = min(max(self._weight + (1 if partial else -1), 0), LASTING)
+        if self._weight in {0, LASTING}:
+            self._lasts = self._weight > 0
+        return self._lasts
+
+
+class Doubts:
+    """What each detector has against its sensors, from a statement that is not good to the next good one.
+
+    Missing samples do not take back that a sensor was not OK; a partial statement does, which has seen at
+    least half of them. It raises a doubt of its own when such statements prevail, and upholds one that
+    samples are missing.
+    """
+
+    def __init__(self) -> None:
+        self._patience: dict[str, _Patience] = {}
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
         # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
@@ -64,17 +90,32 @@ class Doubts:
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._forget(detector)
         touched: set[str] = set() if before is None else _blames(before[1])
-        if diagnosis.quality == "good":
+        if diagnosis.quality == "good" or diagnosis.partial:
             for alarm in self._unsettled_by.pop(detector, ()):
                 self._unsettled[alarm].discard(detector)
-        else:
-            not_ok = diagnosis.quality == "not_ok" or (before is not None and before[1].not_ok)
-            doubt = Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
+        if (doubt := self._doubt(diagnosis, None if before is None else before[1])) is not None:
             self._remember(name, doubt)
             touched |= _blames(doubt)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
         alarms = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(alarms, frozenset(touched))
+
+    def _doubt(self, diagnosis: Diagnosis, before: Doubt | None) -> Doubt | None:
+        """What stands against the sensors after a statement."""
+        detector, good = diagnosis.detector, diagnosis.quality == "good"
+        if diagnosis.partial and detector not in self._patience:
+            self._patience[detector] = _Patience()
+        lacked, lasts = before is not None and before.quality == "missing", False
+        if detector in self._patience and (good or diagnosis.partial):
+            lasts = self._patience[detector].lasts(partial=diagnosis.partial)
+        if good:
+            return before if lasts and lacked else None
+        if diagnosis.partial and not (lasts or lacked):
+            return None  # and the samples that are there show that the sensor is OK
+        not_ok = diagnosis.quality == "not_ok" or (
+            before is not None and before.not_ok and not diagnosis.partial
+        )
+        return Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
 
     def resume(self, doubts: Iterable[Doubt]) -> None:
         """Go on from before a restart."""

@@ -83,7 +83,7 @@ class Watch(Protocol):
     """The memory of one rule."""
 
     def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
-        """What a good diagnosis says; None if it says nothing new and everything holds."""
+        """What a good diagnosis says, or a partial one; None if it says nothing new and everything holds."""
         ...
 
     def hold(self, diagnosis: Diagnosis) -> None:
@@ -257,10 +257,22 @@ class MeasureWatch:
         self.setpoint = setpoint
 
     def find(self, diagnosis: Diagnosis, given: Circumstances) -> tuple[Level, float] | None:
-        """The level and the value; None, and everything holds, without the measure."""
+        """The level and the value; None, and everything holds, without the measure.
+
+        Of a value of which only bounds are known: a level that has risen to where the value is for sure, with
+        the bound that says so. None if it has not.
+        """
         value = diagnosis.statistics.get(self._measure)
+        factor = self._trip_multiply if given.starting else 1.0
+        if (bounds := diagnosis.bounds.get(self._measure)) is not None:
+            before = self.monitor.level
+            level = self.monitor.rise(*bounds, diagnosis.t_ns, factor)
+            if level <= before:
+                return None
+            self._factor = factor
+            return level, self._nearer(bounds)
         if value is not None:
-            self._factor = self._trip_multiply if given.starting else 1.0
+            self._factor = factor
             return self.monitor.update(value, diagnosis.t_ns, self._factor), value
         self.monitor.hold()
         if not self._reported_absent:
@@ -274,6 +286,15 @@ class MeasureWatch:
             )
         return None
 
+    def sure(self, bounds: tuple[float, float]) -> tuple[Level, float]:
+        """The level at which a value between bounds is for sure, and the bound that says so."""
+        return self.monitor.sure(*bounds), self._nearer(bounds)
+
+    def _nearer(self, bounds: tuple[float, float]) -> float:
+        """The bound that is nearer to the machine in good order."""
+        limit = self.monitor.reached(bounds[0])
+        return bounds[limit is not None and limit.lower]
+
     def side(self, value: float) -> str:
         """Where the present level was reached, as an identity; empty if there is one side only."""
         limit = self.monitor.reached(value)
@@ -284,8 +305,12 @@ class MeasureWatch:
     def in_words(self, diagnosis: Diagnosis, sensor: str, value: float) -> str:
         """The value of ``sensor`` and the limit that makes the present level of it."""
         unit = f" {diagnosis.units[self._measure]}" if self._measure in diagnosis.units else ""
-        measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
         limit = self.monitor.reached(value)
+        measured = f"{self._measure} of {sensor} is {value:.4g}{unit}"
+        if self._measure in diagnosis.bounds:
+            most = "most" if limit is not None and limit.lower else "least"
+            lacks = f"{100.0 * (diagnosis.missing_share or 0.0):.2g} % of its samples are missing"
+            measured = f"{self._measure} of {sensor} is at {most} {value:.4g}{unit} though {lacks}"
         if limit is not None:
             side = "lower " if limit.lower else ""
             multiplied = f" times {self._factor:g} at start-up" if self._factor > 1.0 and not side else ""

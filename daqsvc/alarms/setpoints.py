@@ -104,7 +104,6 @@ class SetpointMonitor:
 
     def __init__(self, setpoint: Setpoint) -> None:
         self._comparators = [_Comparator(limit, setpoint) for limit in setpoint.limits]
-        self._known_at_ns: int | None = None
 
     @property
     def level(self) -> Level:
@@ -128,11 +127,24 @@ class SetpointMonitor:
         if math.isnan(value) or value == -math.inf:
             self.hold()
             return self.level
-        elapsed_ns = 0 if self._known_at_ns is None else max(t_ns - self._known_at_ns, 0)
-        self._known_at_ns = t_ns
         for comparator in self._comparators:
-            comparator.update(value, elapsed_ns, factor)
+            comparator.update(value, t_ns, factor)
         return self.level
+
+    def rise(self, low: float, high: float, t_ns: int, factor: float = 1.0) -> Level:
+        """Take in a value of which only bounds are known; it may reach limits, and leaves none.
+
+        A limit is reached if the value is beyond it wherever it lies between ``low`` and ``high``. What
+        cannot be told so holds, and no delay goes on.
+        """
+        for comparator in self._comparators:
+            comparator.rise(low, high, t_ns, factor)
+        return self.level
+
+    def sure(self, low: float, high: float) -> Level:
+        """The highest level that has been reached and that a value between these bounds is at for sure."""
+        beyond = (one.limit.level for one in self._comparators if one.reached and one.beyond(low, high))
+        return max(beyond, default=Level.NORMAL)
 
     def resume(self, level: Level, *, lower: bool | None = None) -> None:
         """Go on from a level that was reached before a restart; the delays begin anew.
@@ -147,7 +159,8 @@ class SetpointMonitor:
 
     def hold(self) -> None:
         """A value is missing: the level stays and the delays stand still until the next one."""
-        self._known_at_ns = None
+        for comparator in self._comparators:
+            comparator.hold()
 
 
 class _Comparator:
@@ -163,8 +176,11 @@ class _Comparator:
         self._on_delay_ns = setpoint.on_delay_ns
         self._off_delay_ns = setpoint.off_delay_ns
         self._contrary_ns: int | None = None
+        self._known_at_ns: int | None = None
 
-    def update(self, value: float, elapsed_ns: int, factor: float) -> None:
+    def update(self, value: float, t_ns: int, factor: float) -> None:
+        elapsed_ns = 0 if self._known_at_ns is None else max(t_ns - self._known_at_ns, 0)
+        self._known_at_ns = t_ns
         value, factor = self._sign * value, 1.0 if self.limit.lower else factor
         contrary = value < self._leave_below if self.reached else value >= factor * self._enter_at
         if not contrary:
@@ -174,3 +190,16 @@ class _Comparator:
         if self._contrary_ns >= (self._off_delay_ns if self.reached else self._on_delay_ns):
             self.reached = not self.reached
             self._contrary_ns = None
+
+    def beyond(self, low: float, high: float, factor: float = 1.0) -> bool:
+        """Whether a value is at the limit or beyond wherever it lies between ``low`` and ``high``."""
+        return -high >= self._enter_at if self.limit.lower else low >= factor * self._enter_at
+
+    def rise(self, low: float, high: float, t_ns: int, factor: float) -> None:
+        if self.beyond(low, high, factor):
+            self.update(high if self.limit.lower else low, t_ns, factor)
+        else:
+            self.hold()
+
+    def hold(self) -> None:
+        self._known_at_ns = None

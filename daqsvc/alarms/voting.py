@@ -1,6 +1,7 @@
 """Voting: one alarm on the same measure of several sensors, raised when enough of them agree.
 
-A sensor that is missing samples or not OK has no vote, and its vote counts for neither side. A level is
+A sensor that is missing samples or not OK has no vote, and its vote counts for neither side; where it is
+beyond a limit whatever the missing samples were, it votes for that limit, and still not against. A level is
 reached when enough sensors that can be judged say so; it is left when not even all the silent ones could make
 up the number; between the two it stays as it was. Sensors that drop out therefore neither raise the alarm nor
 clear it, and the number of votes that it takes stays the same.
@@ -83,33 +84,47 @@ class _VotingWatch:
             for sensor in rule.sensors
         }
         self._votes: dict[str, Level] = {}
+        self._at_least: dict[str, Level] = {}
         self._level = Level.NORMAL
 
     def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
         sensor = self._sensor_of[diagnosis.detector]
         watch = self._watches[sensor]
         found = watch.find(diagnosis, given)
+        self._votes.pop(sensor, None)
+        self._at_least.pop(sensor, None)
+        bounds = diagnosis.bounds.get(self._rule.measure)
+        if bounds is not None:
+            found = watch.sure(bounds)
         if found is None:
-            self._votes.pop(sensor, None)
             return None
         vote, value = found
-        self._votes[sensor] = vote
+        if bounds is None:
+            self._votes[sensor] = vote
+        else:
+            self._at_least[sensor] = vote
         valid = {name: level for name, level in self._votes.items() if name not in given.not_ok}
+        sure_of = {name: level for name, level in self._at_least.items() if name not in given.not_ok}
         silent = len(self._rule.sensors) - len(valid)
         level = self._level
         for reached in _LEVELS:
             votes = sum(level >= reached for level in valid.values())
-            if votes >= self._rule.vote:
+            # A sensor that lacks samples may add its vote, but not say that it has none.
+            if votes + sum(level >= reached for level in sure_of.values()) >= self._rule.vote:
                 level = max(level, reached)
             elif votes + silent < self._rule.vote and level >= reached:
                 level = Level(reached - 1)
+        if bounds is not None and level <= self._level:
+            return None
         self._level = level
-        return Finding(level, "", lambda: self._sentence(watch.in_words(diagnosis, sensor, value), valid))
+        known = valid | sure_of
+        return Finding(level, "", lambda: self._sentence(watch.in_words(diagnosis, sensor, value), known))
 
     def hold(self, diagnosis: Diagnosis) -> None:
         sensor = self._sensor_of[diagnosis.detector]
         self._watches[sensor].monitor.hold()
         self._votes.pop(sensor, None)
+        self._at_least.pop(sensor, None)
 
     def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
         self._level = level

@@ -23,6 +23,8 @@ class Window:
         period_ns: time between samples.
         skipped: samples between the previous window and this one that the detector was too slow
             for (they were overwritten); 0 in normal operation.
+        snapshot: whether the samples are one block that was taken by itself. Between it and the window before
+            nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
     """
 
     first_index: int
@@ -30,6 +32,7 @@ class Window:
     t_end_ns: int
     period_ns: float
     skipped: int = 0
+    snapshot: bool = False
 
 
 class Detector(Protocol):
@@ -43,7 +46,7 @@ class Detector(Protocol):
     name: str
     stream: str
     block: int
-    """Samples per step: windows have a multiple of this many samples."""
+    """Samples per step: windows have a multiple of this many samples, but for snapshots."""
 
     def warm(self) -> None:
         """Compile and run every kernel once, so that the first window is as fast as the rest."""

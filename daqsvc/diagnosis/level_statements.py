@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.diagnosis.record import Diagnosis
@@ -10,6 +11,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daqsvc.diagnosis.record import DataQuality, Severity
+
+NO_BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType({})
+"""Of statistics that are all certain."""
 
 _DECISIONS: tuple[Severity, ...] = ("normal", "alert", "danger")
 
@@ -23,11 +27,11 @@ class Limits(NamedTuple):
     alert_low: float | None = None
     danger_low: float | None = None
 
-    def severity(self, value: float) -> Severity:
-        """How bad ``value`` is: a limit is reached at it."""
-        if _reached(value, self.danger, self.danger_low):
+    def severity(self, low: float, high: float) -> Severity:
+        """How bad a value is that lies between ``low`` and ``high``, at least: a limit is reached at it."""
+        if _reached(low, high, self.danger, self.danger_low):
             return "danger"
-        return "alert" if _reached(value, self.alert, self.alert_low) else "normal"
+        return "alert" if _reached(low, high, self.alert, self.alert_low) else "normal"
 
     @property
     def thresholds(self) -> dict[str, float]:
@@ -79,6 +83,8 @@ class LevelStatements:
         units: Mapping[str, str],
         quality: DataQuality = "good",
         reason: str = "",
+        missing_share: float | None = None,
+        bounds: Mapping[str, tuple[float, float]] = NO_BOUNDS,
     ) -> Diagnosis:
         """One statement about one sensor.
 
@@ -90,15 +96,21 @@ class LevelStatements:
             units: of the statistics that have one.
             quality: of the data.
             reason: why that is not good.
+            missing_share: share of the samples that are missing; None if that is not what it is about.
+            bounds: of the statistics that are uncertain by that, between what they lie; they may make the
+                decision worse, never better.
         """
         before = self._decided.get(sensor)
         severity = before or "normal"
-        if quality == "good":
-            severity = max(
-                (limit.severity(statistics[limit.measure]) for limit in limits),
+        if quality == "good" or bounds:
+            found: Severity = max(
+                (limit.severity(*_span(limit.measure, statistics, bounds)) for limit in limits),
                 key=_DECISIONS.index,
                 default="normal",
             )
+            better = _DECISIONS.index(found) < _DECISIONS.index(severity)
+            severity = severity if bounds and better else found
+        if quality == "good" or severity != (before or "normal"):
             self._decided[sensor] = severity
         return Diagnosis(
             machine=self._machine,
@@ -107,8 +119,8 @@ class LevelStatements:
             stream=self._stream,
             first_index=evidence.first_index,
             end_index=evidence.end_index,
-            decision=severity if quality == "good" or before else "undetermined",
-            changed=quality == "good" and before not in {None, severity},
+            decision=self._decided.get(sensor, "undetermined"),
+            changed=before not in {None, severity},
             severity=severity,
             statistics=statistics,
             units=units,
@@ -117,8 +129,16 @@ class LevelStatements:
             reason=reason,
             sensors=(sensor,),
             model=self._model,
+            missing_share=missing_share,
+            bounds=bounds,
         )
 
 
-def _reached(value: float, upper: float | None, lower: float | None) -> bool:
-    return (upper is not None and value >= upper) or (lower is not None and value <= lower)
+def _span(
+    measure: str, statistics: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[float, float]:
+    return bounds[measure] if measure in bounds else (statistics[measure], statistics[measure])
+
+
+def _reached(low: float, high: float, upper: float | None, lower: float | None) -> bool:
+    return (upper is not None and low >= upper) or (lower is not None and high <= lower)

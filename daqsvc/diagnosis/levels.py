@@ -7,9 +7,18 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from daqsvc.diagnosis.level_statements import Evidence, LevelStatements
+from daqsvc.diagnosis.level_statements import NO_BOUNDS, Evidence, LevelStatements
+from daqsvc.diagnosis.partial_levels import (
+    LEAST_KNOWN_ERROR,
+    MIN_PRESENT,
+    MOST_ERROR,
+    MOST_MISSING,
+    level_bounds,
+    partly_missing,
+)
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.diagnosis.standstill import StandstillWatch
+from daqsvc.dsp.gapped_band import gapped_band_rms
 from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
 
 if TYPE_CHECKING:
@@ -19,11 +28,12 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.level_statements import Limits
+    from daqsvc.diagnosis.partial_levels import Bounds
     from daqsvc.diagnosis.record import DataQuality, Diagnosis
     from daqsvc.diagnosis.standstill import Standstill
 
-MIN_PRESENT = 0.5
-"""Share of a window's samples that must be there for its levels to be given."""
+_LEAST_SAMPLES = 4
+"""Fewer make no spectrum."""
 
 _GLITCH = 2
 """So few samples beyond the gap limits inside a window are interference, not the probe."""
@@ -76,7 +86,12 @@ class LevelChannel:
 class LevelDetector:
     """RMS, peak, crest factor and band velocity of every sensor of a stream, window by window.
 
-    Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``.
+    Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``. A snapshot is a window by
+    itself, whatever its length.
+
+    Where samples are missing the levels are those of the samples that are there, and the band velocity is
+    estimated from these (`gapped_band_rms`). Above `MOST_MISSING` they are uncertain (`Diagnosis.bounds`),
+    below `MIN_PRESENT` not given at all.
 
     Args:
         machine: name of the machine.
@@ -99,7 +114,7 @@ class LevelDetector:
     ) -> None:
         self.name = f"levels/{stream}"
         self.stream = stream
-        self.block = max(4, round(window_s * rate_hz))
+        self.block = max(_LEAST_SAMPLES, round(window_s * rate_hz))
         self._statements = LevelStatements(machine, stream, "levels/1")
         self._rate_hz = rate_hz
         self._channels = tuple(channels)
@@ -110,14 +125,15 @@ class LevelDetector:
     def warm(self) -> None:
         """Make the taper and the band's weights; there is nothing to compile."""
         for channel in self._channels:
-            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)))
+            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)), 0.0)
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
         said: list[Diagnosis] = []
         self._next_index = window.first_index + len(window.samples)
-        for start in range(0, len(window.samples), self.block):
-            part = window.samples[start : start + self.block]
+        block = len(window.samples) if window.snapshot else self.block
+        for start in range(0, len(window.samples), block):
+            part = window.samples[start : start + block]
             after = len(window.samples) - start - len(part)
             t_ns = window.t_end_ns - round(after * window.period_ns)
             said += [
@@ -137,18 +153,21 @@ class LevelDetector:
         present = np.isfinite(samples)
         count = int(present.sum())
         evidence = Evidence(first_index, first_index + len(samples), t_ns)
-        if count < MIN_PRESENT * len(samples):
+        share = 1.0 - count / len(samples)
+        if count < max(MIN_PRESENT * len(samples), _LEAST_SAMPLES):
             reason = (
                 f"only {count} of {len(samples)} samples of {channel.sensor} are there, the others were lost "
                 "or the device had none; check bus, device and sensor"
             )
-            return self._state(channel, evidence, {}, "missing", reason)
-        statistics = self._measure(channel, samples)
+            return self._state(channel, evidence, {}, "missing", reason, share)
+        statistics, bounds = self._measure(channel, samples, share)
         known = samples[present]
         still = self._standstills[channel.sensor].take(known)
-        reason = _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still)
-        quality: DataQuality = "not_ok" if reason else "good"
-        return self._state(channel, evidence, statistics, quality, reason)
+        if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
+            return self._state(channel, evidence, statistics, "not_ok", reason, share)
+        reason = partly_missing(channel.sensor, len(samples) - count, len(samples), bounds)
+        quality: DataQuality = "missing" if reason else "good"
+        return self._state(channel, evidence, statistics, quality, reason, share, bounds)
 
     def _state(
         self,
@@ -157,14 +176,29 @@ class LevelDetector:
         statistics: dict[str, float],
         quality: DataQuality,
         reason: str,
+        missing_share: float = 1.0,
+        bounds: Bounds = NO_BOUNDS,
     ) -> Diagnosis:
         units = {name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"}
         return self._statements.state(
-            channel.sensor, channel.limits, evidence, statistics, units, quality, reason
+            channel.sensor,
+            channel.limits,
+            evidence,
+            statistics,
+            units,
+            quality,
+            reason,
+            missing_share,
+            bounds,
         )
 
-    def _measure(self, channel: LevelChannel, samples: NDArray[np.float32]) -> dict[str, float]:
+    def _measure(
+        self, channel: LevelChannel, samples: NDArray[np.float32], share: float
+    ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """The measures of a window that lacks a ``share`` of its samples, and the bounds of the uncertain."""
         found = levels(samples)
+        known = samples[np.isfinite(samples)]
+        bounds = level_bounds(found, float(known.min()), float(known.max()), share)
         statistics = {
             "mean": found.mean,
             "rms": found.rms,
@@ -172,15 +206,24 @@ class LevelDetector:
             "crest_factor": found.crest_factor,
         }
         if channel.gap is not None:
-            statistics["gap_voltage"] = channel.gap.zero_v + found.mean * channel.gap.volts_per_unit
+            gap = channel.gap
+            statistics["gap_voltage"] = gap.zero_v + found.mean * gap.volts_per_unit
+            if "mean" in bounds:
+                volts = sorted(gap.zero_v + end * gap.volts_per_unit for end in bounds["mean"])
+                bounds["gap_voltage"] = (volts[0], volts[1])
         if channel.unit in _TO_VELOCITY:
             factor, integrate = _TO_VELOCITY[channel.unit]
-            there = np.nan_to_num(
-                samples.astype(np.float64), nan=found.mean, posinf=found.mean, neginf=found.mean
-            )
-            rms = band_rms(there, self._rate_hz, *self._band_hz, integrate=integrate)
-            statistics["velocity_rms"] = factor * rms
-        return statistics
+            if share:
+                values = samples.astype(np.float64)
+                about = gapped_band_rms(values, self._rate_hz, *self._band_hz, integrate=integrate)
+                if about.error <= LEAST_KNOWN_ERROR:
+                    statistics["velocity_rms"] = factor * about.rms
+                if share > MOST_MISSING or about.error > MOST_ERROR:
+                    bounds["velocity_rms"] = (factor * about.low, factor * about.high)
+            else:
+                rms = band_rms(samples.astype(np.float64), self._rate_hz, *self._band_hz, integrate=integrate)
+                statistics["velocity_rms"] = factor * rms
+        return statistics, bounds
 
 
 def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: NDArray[np.float32]) -> str:

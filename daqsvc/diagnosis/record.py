@@ -38,10 +38,14 @@ class Diagnosis:
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
         quality: ``"good"``; ``"missing"`` if too many samples of the window are missing;
             ``"not_ok"`` if a sensor is outside its OK limits, dead or clipped. Unless it is good,
-            ``decision`` is held from before: missing data never clears anything.
+            ``decision`` is held from before: missing data never clears anything. Only where ``bounds`` show
+            that it must be worse whatever is missing it may rise.
         reason: why the quality is not good, in words for a person.
         sensors: names of the sensors that the statement rests on.
         model: name and version of the model behind the decision.
+        missing_share: share of the window's samples that are missing; None if the detector does not say.
+        bounds: statistics that are uncertain because samples are missing: between what they lie all the
+            same. Such a one may raise an alarm by its bound, and returns none.
     """
 
     machine: str
@@ -65,6 +69,13 @@ class Diagnosis:
     sensors: tuple[str, ...] = ()
     model: str = ""
     where: str = ""
+    missing_share: float | None = None
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def partial(self) -> bool:
+        """Whether samples are missing, but not so many that nothing can be said."""
+        return self.quality == "missing" and bool(self.bounds)
 
 
 def silence_reason(stream: str, silence_s: float) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.diagnosis.level_statements import Evidence, LevelStatements
+from daqsvc.diagnosis.partial_levels import MOST_MISSING, partly_missing
 from daqsvc.diagnosis.record import silence_reason
 
 if TYPE_CHECKING:
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.level_statements import Limits
-    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.diagnosis.partial_levels import Bounds
+    from daqsvc.diagnosis.record import DataQuality, Diagnosis
 
 VALUE = "value"
 """The one measure of a trend value."""
@@ -50,7 +52,7 @@ class TrendChannel:
 
 
 class TrendDetector:
-    """The value of every trend channel of a stream: sample by sample if it is slow, else averaged.
+    """The value of every trend channel of a stream: one by one if slow, else averaged; a snapshot always is.
 
     Emits one `Diagnosis` per sensor and value, as detector ``levels/<sensor>``.
 
@@ -86,8 +88,9 @@ class TrendDetector:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
         said: list[Diagnosis] = []
         self._next_index = window.first_index + len(window.samples)
-        for start in range(0, len(window.samples), self.block):
-            part = window.samples[start : start + self.block]
+        block = len(window.samples) if window.snapshot else self.block
+        for start in range(0, len(window.samples), block):
+            part = window.samples[start : start + block]
             after = len(window.samples) - start - len(part)
             first_index = window.first_index + start
             t_ns = window.t_end_ns - round(after * window.period_ns)
@@ -120,19 +123,37 @@ class TrendDetector:
             )
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0
-        reason = _beyond_ok(channel, known)
+        missing, value = len(samples) - len(known), _as_read(known)
+        bounds: Bounds = {}
+        if reason := _beyond_ok(channel, known):
+            quality: DataQuality = "not_ok"
+        else:
+            bounds = _bounds(value, known, missing)
+            quality = "missing" if bounds else "good"
+            reason = partly_missing(channel.sensor, missing, len(samples), bounds)
         return self._statements.state(
             channel.sensor,
             channel.limits,
             evidence,
-            {VALUE: _as_read(known)},
+            {VALUE: value},
             {VALUE: channel.unit} if channel.unit else {},
-            "not_ok" if reason else "good",
+            quality,
             reason,
+            missing / len(samples),
+            bounds,
         )
 
     def _missing(self, channel: TrendChannel, evidence: Evidence, reason: str) -> Diagnosis:
         return self._statements.state(channel.sensor, channel.limits, evidence, {}, {}, "missing", reason)
+
+
+def _bounds(value: float, known: NDArray[np.float32], missing: int) -> Bounds:
+    """Between what an average lies of which values are missing, if these lie among those that are known."""
+    share = missing / (missing + len(known))
+    if missing <= BRIDGED or share <= MOST_MISSING:
+        return {}
+    off = share * float(known.max() - known.min())
+    return {VALUE: (value - off, value + off)}
 
 
 def _as_read(known: NDArray[np.float32]) -> float:

@@ -47,8 +47,12 @@ def levels(samples: NDArray[np.float32]) -> Levels:
 
 
 @lru_cache(maxsize=64)
-def _weights(n: int, rate_hz: float, low_hz: float, high_hz: float, *, integrate: bool) -> _Weights:
-    """Hann taper of length ``n``; power weight per bin of its real FFT: the band, over omega^2 if asked."""
+def band_weights(n: int, rate_hz: float, low_hz: float, high_hz: float, *, integrate: bool) -> _Weights:
+    """Hann taper float64 ``[n]``, and the weight of each bin of the real FFT, float64 ``[n // 2 + 1]``.
+
+    A power spectrum of tapered samples, summed with these weights, is the mean square in the band, over
+    omega^2 if ``integrate`` asks for it.
+    """
     frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
     inside = (frequency_hz >= low_hz) & (frequency_hz <= high_hz)
     weight = inside.astype(np.float64)
@@ -77,6 +81,6 @@ def band_rms(
     Returns:
         In the unit of the samples; times seconds if integrated.
     """
-    taper, weight = _weights(len(samples), rate_hz, low_hz, high_hz, integrate=integrate)
+    taper, weight = band_weights(len(samples), rate_hz, low_hz, high_hz, integrate=integrate)
     spectrum = np.fft.rfft((samples - samples.mean()) * taper)
     return float(np.sqrt(np.sum((spectrum.real**2 + spectrum.imag**2) * weight)))

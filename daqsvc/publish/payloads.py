@@ -82,6 +82,13 @@ class _Statement(Payload):
     sensors: tuple[str, ...]
     model: str
     where: str = Field("", description="the part of the machine that it is about, e.g. a bearing; or empty")
+    missing_share: Number = Field(
+        None, description="share of the window's samples that are missing; null if the detector does not say"
+    )
+    bounds: dict[str, tuple[Number, Number]] = Field(
+        {},
+        description="of statistics that missing samples make uncertain: lowest, highest; null: no end",
+    )
 
 
 class CausePayload(_Statement):
@@ -306,6 +313,8 @@ def _statement(diagnosis: Diagnosis) -> dict[str, Any]:
         "sensors": diagnosis.sensors,
         "model": diagnosis.model,
         "where": diagnosis.where,
+        "missing_share": diagnosis.missing_share,
+        "bounds": dict(diagnosis.bounds),
     }
 
 
@@ -332,7 +341,13 @@ def _diagnosis(machine: str, cause: CausePayload) -> Diagnosis:
         sensors=cause.sensors,
         model=cause.model,
         where=cause.where,
+        missing_share=cause.missing_share,
+        bounds={name: _ends(*ends) for name, ends in cause.bounds.items()},
     )
+
+
+def _ends(low: float | None, high: float | None) -> tuple[float, float]:
+    return -math.inf if low is None else low, math.inf if high is None else high
 
 
 def _or_nan(figures: Mapping[str, float | None]) -> dict[str, float]:

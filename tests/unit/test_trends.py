@@ -121,3 +121,21 @@ def test_the_channels_of_a_stream_are_judged_each_for_itself():
         ("levels/velocity", "normal", "good"),
         ("levels/oil", "normal", "missing"),
     ]
+
+
+def test_an_average_that_lacks_values_may_raise_an_alarm_and_returns_none():
+    limits = [Limits("value", 30.0, None)]
+    unit = TrendDetector("m", "s", 40.0, [TrendChannel("oil", 0, "degC", limits)], window_s=0.5)
+    values = np.linspace(19.0, 21.0, 20, dtype=np.float32)
+
+    def said(level, missing):
+        samples = values + np.float32(level - 20.0)
+        samples[:missing] = np.nan
+        (one,) = unit.process(Window(0, samples.reshape(-1, 1), 10**9, 25e6))
+        return one.quality, one.decision
+
+    assert said(20.0, 2) == ("good", "normal")
+    assert said(30.0, 8) == ("missing", "normal")  # perhaps
+    assert said(33.0, 8) == ("missing", "alert")
+    assert said(20.0, 8) == ("missing", "alert")
+    assert said(20.0, 0) == ("good", "normal")
