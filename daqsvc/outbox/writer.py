@@ -28,6 +28,12 @@ log = logging.getLogger(__name__)
 MARK_LINGER_S = 0.05
 """How long a mark may wait for company: nobody waits for it, and each commit costs the disk a sync."""
 
+CROWD_LINGER_S = 0.02
+"""How long messages wait for company while they come in a crowd: a commit for each costs more than they."""
+
+CROWD_OVER_S, CROWD = 0.1, 20
+"""So many messages within so long are a crowd."""
+
 RETRY_FIRST_S, RETRY_MOST_S = 0.1, 5.0
 
 COMMIT_AT_MOST = 500
@@ -54,6 +60,31 @@ class Batch:
         self.drafts += other.drafts
         self.sent += other.sent
         self.reads += other.reads
+
+
+class Crowd:
+    """Whether messages come in a crowd, by how many came in the last full spell of `CROWD_OVER_S`."""
+
+    def __init__(self) -> None:
+        self._since_s = 0.0
+        self._came = 0
+        self._before = 0
+
+    def come(self, count: int, now_s: float) -> None:
+        """So many messages have come by ``now_s``, on a monotonic clock."""
+        self._look(now_s)
+        self._came += count
+
+    def is_there(self, now_s: float) -> bool:
+        """Whether the messages of ``now_s`` are part of a crowd."""
+        self._look(now_s)
+        return max(self._before, self._came) >= CROWD
+
+    def _look(self, now_s: float) -> None:
+        spells = (now_s - self._since_s) // CROWD_OVER_S
+        if spells >= 1:
+            # Of a longer time than one spell, the last one was empty.
+            self._since_s, self._before, self._came = now_s, self._came if spells < 2 else 0, 0
 
 
 @dataclass(slots=True)
@@ -103,6 +134,7 @@ class JournalWriter:
         self._make_way = make_way
         self._work: queue.SimpleQueue[Batch] = queue.SimpleQueue()
         self._closing = threading.Event()
+        self._crowd = Crowd()
 
     def start(self) -> tuple[asyncio.Future[int], asyncio.Future[None]]:
         """Start the thread.
@@ -201,6 +233,8 @@ class JournalWriter:
         """Add what has arrived; marks alone wait for company for a while."""
         if wait:
             batch.add(self._work.get())
+            if self._crowd.is_there(time.monotonic()) and not batch.reads:
+                self._closing.wait(CROWD_LINGER_S)
         until = time.monotonic() + MARK_LINGER_S
         while True:
             linger_s = until - time.monotonic()
@@ -229,6 +263,7 @@ class JournalWriter:
 
     def _commit(self, batch: Batch, post: _Post) -> None:
         now, sent = batch.drafts[:COMMIT_AT_MOST], batch.sent[:COMMIT_AT_MOST]
+        self._crowd.come(len(now), time.monotonic())
         outcomes, marked = self._journal.commit([draft for draft, _ in now], sent)
         settled = [(done, outcome) for (_, done), outcome in zip(now, outcomes, strict=True)]
         batch.drafts, batch.sent = batch.drafts[COMMIT_AT_MOST:], batch.sent[COMMIT_AT_MOST:]

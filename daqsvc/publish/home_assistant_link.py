@@ -30,6 +30,12 @@ BIRTH_DELAY_S = 5.0
 EARLIER_S = 1.0
 """How long an earlier discovery message that is retained at the broker may take to arrive."""
 
+PAUSE_S = 0.2
+"""What lies between two summaries at least; what comes meanwhile is in the next."""
+
+SUMMARY_BYTES_PER_S = 100_000
+"""What summaries may take of the way to the broker: that of 1000 alarms goes out every 2 s."""
+
 
 class HomeAssistantLink:
     """Publishes the discovery message and the summary of the alarms.
@@ -49,6 +55,7 @@ class HomeAssistantLink:
         self._changed = asyncio.Event()
         self._born = asyncio.Event()
         self._earlier: asyncio.Future[bytes] | None = None
+        self._pause_s = PAUSE_S
 
     def note(self, message: OutboxMessage) -> None:
         """Take in an alarm's message that the broker has."""
@@ -117,6 +124,8 @@ class HomeAssistantLink:
                     born = asyncio.create_task(self._born.wait())
                 else:
                     await self._summarise(connection)
+                    # A summary tells of all alarms. For each event of a flood anew, it would be the flood.
+                    await asyncio.wait({born}, timeout=self._pause_s)
                 if changed.done():
                     changed = asyncio.create_task(self._changed.wait())
         finally:
@@ -143,7 +152,8 @@ class HomeAssistantLink:
 
     async def _summarise(self, connection: Connection) -> None:
         self._changed.clear()
-        summary = self._summary.payload(self._clock).to_json()
+        summary = self._summary.to_json(self._clock)
+        self._pause_s = max(PAUSE_S, len(summary) / SUMMARY_BYTES_PER_S)
         await connection.deliver(self._topics.summary(self._settings.machine), summary, retain=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, Field
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from daqsvc.outbox.store import OutboxMessage
     from daqsvc.publish.topics import Topics
 
+_NO_ALARMS = b'"alarms":{}}'
+"""How the JSON of a summary without alarms ends."""
 _HIDDEN = {AlarmState.SUPPRESSED, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE}
 _GONE = {AlarmState.NORMAL, AlarmState.RETURNED_UNACKNOWLEDGED}
 
@@ -57,6 +60,8 @@ class _Told(BaseModel):
 class Summary:
     """The alarms of a machine, as the messages that the broker has acknowledged tell them.
 
+    An event costs what its own alarm costs: of the others the JSON is kept.
+
     Args:
         machine: name of the machine.
         alarms: those that are normal until something else is said.
@@ -66,7 +71,9 @@ class Summary:
     def __init__(self, machine: str, alarms: Iterable[str], topics: Topics) -> None:
         self._machine = machine
         self._topics = topics
-        self._alarms = {name: _untold() for name in alarms}
+        self._alarms: dict[str, bytes] = {}
+        for name in alarms:
+            self._put(name, _untold())
 
     def note(self, message: OutboxMessage) -> bool:
         """Take in a message of the outbox; whether it has told something of an alarm of the machine.
@@ -78,20 +85,27 @@ class Summary:
             return False
         told = _Told.model_validate_json(message.payload)
         problem: Literal["ON", "OFF"] = "OFF" if told.state in _GONE else "ON"
-        self._alarms[told.alarm] = StandingPayload(
-            problem=None if told.state in _HIDDEN else problem,
-            state=told.state,
-            level=told.level,
-            occurrence=told.occurrence,
-            time=told.time,
-            message=told.message,
+        self._put(
+            told.alarm,
+            StandingPayload(
+                problem=None if told.state in _HIDDEN else problem,
+                state=told.state,
+                level=told.level,
+                occurrence=told.occurrence,
+                time=told.time,
+                message=told.message,
+            ),
         )
         return True
 
-    def payload(self, clock: Clock) -> SummaryPayload:
-        """How the alarms stand now."""
+    def to_json(self, clock: Clock) -> bytes:
+        """How the alarms stand now: a `SummaryPayload` as UTF-8 JSON."""
         stamp = stamp_now(self._topics.site, self._topics.box, clock)
-        return SummaryPayload(**stamp, machine=self._machine, alarms=dict(self._alarms))
+        empty = SummaryPayload(**stamp, machine=self._machine, alarms={}).to_json()
+        return empty.removesuffix(_NO_ALARMS) + b'"alarms":{' + b",".join(self._alarms.values()) + b"}}"
+
+    def _put(self, name: str, standing: StandingPayload) -> None:
+        self._alarms[name] = json.dumps(name, ensure_ascii=False).encode() + b":" + standing.to_json()
 
 
 def _untold() -> StandingPayload:
