@@ -23,10 +23,16 @@ if TYPE_CHECKING:
     from daqsvc.recording.recording import Recording
     from sim_hw.demo.listener import Received
     from sim_hw.demo.session import Outcome, Script
+    from sim_hw.scenario_bearing import BearingScenario
 
 EXIT_FAILED = 1
 SCENARIO = "paper"
 UNIT = "g"
+BEARING_RATE_HZ = 12_000.0
+SIMULATED_BEARING = "6205-2RS"
+"""What the simulated bearing is: `sim_hw.plants.bearing.ORDERS` are its orders."""
+DECISIONS = {"healthy": "normal"}
+"""What the detector calls a part of a scenario, where it has another name."""
 UNITS = ("g", "m/s2", "mm/s", "um", "mm", "mil")
 
 
@@ -195,9 +201,11 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
 
     from sim_hw.demo.machines import laval_rig  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
-    from sim_hw.scenario import load_scenario  # noqa: PLC0415
+    from sim_hw.scenario import Scenario, load_any_scenario  # noqa: PLC0415
 
-    scenario = load_scenario(arguments.scenario or SCENARIO)
+    scenario = load_any_scenario(arguments.scenario or SCENARIO)
+    if not isinstance(scenario, Scenario):
+        return _of_bearing(scenario, arguments)
     machine = scenario.simulate(arguments.seed, arguments.snr_db)
     samples = np.column_stack([machine.channels[name] for name in ("x_um", "y_um", "keyphasor_v")])
     return Script(
@@ -210,6 +218,37 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
         samples_per_rev=machine.samples_per_rev,
         faults=scenario.node_faults(arguments.seed),
         seed=scenario.seed if arguments.seed is None else arguments.seed,
+    )
+
+
+def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Script:
+    import numpy as np  # noqa: PLC0415
+
+    from daqsvc.recording.recording import Recording  # noqa: PLC0415
+    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
+    from sim_hw.demo.session import Script  # noqa: PLC0415
+    from sim_hw.scenario import Onset  # noqa: PLC0415
+
+    run = scenario.accelerations(BEARING_RATE_HZ, arguments.seed, arguments.snr_db)
+    samples = np.column_stack([run.rotor_m_s2, run.housing_m_s2])
+    recording = Recording(("rotor", "housing"), samples, BEARING_RATE_HZ, Path(scenario.title), 0)
+    bearing = PlayedBearing(SIMULATED_BEARING, scenario.plant.speed_rpm)
+    per_rev = BEARING_RATE_HZ * 60.0 / scenario.plant.speed_rpm
+    begins = [("healthy", 0.0), *((damage.part, damage.at_s) for damage in scenario.damage)]
+    return Script(
+        title=scenario.title,
+        machine=lambda url: for_recording(recording, "m/s2", Setpoints(), url, bearing),
+        stream="recording",
+        samples=samples,
+        rate_hz=BEARING_RATE_HZ,
+        onsets=[
+            Onset(DECISIONS.get(part, part), at_s * BEARING_RATE_HZ / per_rev, round(at_s * BEARING_RATE_HZ))
+            for part, at_s in begins
+        ],
+        samples_per_rev=per_rev,
+        faults=scenario.node_faults(arguments.seed),
+        seed=scenario.seed if arguments.seed is None else arguments.seed,
+        detector="bearing",
     )
 
 

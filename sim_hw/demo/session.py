@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ import can
 from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.service import Service
+from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.errors import DemoError
 from sim_hw.demo.listener import Listener
@@ -29,10 +31,13 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.settings import MachineFile
+    from drivers.frames import FrameLayout
     from sim_hw.demo.listener import Received
     from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.scenario import Onset
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -56,6 +61,7 @@ class Script:
         samples_per_rev: to count delays in revolutions; None if the shaft is not known.
         faults: of the node and its link.
         seed: of everything random, to be told in the summary.
+        detector: the one whose decisions are held against ``onsets``.
     """
 
     title: str
@@ -67,6 +73,7 @@ class Script:
     samples_per_rev: float | None = None
     faults: NodeFaults | None = None
     seed: int = 0
+    detector: str = "rotor-bank"
 
     @property
     def duration_s(self) -> float:
@@ -166,7 +173,10 @@ class Session:
                 await _first(_links_up(service), running, "bus and broker did not come up", LINK_UP_S)
                 channel = machine.buses["can0"].model_dump()["channel"]
                 with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:
-                    await _unless_ended(running, self._play(bus, service, clock))
+                    try:
+                        await _unless_ended(running, self._play(bus, service, clock))
+                    except TimeoutError as error:
+                        raise DemoError(f"the playing came to a stop: {error}") from error
                 await self._last_frames(service)
             finally:
                 # Also when playing is broken off: the service stops as it does in the field.
@@ -178,7 +188,7 @@ class Session:
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
         script = self.script
         layout = assembly_drivers.frame_layout(service.machine, script.stream)
-        node = self.node = CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults)
+        node = self.node = _node(bus, layout, script)
         pacer: Pacer
         if isinstance(clock, DrivenClock):
             block = max((d.block for d in service.pipeline.detectors), default=0)
@@ -209,12 +219,15 @@ class Session:
         return None
 
     def backlog(self) -> int:
-        """Samples that have been sent and not yet been diagnosed."""
+        """Samples that are on the bus, or have come off it and have not been diagnosed yet.
+
+        What the node took while it was silent or off never goes onto the bus, and nobody waits for it.
+        """
         counters = self.counters()
         if self.service is None or self.node is None or counters is None:
             return 0
-        on_the_way = self.node.samples_sent - counters.samples_received - counters.samples_lost
-        return on_the_way + self.service.pipeline.behind_samples
+        on_the_way = self.node.frames_sent - counters.frames_received
+        return on_the_way * self.node.samples_per_frame + self.service.pipeline.behind_samples
 
     async def _last_frames(self, service: Service) -> None:
         """Let the frames that are still on the bus arrive."""
@@ -232,6 +245,15 @@ class Session:
         if message.kind == "diagnosis" and message.payload["changed"]:
             self.outcome.diagnoses.append(message.payload)
         self._hear(message)
+
+
+def _node(bus: can.BusABC, layout: FrameLayout, script: Script) -> CanNode:
+    """The device; a value beyond what its frames can hold is saturated, as by a converter, and said so."""
+    try:
+        return CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults)
+    except LayoutError as error:
+        logger.warning("%s. The device saturates such values, as an analogue input does", error)
+        return CanNode(bus, layout, script.samples, script.rate_hz, faults=script.faults, clip=True)
 
 
 async def _links_up(service: Service) -> None:

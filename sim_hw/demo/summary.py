@@ -16,14 +16,14 @@ ROTOR_BANK = "rotor-bank"
 def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, Any]:
     """The summary as one JSON object.
 
-    A declaration is a change of the rotor bank's decision. Its delay counts from the onset of the mode,
+    A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the mode,
     in revolutions. It is wrong if the machine was in another mode. Samples at the end that do not fill
     a frame are left over: a device would send them with the next ones.
     """
     declared = [
         (str(payload["decision"]), int(payload["window"]["end_index"]))
         for payload in outcome.diagnoses
-        if payload["detector"] == ROTOR_BANK
+        if payload["detector"] == script.detector
     ]
     figures = outcome.figures
     stream = figures["streams"][script.stream]

@@ -229,7 +229,9 @@ class View:
             f"{samples['skipped_by_detectors']:,} skipped"
         )
         if samples["left_over"]:
-            console.print(f"the last {samples['left_over']} samples do not fill a frame and were not sent")
+            console.print(
+                f"{samples['left_over']} samples were not sent: they do not fill a frame, or the device was off"
+            )
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):
                 told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())

@@ -62,6 +62,11 @@ class PlannedNode(ABC):
         return self._unsent
 
     @property
+    def samples_per_frame(self) -> int:
+        """Samples of each channel in a frame."""
+        return self._per_frame
+
+    @property
     def samples_sent(self) -> int:
         """Samples, per channel, that were played so far, whatever became of them."""
         frames: int = self._frames_done[self._played]
