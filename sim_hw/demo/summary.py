@@ -16,8 +16,8 @@ ROTOR_BANK = "rotor-bank"
 def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, Any]:
     """The summary as one JSON object.
 
-    A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the mode,
-    in revolutions. It is wrong if the machine was in another mode. Samples at the end that do not fill
+    A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the
+    mode, in revolutions. It is wrong if the machine was in another mode. Samples at the end that do not fill
     a frame are left over: a device would send them with the next ones.
     """
     declared = [

@@ -230,7 +230,7 @@ class View:
         )
         if samples["left_over"]:
             console.print(
-                f"{samples['left_over']} samples were not sent: they do not fill a frame, or the device was off"
+                f"{samples['left_over']} samples were not sent: they fill no frame, or the device was off"
             )
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):

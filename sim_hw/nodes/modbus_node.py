@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from drivers.modbus_layouts import Trend
 from sim_hw.nodes.modbus_unit import encode, store_for
 
 if TYPE_CHECKING:
@@ -283,6 +284,9 @@ class ModbusNode:
     ) -> None:
         self._rows = encode(layout.record, samples)
         self._store = store_for(unit, layout)
+        if isinstance(layout, Trend):
+            # A device has measured before it is asked for the first time.
+            self._store.put(first_index, self._rows[:1])
         self._period_ns = NS_PER_S / rate_hz
         self._first_index = first_index
         self.samples_sent = 0

@@ -25,18 +25,30 @@ _LAST_ID = 65_535
 
 
 class ModbusUnit:
-    """Registers behind one unit address; all of them exist and are 0 at first."""
+    """Registers behind one unit address.
+
+    Registers are there once they are mapped or set, and 0 until they are set. Requests for any others are
+    refused with exception 2, as devices do.
+    """
 
     def __init__(self) -> None:
         self._registers: dict[Table, NDArray[np.uint8]] = {
             name: np.zeros(2 * ADDRESSES, np.uint8) for name in _TABLES.values()
         }
+        self._mapped: dict[Table, NDArray[np.bool_]] = {
+            name: np.zeros(ADDRESSES, np.bool_) for name in _TABLES.values()
+        }
         self._queues: dict[int, Callable[[], bytes]] = {}
         self._watchers: dict[int, Callable[[int], None]] = {}
+
+    def map(self, table: Table, address: int, count: int) -> None:
+        """Let these registers be there."""
+        self._mapped[table][address : address + count] = True
 
     def put(self, table: Table, address: int, raw: bytes | NDArray[np.uint8]) -> None:
         """Set registers, high byte of each first."""
         data = np.frombuffer(bytes(raw), np.uint8)
+        self.map(table, address, len(data) // 2)
         self._registers[table][2 * address : 2 * address + len(data)] = data
 
     def get(self, table: Table, address: int, count: int) -> bytes:
@@ -49,6 +61,7 @@ class ModbusUnit:
 
     def watch(self, address: int, told: Callable[[int], None]) -> None:
         """Call ``told`` with the value whenever a holding register is written by request."""
+        self.map("holding", address, 1)
         self._watchers[address] = told
 
     def answer(self, pdu: bytes) -> bytes:
@@ -68,9 +81,12 @@ class ModbusUnit:
         """What follows the function in a reply, or the code of an exception; so the next ones."""
         if not 1 <= count <= _MAX_READ:
             return ILLEGAL_VALUE
-        if address + count > ADDRESSES:
+        if not self._there(table, address, count):
             return ILLEGAL_ADDRESS
         return bytes([2 * count]) + self.get(table, address, count)
+
+    def _there(self, table: Table, address: int, count: int) -> bool:
+        return address + count <= ADDRESSES and bool(self._mapped[table][address : address + count].all())
 
     def _read_queue(self, address: int) -> bytes | int:
         if address not in self._queues:
@@ -82,6 +98,8 @@ class ModbusUnit:
         count, raw = int.from_bytes(data[:2], "big"), data[3:]
         if not 1 <= count <= _MAX_WRITE or data[2] != 2 * count or len(raw) != 2 * count:
             return ILLEGAL_VALUE
+        if not self._there("holding", address, count):
+            return ILLEGAL_ADDRESS
         self.put("holding", address, raw)
         for k in range(count):
             if (told := self._watchers.get(address + k)) is not None:
@@ -102,6 +120,8 @@ class TrendStore:
 
     def __init__(self, unit: ModbusUnit, layout: Trend) -> None:
         self._unit, self._layout = unit, layout
+        for run in layout.record.runs:
+            unit.map(layout.table, run.address, run.count)
 
     def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
         """See `SampleStore.put`."""
@@ -117,6 +137,8 @@ class RingStore:
 
     def __init__(self, unit: ModbusUnit, layout: Ring) -> None:
         self._unit, self._layout = unit, layout
+        unit.map(layout.table, layout.count.run.address, layout.count.run.count)
+        unit.map(layout.table, layout.address, layout.depth * layout.record.registers)
 
     def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
         """See `SampleStore.put`."""
@@ -202,6 +224,9 @@ class WaveformStore:
         self._block = b""
         self._id = 0
         self.block_starts: dict[int, int] = {}
+        shown = layout.samples * layout.record.registers if layout.page is None else layout.page.registers
+        unit.map(layout.table, layout.block_id, 1)
+        unit.map(layout.table, layout.address, shown)
         if layout.trigger is not None:
             unit.watch(layout.trigger.address, lambda _value: self._begin())
         if layout.page is not None:

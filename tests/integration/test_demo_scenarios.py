@@ -43,8 +43,8 @@ def test_every_scenario_that_comes_along_is_played_to_its_end(
     played, frames = summary["samples"], summary["frames"]
     assert played["sent"] > 0
     assert frames["received"] == frames["sent"]
-    # What the device sampled came, or is counted as lost. What it did not sample while it was off is estimated
-    # from when its frames came, and on a busy host they are read up to 0.1 s late.
+    # What the device sampled came, or is counted as lost. What it did not sample while it was off is
+    # estimated from when its frames came, and on a busy host they are read up to 0.1 s late.
     assert played["received"] + played["lost"] == pytest.approx(played["sent"] + played["left_over"], abs=70)
 
 

@@ -153,6 +153,7 @@ def test_a_waveform_device_that_restarts_has_not_lost_all_the_ids_between(shows_
 
     async def main():
         unit = ModbusUnit()
+        unit.map("holding", 0, 4000)
         ids = [40_000, 40_001, *([0, 0] if shows_none else []), 1, 2, 5, 6]
         async with responding({1: unit}, SOUND, serial=False), rig.running():
             for block_id in ids:

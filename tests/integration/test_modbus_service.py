@@ -65,6 +65,7 @@ async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_pat
     # Registers 16 to 21 of a QM42VT1 in a published example: 0.0046 in/s, 0.108 mm/s, 78.65 F, 25.9 C,
     # 0.0071 in/s, 0.182 mm/s.
     unit = ModbusUnit()
+    unit.map("holding", 0, 64)
     unit.put("holding", 16, bytes.fromhex("002E006C06250206004700B6"))
     unit.put("holding", 32, struct.pack(">6H", 0, 1500, 0, 600, 0, 2500))
     link = tmp_path / "ttyUSB0"
@@ -86,6 +87,7 @@ async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_pat
 
 async def test_nothing_is_written_but_what_the_machine_file_allows():
     unit = ModbusUnit()
+    unit.map("holding", 490, 20)
     server = ModbusTcpServer({1: unit})
     await server.start()
     allowed = "timeout_ms = 200.0\nwrites = [{ unit = 1, address = 500, count = 2 }]"

@@ -47,6 +47,7 @@ class Sensor:
 
     def __init__(self, link):
         self.unit = ModbusUnit()
+        self.unit.map("holding", 0, 64)
         self.silent = False
         self._server = ModbusRtuServer({1: self.unit}, link, self._plan)
 

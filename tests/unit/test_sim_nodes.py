@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import struct
 import uuid
 
 import can
@@ -10,8 +11,12 @@ import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.frames import FrameLayout
+from drivers.modbus_layouts import Trend
+from drivers.registers import RegisterField, RegisterRecord, Run
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
 from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.modbus_node import ModbusNode
+from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pacing import SHORTEST_SLEEP_NS, DrivenPacer, RealTimePacer
 from sim_hw.nodes.wire import quantised, to_frames
 
@@ -315,3 +320,16 @@ async def test_real_time_deadlines_do_not_drift():
     assert clock.now_ns == before_ns
     await pacer.wait_until(1010 * 2 * MS)
     assert clock.now_ns >= start_ns + 1010 * 2 * MS
+
+
+def test_registers_that_a_modbus_unit_does_not_have_are_refused_as_devices_do() -> None:
+    unit = ModbusUnit()
+    layout = Trend(1, "holding", RegisterRecord((RegisterField("x", 10, "int16", scale=0.1),), (Run(10, 1),)))
+    ModbusNode(unit, layout, np.array([[4.2], [5.0]]), 1.0)
+    read = lambda address, count: unit.answer(struct.pack(">BHH", 3, address, count))  # noqa: E731
+    # It has measured before it is asked for the first time.
+    assert read(10, 1) == struct.pack(">BBH", 3, 2, 42)
+    for address, count in [(9, 1), (9, 2), (10, 2), (500, 125), (65_535, 2)]:
+        assert read(address, count) == bytes([0x83, 2])
+    assert unit.answer(struct.pack(">BHHBH", 16, 500, 1, 2, 7)) == bytes([0x90, 2])
+    assert unit.answer(struct.pack(">BHH", 4, 10, 1)) == bytes([0x84, 2])
