@@ -243,6 +243,12 @@ def recorder_of(port: BusPort, link_name: str, counters: CanCounters) -> CanReco
             file_bytes=wanted["file_mb"] * _BYTES_PER_MB,
             keep_bytes=wanted["keep_mb"] * _BYTES_PER_MB,
         )
+    if not port.options.get("fd") and port.options["interface"] != "socketcan":
+        logger.warning(
+            "%s: CAN FD frames are neither read nor recorded, and not counted as unrecorded: the machine "
+            "file says fd = false. Set fd = true if the bus carries any",
+            link_name,
+        )
     channel = str(port.options.get("channel"))
     # Virtual buses are called by a path, which is no word of a log.
     interface = channel if _INTERFACE.fullmatch(channel) else port.name

@@ -174,7 +174,8 @@ def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock
         )
     sock = _raw_socket()
     try:
-        if options.get("fd"):
+        # A recording is of the whole bus: what is sent on it does not depend on what the streams are.
+        if options.get("fd") or options.get("record"):
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ALL_CLASSES)
         if _filtered(options) and len(matches) <= _MOST_FILTERS:

@@ -159,3 +159,16 @@ async def test_the_whole_bus_is_recorded_unless_it_is_filtered(vcan: VcanLink, t
             await until(lambda: driver.streams["classic"][0].frames_received == 1)  # noqa: B023
         counts.append(driver.counters.frames_recorded)
     assert counts == [2, 1]
+
+
+async def test_fd_frames_are_recorded_whatever_the_machine_file_says_of_fd(
+    vcan: VcanLink, tmp_path: Path
+) -> None:
+    driver = driver_on(vcan, {"file": tmp_path / "fd.log"})
+    driver._port.options["fd"] = False
+    async with running(driver):
+        with vcan.sender() as sender:
+            sender.send(frame_bytes(0x7FF, bytes(64), fd=True))
+            sender.send(frame_bytes(0x101, bytes(8)))
+        await until(lambda: driver.streams["classic"][0].frames_received == 1)
+    assert driver.counters.frames_recorded == 2

@@ -31,6 +31,7 @@ from running_drivers import running, until
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from drivers import can_record
+from drivers.base import BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_errors import CanCounters
 from drivers.can_record import CanRecorder
@@ -446,3 +447,19 @@ async def test_the_recording_outlives_the_link(bus: StandInBus, tmp_path: Path) 
     path = only_file(tmp_path)
     assert len(numbers(path)) == driver.counters.frames_recorded == 3
     assert not [t for t in threading.enumerate() if t.name.startswith("can-recorder")]
+
+
+@pytest.mark.parametrize(
+    ("options", "missing"),
+    [
+        ({"interface": "kvaser", "channel": "0", "fd": False}, True),
+        ({"interface": "kvaser", "channel": "0", "fd": True}, False),
+        ({"interface": "socketcan", "channel": "can0", "fd": False}, False),
+    ],
+)
+def test_fd_frames_that_an_adapter_is_told_not_to_read_are_said_to_be_missing(
+    options: dict[str, Any], *, missing: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = BusPort("can0", options | {"record": {"file": tmp_path / "run.log"}}, [], SystemClock(), print)
+    assert can_record.recorder_of(port, "CAN bus 'can0'", CanCounters()) is not None
+    assert ("CAN FD frames are neither read nor recorded" in caplog.text) is missing
