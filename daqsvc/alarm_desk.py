@@ -130,6 +130,7 @@ class AlarmDesk:
         self._free_bytes: int | None = None
         self._under_way: set[asyncio.Future[Any]] = set()
         self._newest: dict[tuple[str, str], AlarmEvent] = {}
+        self._topic_of: dict[tuple[str, str], str] = {}
         self._untold: dict[tuple[str, str], AlarmEvent] = {}
         """By alarm, its newest event if the outbox has refused that."""
         self._one_at_a_time = asyncio.Lock()
@@ -216,7 +217,7 @@ class AlarmDesk:
     def figures(self) -> dict[str, Any]:
         """How many alarms stand, are covered or unacknowledged by now, and what has happened so far."""
         counted = self.manager.counters
-        shown = Counter(status.state for status in self.manager.alarms.values())
+        shown = Counter(self.manager.shown)
         return {
             "active": sum(count for state, count in shown.items() if state.is_active),
             "unacknowledged": sum(c for state, c in shown.items() if state.value.endswith("_unacknowledged")),
@@ -326,7 +327,9 @@ class AlarmDesk:
         alarm = (event.identity.machine, event.alarm)
         self._newest[alarm] = event
         self._untold.pop(alarm, None)
-        topic = self.topics.alarm(event.identity.machine, event.alarm)
+        topic = self._topic_of.get(alarm)
+        if topic is None:
+            topic = self._topic_of[alarm] = self.topics.alarm(*alarm)
         try:
             committed = self.outbox.submit(
                 topic,
@@ -336,12 +339,13 @@ class AlarmDesk:
         except OutboxError as error:
             committed = asyncio.get_running_loop().create_future()
             committed.set_exception(error)
-        self._watch(committed)
+        self._under_way.add(committed)
         committed.add_done_callback(lambda done: self._settled(event, done))
         return committed
 
     def _settled(self, event: AlarmEvent, committed: asyncio.Future[int]) -> None:
         """Remember what the disk must be told again: how an alarm stands, if its newest event was refused."""
+        self._under_way.discard(committed)
         if committed.cancelled() or (error := committed.exception()) is None:
             return
         logger.error("an event of alarm %s never reached the disk: %s", event.alarm, error)

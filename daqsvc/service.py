@@ -82,6 +82,10 @@ class LoopLag:
                     late_s,
                 )
 
+    def forget(self) -> None:
+        """Begin the figures anew."""
+        self._late_s.clear()
+
     def figures_ms(self) -> dict[str, float]:
         """Median, 99th percentile and maximum of the lateness, in ms."""
         if not self._late_s:

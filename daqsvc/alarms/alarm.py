@@ -91,7 +91,7 @@ class Alarm:
 
     def is_held(self, hold: Hold) -> bool:
         """Whether ``hold`` covers the state."""
-        return hold in self._holds
+        return bool(self._holds) and hold in self._holds
 
     def resume(self, told: AlarmEvent, found: str, since: Instant, now: Instant) -> None:
         """Stand as the last event before a restart said.

@@ -263,8 +263,10 @@ class AlarmManager:
         return replace(event, first_out=True) if self._first_out.marks(event) else event
 
     def _count(self, before: AlarmState, now: AlarmState) -> None:
-        self._shown[before] -= before is not AlarmState.NORMAL
-        self._shown[now] += now is not AlarmState.NORMAL
+        if before is not AlarmState.NORMAL:
+            self._shown[before] -= 1
+        if now is not AlarmState.NORMAL:
+            self._shown[now] += 1
 
     def _events(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
         self._start_up.take(diagnosis)

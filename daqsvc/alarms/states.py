@@ -165,9 +165,9 @@ def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> Alar
 
 def strongest_first(holds: Collection[Hold]) -> tuple[AlarmState, ...]:
     """The states that ``holds`` show, the one that consumers see first."""
-    return tuple(hold.value for hold in _STRONGEST_FIRST if hold in holds)
+    return tuple(hold.value for hold in _STRONGEST_FIRST if hold in holds) if holds else ()
 
 
 def shown(state: AlarmState, holds: Collection[Hold]) -> AlarmState:
     """The state that consumers see: the strongest hold, or the alarm's own state if none covers it."""
-    return next(iter(strongest_first(holds)), state)
+    return next(iter(strongest_first(holds)), state) if holds else state
