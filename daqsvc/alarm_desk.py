@@ -304,6 +304,7 @@ class AlarmDesk:
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
             buses=self._bus_health(),
+            refused=None if publisher is None else publisher.refused,
         )
 
     async def _look_at_disk(self) -> None:

@@ -91,11 +91,13 @@ def _commands(machine: MachineFile) -> CommandSettings | None:
     given = None if machine.mqtt is None else machine.mqtt.commands
     if given is None or not given.enabled:
         return None
+    home_assistant = None if machine.mqtt is None else machine.mqtt.home_assistant
     return CommandSettings(
         machines=(machine.machine.name,),
         allow=frozenset(Verb(verb) for verb in given.allow),
         max_age_s=given.max_age_s,
         max_bytes=given.max_bytes,
+        reserved=() if home_assistant is None else (home_assistant.prefix,),
     )
 
 

@@ -31,6 +31,12 @@ BUS_CONTROLLER = "bus-controller/"
 BUS_RECORDING = "bus-recording/"
 """How the names of the conditions of a bus begin."""
 
+REFUSED = "broker/refused"
+"""The condition of messages that the broker will not take."""
+
+REFUSED_NAMED = 3
+"""Topics that it names."""
+
 CERTIFICATE = "certificate/"
 BROKER = "broker"
 CERTIFICATE_DAYS = 14
@@ -89,6 +95,7 @@ class Vitals:
         telemetry_dropped: telemetry messages dropped so far.
         unwritten: commands so far that were refused because the audit log could not be written.
         buses: how each bus stands, by name.
+        refused: by topic, why the broker will not take messages; None without a broker.
     """
 
     now_ns: int
@@ -105,6 +112,7 @@ class Vitals:
     telemetry_dropped: int
     unwritten: int
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
+    refused: Mapping[str, str] | None = None
 
 
 def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProxyType({})) -> list[str]:
@@ -118,6 +126,8 @@ def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProx
     found += [f"{BUS_OVERRUN}{bus}" for bus, driver in buses.items() if driver in {"can", "serial"}]
     for kind in (BUS_CONTROLLER, BUS_RECORDING):
         found += [f"{kind}{bus}" for bus, driver in buses.items() if driver == "can"]
+    if mqtt is not None:
+        found.append(REFUSED)
     if mqtt is not None and mqtt.tls:
         files = {BROKER: True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
         found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
@@ -174,6 +184,10 @@ class SelfCheck:
         yield self._damage(vitals)
         yield self._dropped(vitals)
         yield self._audit(vitals)
+        if vitals.refused is not None:
+            yield _refusals(vitals.refused)
+        elif REFUSED in vitals.conditions_told:
+            yield Condition(REFUSED, Level.NORMAL, "there is no broker any more")
         yield from self._buses(vitals)
 
     def _buses(self, vitals: Vitals) -> Iterator[Condition]:
@@ -283,6 +297,19 @@ class SelfCheck:
             "has room and is fast enough"
         )
         return Condition(name, Level.ALERT, sentence)
+
+
+def _refusals(refused: Mapping[str, str]) -> Condition:
+    if not refused:
+        return Condition(REFUSED, Level.NORMAL, "the broker takes all messages")
+    # No count: it would be another sentence each time.
+    named = "; ".join(f"{topic} ({reason})" for topic, reason in sorted(refused.items())[:REFUSED_NAMED])
+    others = ", and others" if len(refused) > REFUSED_NAMED else ""
+    sentence = (
+        f"the broker will not take messages on {named}{others}: they wait on disk and are tried again; allow "
+        "them there"
+    )
+    return Condition(REFUSED, Level.ALERT, sentence)
 
 
 class _Happening:

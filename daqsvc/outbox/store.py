@@ -10,7 +10,9 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, TypeVar
 
+from daqsvc.outbox.command_ids import CommandIds
 from daqsvc.outbox.counters import OutboxCounters, TelemetryCounters
+from daqsvc.outbox.dead_letters import DeadLetters
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import Draft, OutboxError, OutboxMessage, TelemetryMessage, new_series
@@ -49,6 +51,9 @@ class Outbox:
 
     Use it from one event loop; ``open`` before anything else, ``close`` at the end.
 
+    Beside the journal it has, in files of their own, the messages that the broker refuses (`dead_letters`)
+    and the ids of the commands that have come (`command_ids`).
+
     Args:
         path: the SQLite file of the alarms, e.g. ``/var/lib/daqsvc/outbox.sqlite``; that of telemetry
             stands beside it, ``outbox-telemetry.sqlite``.
@@ -63,6 +68,9 @@ class Outbox:
     def __init__(self, path: Path, clock: Clock, limits: OutboxLimits | None = None) -> None:
         self.series = new_series()
         self.counters = OutboxCounters()
+        self.directory = path.parent
+        self.command_ids = CommandIds(path.with_name("command-ids"))
+        self.dead_letters = DeadLetters(path.with_name(f"{path.stem}-refused{path.suffix}"), clock.wall_ns)
         self._limits = OutboxLimits() if limits is None else limits
         self._journal = Journal(path, clock.wall_ns, self._limits)
         self._telemetry = Telemetry(telemetry_path(path), clock, self._limits, self.counters.telemetry)

@@ -6,10 +6,10 @@ stands in the machine file. So the broker's access list says who, and the box sa
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import re
-from collections import OrderedDict
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
@@ -19,27 +19,31 @@ from pydantic import ValidationError
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.asked import refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.outbox.command_ids import REMEMBERED
 from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import stamp_now
 from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
-    import aiomqtt
-
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.outbox.command_ids import CommandIds
+    from daqsvc.publish.connection import Incoming
     from daqsvc.publish.settings import CommandSettings
-    from daqsvc.publish.topics import Topics
+    from daqsvc.publish.topics import CommandTopic, Topics
 
 log = logging.getLogger(__name__)
-
-REMEMBERED = 4096
-"""Ids of commands that can be remembered, to refuse a command that comes again."""
 
 QUIET_NS = 10 * NS_PER_S
 """After one refusal has been logged, further ones are not for so long."""
 
 _SHOWN_ID = 64
+_SHOWN_TOPIC = 200
+_LONGEST_ANSWER_TOPIC = 256
+_RESERVED = ("$", "daqsvc/", "homeassistant/", "spBv1.0/", "STATE/")
+"""Where no answer goes, whatever its sender wants: where boxes speak, discovery by others, Sparkplug,
+brokers."""
+
 _SHOWN_FAULTS = 500
 
 
@@ -58,6 +62,7 @@ class CommandCounters:
         unauthorised: for a machine or a verb that the machine file does not allow.
         stale: too old, from the future, retained at the broker, here for the second time, or so many that
             a second time could not be told.
+        unwritten: refused because their id could not be written down.
         unanswered: answers that the broker did not take.
     """
 
@@ -66,6 +71,7 @@ class CommandCounters:
     malformed: int = 0
     unauthorised: int = 0
     stale: int = 0
+    unwritten: int = 0
     unanswered: int = 0
 
 
@@ -92,75 +98,85 @@ class CommandIntake:
         topics: the box.
         handler: carries out what is allowed.
         clock: its wall clock tells how old a command is.
+        ids: those of the commands that have come.
     """
 
     def __init__(
-        self, settings: CommandSettings, topics: Topics, handler: CommandHandler, clock: Clock
+        self,
+        settings: CommandSettings,
+        topics: Topics,
+        handler: CommandHandler,
+        clock: Clock,
+        ids: CommandIds,
     ) -> None:
         self.counters = CommandCounters()
         self._settings = settings
         self._topics = topics
         self._handler = handler
         self._clock = clock
-        self._seen: OrderedDict[tuple[str, str], int] = OrderedDict()
+        self._ids = ids
+        self._reserved = (*_RESERVED, f"{topics.root}/", *(f"{prefix}/" for prefix in settings.reserved))
         self._quiet_until_ns = clock.monotonic_ns()
 
-    async def take(self, message: aiomqtt.Message) -> Answer:
+    async def take(self, message: Incoming) -> Answer | None:
         """Carry out the command of a message, or refuse it; the answer says which.
 
-        Args:
-            message: on a topic that `Topics.commands` or `Topics.below_commands` matches, but no answer.
+        Returns:
+            The answer; None if the message is no command to this box, or the answer to one.
         """
-        topic = str(message.topic)
-        machine, _, verb = topic.removeprefix(f"{self._topics.base}/").split("/", 2)
-        asked = bytes(message.payload)
+        told = self._topics.command_of(message.topic)
+        if told is None or told.is_answer:
+            return None
         try:
-            command = self._command(machine, verb, asked, retained=message.retain)
+            command = await self._command(told, message)
         except CommandRefusedError as refusal:
-            self._log(topic, refusal)
+            self._log(message.topic, refusal)
             outcome = CommandOutcome(accepted=False, reason=str(refusal))
         else:
-            outcome = await self._handler(command, f"mqtt {topic}")
+            outcome = await self._handler(command, f"mqtt {message.topic}")
             if outcome.accepted:
                 self.counters.accepted += 1
             else:
                 self.counters.refused += 1
         response = ResponsePayload(
             **stamp_now(self._topics.site, self._topics.box, self._clock),
-            id=_id_of(asked[: self._settings.max_bytes]),
-            machine=machine,
-            verb=verb,
+            id=_id_of(message.payload[: self._settings.max_bytes]),
+            machine=told.machine[:_SHOWN_TOPIC],
+            verb=told.verb[:_SHOWN_TOPIC],
             accepted=outcome.accepted,
             reason=outcome.reason,
             events=outcome.events,
         )
-        return Answer(self._answer_topic(message), response.to_json(), _correlation(message))
+        return Answer(self._answer_topic(message), response.to_json(), message.correlation)
 
     def _log(self, topic: str, refusal: CommandRefusedError) -> None:
         """Say it, but not for each of a flood: the counters and the answers tell of the others."""
         now_ns = self._clock.monotonic_ns()
         loud = now_ns >= self._quiet_until_ns
-        log.log(logging.WARNING if loud else logging.DEBUG, "command on %r refused: %s", topic, refusal)
+        level = logging.WARNING if loud else logging.DEBUG
+        log.log(level, "command on %r refused: %s", topic[:_SHOWN_TOPIC], refusal)
         if loud:
             self._quiet_until_ns = now_ns + QUIET_NS
 
-    def _command(self, machine: str, verb: str, asked: bytes, *, retained: bool) -> AlarmCommand:
+    async def _command(self, topic: CommandTopic, message: Incoming) -> AlarmCommand:
         """What is asked.
 
         Raises:
             CommandRefusedError: it is not to be carried out.
         """
+        machine, verb = topic.machine, topic.verb
         allowed = ", ".join(sorted(self._settings.allow)) or "nothing"
         if machine not in self._settings.machines:
             self.counters.unauthorised += 1
             raise CommandRefusedError(
-                f"this box takes no commands for machine {machine!r}; it watches "
+                f"this box takes no commands for machine {machine[:_SHOWN_TOPIC]!r}; it watches "
                 f"{', '.join(self._settings.machines)}"
             )
         if verb not in set(Verb):
             self.counters.malformed += 1
             raise CommandRefusedError(
-                f"there is no verb {verb!r}; the last part of a command's topic is one of {', '.join(Verb)}"
+                f"there is no verb {verb[:_SHOWN_TOPIC]!r}; the last part of a command's topic is one of "
+                f"{', '.join(Verb)}"
             )
         if verb not in self._settings.allow:
             self.counters.unauthorised += 1
@@ -168,15 +184,15 @@ class CommandIntake:
                 f"{verb!r} is not allowed over MQTT; allowed: {allowed}. Add it to mqtt.commands.allow in "
                 "the machine file, or do it at the box"
             )
-        told = self._read(asked)
-        if retained:
+        told = self._read(message.payload)
+        if message.retain:
             self.counters.stale += 1
             raise CommandRefusedError(
                 "it is retained at the broker and would come again with every connection; send it without "
                 "retain"
             )
         self._check_age(told)
-        self._check_new(machine, told.id)
+        await self._check_new(machine, told)
         return AlarmCommand(
             verb=Verb(verb),
             alarm=told.alarm,
@@ -222,38 +238,46 @@ class CommandIntake:
             "send it again, or set the clocks"
         )
 
-    def _check_new(self, machine: str, identifier: str) -> None:
-        now_ns = self._clock.monotonic_ns()
-        # A command that is no longer remembered would be too old, from whichever side its clock was off.
-        forget_ns = now_ns - round(2 * self._settings.max_age_s * NS_PER_S)
-        while self._seen and next(iter(self._seen.values())) < forget_ns:
-            self._seen.popitem(last=False)
-        if (machine, identifier) in self._seen:
+    async def _check_new(self, machine: str, told: CommandPayload) -> None:
+        """Write down that this command has come; before it is obeyed, for afterwards may be too late."""
+        too_old_s = told.issued_at.timestamp() + self._settings.max_age_s
+        try:
+            known = await asyncio.to_thread(
+                self._ids.remember,
+                machine,
+                told.id,
+                until_ns=round(too_old_s * NS_PER_S),
+                now_ns=self._clock.wall_ns(),
+            )
+        except OSError as error:
+            self.counters.unwritten += 1
+            raise CommandRefusedError(
+                f"its id cannot be written down ({error.strerror or error}), so it might be obeyed twice: "
+                "make room on the disk of the box, then ask again"
+            ) from error
+        if known == "known":
             self.counters.stale += 1
             raise CommandRefusedError(
-                f"a command with id {identifier!r} has come before; give every command its own id"
+                f"a command with id {told.id!r} has come before; give every command its own id"
             )
-        if len(self._seen) >= REMEMBERED:
+        if known == "full":
             self.counters.stale += 1
             raise CommandRefusedError(f"there were {REMEMBERED} commands in a short time; ask again later")
-        self._seen[machine, identifier] = now_ns
 
-    def _answer_topic(self, message: aiomqtt.Message) -> str:
+    def _answer_topic(self, message: Incoming) -> str:
         """Where the sender wants the answer, unless that would speak in the name of this box or of others.
 
         The box may publish what the sender may not: an answer must not become an alarm, or an entity.
         """
         own = f"{message.topic}/{ANSWER}"
-        wanted = getattr(message.properties, "ResponseTopic", None)
-        if not isinstance(wanted, str) or not wanted or len(wanted) > 256 or set(wanted) & set("+#\0"):
+        wanted = message.response_topic
+        if not wanted or len(wanted) > _LONGEST_ANSWER_TOPIC or set(wanted) & set("+#"):
             return own
-        reserved = ("$", f"{self._topics.root}/", "homeassistant/", "spBv1.0/")
-        return own if wanted.startswith(reserved) and not wanted.startswith(own) else wanted
-
-
-def _correlation(message: aiomqtt.Message) -> bytes | None:
-    data = getattr(message.properties, "CorrelationData", None)
-    return data if isinstance(data, bytes) else None
+        if not wanted.isprintable():
+            return own
+        if wanted == own or wanted.startswith(f"{own}/"):
+            return wanted
+        return own if f"{wanted}/".startswith(self._reserved) else wanted
 
 
 def _id_of(asked: bytes) -> str | None:
@@ -263,4 +287,7 @@ def _id_of(asked: bytes) -> str | None:
     except (ValueError, RecursionError):
         return None
     identifier = told.get("id") if isinstance(told, dict) else None
-    return identifier[:_SHOWN_ID] if isinstance(identifier, str) else None
+    if not isinstance(identifier, str):
+        return None
+    # JSON can say what no UTF-8 can: halves of surrogate pairs.
+    return re.sub(r"[\ud800-\udfff]", "?", identifier[:_SHOWN_ID])

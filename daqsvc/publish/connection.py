@@ -1,30 +1,40 @@
-"""An aiomqtt client that cannot hold up the service, and that hears the broker say no."""
+"""One connection to a broker: paho's protocol, asyncio's event loop, and a broker that is not trusted."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import math
-import ssl
 import threading
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, cast
 
-import aiomqtt
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from daqsvc.publish.errors import (
+    MqttCodeError,
+    MqttError,
+    NoConsentError,
+    PublishRefusedError,
+    SilentBrokerError,
+    TakenOverError,
+)
 from daqsvc.publish.outage import in_words
+from daqsvc.publish.wire import LARGEST_PACKET, Wire, WireContext
 
 if TYPE_CHECKING:
+    import ssl
     from collections.abc import AsyncIterator, Callable
 
-    from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage
+    from paho.mqtt.client import MQTTMessage
     from paho.mqtt.reasoncodes import ReasonCode
 
-# paho and aiomqtt tell about every broken connection, and about every message above ten under way; the
-# publisher says once, in its own words, what matters of it.
+# paho tells about every broken connection; the publisher says once, in its own words, what matters of it.
 _LIBRARY_LOG = logging.getLogger(f"{__name__}.library")
 _LIBRARY_LOG.setLevel(logging.CRITICAL)
 
@@ -32,14 +42,26 @@ CONSENT_S = 5.0
 """How long the broker may take to accept or refuse a connection."""
 
 PUBACK_S = 10.0
-"""How long the broker may take to acknowledge a message."""
+"""How long the broker may take to acknowledge a message, or a subscription."""
 
-INCOMING = 64
+INCOMING: Final = 64
 """Messages from the broker that may wait to be looked at; a flood of them is dropped and counted."""
 
-LARGEST_PACKET = 1 << 20
-"""Bytes of the largest packet that an MQTT 5 broker may send to the box."""
+FLOOD_PER_S: Final = 2000
+"""Packets a second that nobody waits for; a broker that sends more waits in its socket, not in our memory."""
 
+OWED: Final = 1000
+"""Acknowledgements that may wait to be sent before nothing more is read."""
+
+RECEIVE_MAXIMUM: Final = 65_535
+"""Messages that a broker takes at a time unless it says another number."""
+
+UNANSWERED: Final = 100
+"""Messages that a broker may leave without a PUBACK, though it answers others, before the connection is
+given up."""
+
+_AT_ONCE = 64
+_MISC_S = 1.0
 _HEAD_BYTES = 64
 """More than the rest of a PUBLISH packet needs: fixed header, packet id, properties that we set."""
 
@@ -47,42 +69,70 @@ _SESSION_TAKEN_OVER = 142
 _FAILURE = 128
 
 
-class NoConsentError(aiomqtt.MqttError):
-    """The broker was reached, but did not say whether it accepts the connection."""
+@dataclass(frozen=True, slots=True)
+class Will:
+    """What the broker publishes when the connection is lost.
+
+    Attributes:
+        topic: MQTT topic.
+        payload: the bytes.
+        qos: 0 or 1.
+        retain: whether the broker shall keep it as the latest of its topic.
+    """
+
+    topic: str
+    payload: bytes
+    qos: int = 1
+    retain: bool = False
 
 
-class PublishRefusedError(aiomqtt.MqttError):
-    """The broker has answered a publication with a reason why it will not take it (MQTT 5 only)."""
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A message from the broker.
+
+    Attributes:
+        topic: MQTT topic; any text, of up to 65,535 bytes.
+        payload: the bytes.
+        retain: whether it was kept at the broker.
+        response_topic: where its sender wants an answer (MQTT 5).
+        correlation: what its sender wants to see again in the answer (MQTT 5).
+    """
+
+    topic: str
+    payload: bytes
+    retain: bool = False
+    response_topic: str | None = None
+    correlation: bytes | None = None
 
 
-class SilentBrokerError(aiomqtt.MqttError):
-    """The connection stands, but no acknowledgement came over it in time."""
-
-
-class TakenOverError(aiomqtt.MqttError):
-    """Another client has connected with the same client id."""
-
-
-class Connection(aiomqtt.Client):
+class Connection:
     """One connection to a broker, made once.
 
-    It differs from its base class in what a service that must not stop needs:
-
-    - The blocking part of connecting (name lookup, TCP, TLS) runs on a daemon thread instead of the
-      event loop's executor: a broker that does not answer delays neither the stop of the service nor
-      the end of the process.
+    - The blocking part of connecting (name lookup, TCP, TLS) runs on a daemon thread of its own: a broker
+    that
+      does not answer delays neither the stop of the service nor the end of the process. All else, paho's
+      callbacks too, happens on the event loop, so that no callback meets a socket that is closed already.
     - A connection that ends before the broker's consent is an error at once, not after a time limit.
-    - `deliver` raises on a negative PUBACK, which the base class takes for a good one, and when the
-      connection is lost. It keeps to the in-flight window of the broker, if that is the smaller one.
-    - `abandon` lets go of a connection that cannot be closed politely.
+    - `deliver` raises on a negative PUBACK and when the connection is lost. It keeps to the in-flight
+    window of
+      the broker, if that is the smaller one.
+    - Whatever a broker sends ends the connection at worst; what waits of it is bounded.
 
     Args:
         hostname: of the broker.
         port: of the broker.
         in_flight: how many messages may wait for their PUBACK at a time.
-        protocol: MQTT version.
+        mqtt5: whether to speak MQTT 5, rather than 3.1.1.
+        identifier: client id.
+        username: None for an anonymous connection.
+        password: None for none.
+        tls_context: None for no TLS.
+        keepalive: in s.
+        will: None for none.
+        reason_against: why nothing is to be sent on a topic; None if it may be.
+        on_taken: called with the topic of each message for which a good PUBACK came.
         on_overlooked: called for each message from the broker that is dropped because too many wait.
-        options: further arguments of `aiomqtt.Client`.
+        on_ignored: called for each message from the broker that came before its consent, or has no topic.
     """
 
     def __init__(
@@ -91,48 +141,95 @@ class Connection(aiomqtt.Client):
         port: int,
         *,
         in_flight: int,
-        protocol: aiomqtt.ProtocolVersion,
+        mqtt5: bool,
+        identifier: str,
+        username: str | None = None,
+        password: str | None = None,
+        tls_context: ssl.SSLContext | None = None,
+        keepalive: int = 60,
+        will: Will | None = None,
+        reason_against: Callable[[str], str | None] = lambda _topic: None,
+        on_taken: Callable[[str], None] = lambda _topic: None,
         on_overlooked: Callable[[], None] = lambda: None,
-        **options: Any,
+        on_ignored: Callable[[], None] = lambda: None,
     ) -> None:
-        self.is_mqtt5 = protocol is aiomqtt.ProtocolVersion.V5
-        if self.is_mqtt5:
-            options["properties"] = _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET)
-        super().__init__(
-            hostname,
-            port,
-            logger=_LIBRARY_LOG,
-            protocol=protocol,
-            max_inflight_messages=in_flight,
-            max_queued_incoming_messages=INCOMING,
-            **options,
-        )
-        self._on_overlooked = on_overlooked
+        self.is_mqtt5 = mqtt5
+        self.unacknowledged: tuple[str, ...] = ()
+        """Topics of what was under way when the connection was lost."""
+        self._address = hostname, port, keepalive
+        self._loop = asyncio.get_running_loop()
         self._in_flight = in_flight
+        self._reason_against = reason_against
+        self._on_taken = on_taken
+        self._on_overlooked = on_overlooked
+        self._on_ignored = on_ignored
         self._window = asyncio.Semaphore(in_flight)
+        self._most_in_flight = RECEIVE_MAXIMUM
+        self._handed_over = 0
+        self._latest_answered = 0
+        self._unanswered = 0
         self._largest_packet: int | None = None
-        self._acknowledgements: dict[int, asyncio.Future[ReasonCode]] = {}
-        self._disconnected.add_done_callback(self._give_up)
+        self._acknowledgements: dict[int, tuple[str, asyncio.Future[ReasonCode]]] = {}
+        self._grants: dict[int, asyncio.Future[list[ReasonCode]]] = {}
+        self._queue: asyncio.Queue[Incoming] = asyncio.Queue(INCOMING)
+        # Futures hold what went wrong as a result: one that nobody asks for is no complaint of asyncio's.
+        self._consent: asyncio.Future[Exception | None] = self._loop.create_future()
+        self._ended: asyncio.Future[Exception | None] = self._loop.create_future()
         self._abandoned = False
+        self._held: Wire | None = None
+        self._fd: int | None = None
+        self._reads = False
+        self._misc: asyncio.TimerHandle | None = None
+        self._second_s = 0.0
+        self._packets_before = 0
+        self._asked_for = 0
+        self._owed_before = 0
+        protocol = MQTTProtocolVersion.MQTTv5 if mqtt5 else MQTTProtocolVersion.MQTTv311
+        self._client = Client(
+            CallbackAPIVersion.VERSION2, identifier, protocol=protocol, reconnect_on_failure=False
+        )
+        self._client.enable_logger(_LIBRARY_LOG)
+        self._client.max_inflight_messages = 0  # the window is kept here
+        self._client.tls_set_context(cast("ssl.SSLContext", WireContext(tls_context, mqtt5=mqtt5)))
+        if username is not None:
+            self._client.username_pw_set(username, password)
+        if will is not None:
+            self._client.will_set(will.topic, will.payload, will.qos, will.retain)
+        self._client.on_connect = lambda _client, _data, _flags, code, told: self._answered(code, told)
+        self._client.on_disconnect = lambda _client, _data, _flags, code, _told: self._disconnected(code)
+        self._client.on_message = lambda _client, _data, message: self._arrived(message)
+        self._client.on_publish = lambda _client, _data, mid, code, _told: self._acknowledged(mid, code)
+        self._client.on_subscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
+        self._client.on_unsubscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
+        self._client.on_socket_register_write = lambda *_: self._write_later()
+        self._client.on_socket_unregister_write = lambda *_: self._write_no_more()
+        self._client.on_socket_close = lambda *_: self._detach()
 
-    async def open(self) -> None:
+    async def open(self, patience_s: Callable[[float], float] | None = None) -> None:
         """Connect and wait for the broker's consent.
+
+        Args:
+            patience_s: from how long it took to reach the broker, how long it may take for its consent, in s;
+                None for `CONSENT_S`.
 
         Raises:
             NoConsentError: the broker did not answer.
-            aiomqtt.MqttError: it refused.
+            MqttError: it refused.
             OSError: it cannot be reached, or TLS failed.
         """
-        reached: asyncio.Future[None] = self._loop.create_future()
+        since_s = self._loop.time()
+        wait_s = CONSENT_S
+        reached: asyncio.Future[Exception | None] = self._loop.create_future()
         threading.Thread(target=self._reach, args=(reached,), name="mqtt-connect", daemon=True).start()
         try:
-            await reached
-            async with asyncio.timeout(CONSENT_S):
-                await self._connected
+            _raise(await reached)
+            wait_s = CONSENT_S if patience_s is None else patience_s(self._loop.time() - since_s)
+            async with asyncio.timeout(wait_s):
+                _raise(await self._consent)
         except BaseException as error:
             self.abandon()
-            if isinstance(error, TimeoutError):
-                raise NoConsentError(f"the broker did not answer within {CONSENT_S:g} s") from error
+            if isinstance(error, TimeoutError) and reached.done() and reached.result() is None:
+                raise NoConsentError(f"the broker did not answer within {wait_s:g} s") from error
             raise
 
     async def deliver(
@@ -154,46 +251,76 @@ class Connection(aiomqtt.Client):
             correlation: what the asker wants to see again in the answer (MQTT 5 only).
 
         Raises:
-            PublishRefusedError: the broker will not take it, or it is too large; the connection stands.
+            PublishRefusedError: the broker will not take it, or it is too large, or no broker would take its
+                topic; the connection stands.
             SilentBrokerError: no PUBACK came in time.
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost.
         """
         async with self._window:
-            if self._disconnected.done():
+            if self._ended.done():
                 raise self._loss()
-            size = len(topic.encode()) + len(payload) + _HEAD_BYTES
-            if self._largest_packet is not None and size > self._largest_packet:
-                # Sent all the same, it would only end the connection, again and again.
-                raise PublishRefusedError(
-                    f"the message on {topic} needs {size} bytes and the broker takes {self._largest_packet}; "
-                    "raise the largest packet there (Mosquitto: max_packet_size)"
-                )
-            info = self._client.publish(topic, payload, 1, retain, self._told(expiry_s, correlation))
+            self._check(topic, len(payload) + len(correlation or b""))
+            try:
+                info = self._client.publish(topic, payload, 1, retain, self._told(expiry_s, correlation))
+            except ValueError as error:
+                raise PublishRefusedError(f"nothing can be sent on {topic[:200]!r}: {error}") from error
             if info.rc != 0:
-                raise aiomqtt.MqttCodeError(info.rc, "could not publish")
-            acknowledged = self._loop.create_future()
-            self._acknowledgements[info.mid] = acknowledged
+                raise MqttCodeError(info.rc, "could not publish")
+            acknowledged: asyncio.Future[ReasonCode] = self._loop.create_future()
+            self._acknowledgements[info.mid] = topic, acknowledged
+            self._handed_over += 1
+            number = self._handed_over
             try:
                 async with asyncio.timeout(PUBACK_S):
-                    answer: ReasonCode = await acknowledged
+                    answer = await acknowledged
             except TimeoutError:
-                raise SilentBrokerError(f"no PUBACK within {PUBACK_S:g} s") from None
+                raise self._silence(number) from None
             finally:
                 self._acknowledgements.pop(info.mid, None)
+            self._latest_answered = max(self._latest_answered, number)
         if answer.is_failure:
             raise PublishRefusedError(f"the broker refuses messages: {answer}")
+        self._on_taken(topic)
+
+    def _check(self, topic: str, length: int) -> None:
+        reason = self._reason_against(topic)
+        if reason is not None:
+            raise PublishRefusedError(reason)
+        size = len(topic.encode(errors="replace")) + length + _HEAD_BYTES
+        if self._largest_packet is not None and size > self._largest_packet:
+            # Sent all the same, it would only end the connection, again and again.
+            raise PublishRefusedError(
+                f"the message on {topic} needs {size} bytes and the broker takes {self._largest_packet}; "
+                "raise the largest packet there (Mosquitto: max_packet_size)"
+            )
+
+    def _silence(self, number: int) -> MqttError:
+        """No PUBACK came: for none, or for one only, which is a refusal without a word."""
+        if number < self._latest_answered and self._unanswered < UNANSWERED:
+            self._unanswered += 1
+            return PublishRefusedError(
+                f"the broker has not acknowledged it within {PUBACK_S:g} s, but later messages"
+            )
+        return SilentBrokerError(f"no PUBACK within {PUBACK_S:g} s")
+
+    def widen(self, in_flight: int) -> None:
+        """Let more messages wait for their PUBACK at a time, as far as the broker allows."""
+        in_flight = min(in_flight, self._most_in_flight)
+        for _ in range(in_flight - self._in_flight):
+            self._window.release()
+        self._in_flight = max(in_flight, self._in_flight)
 
     def tell(self, topic: str, payload: bytes) -> None:
         """Publish with QoS 0, not retained: nobody says whether it arrives.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost.
         """
-        if self._disconnected.done():
+        if self._ended.done():
             raise self._loss()
         info = self._client.publish(topic, payload, 0)
         if info.rc != 0:
-            raise aiomqtt.MqttCodeError(info.rc, "could not publish")
+            raise MqttCodeError(info.rc, "could not publish")
 
     async def watch(self, *topics: str, fresh_only: bool = False) -> list[str]:
         """Subscribe with QoS 1.
@@ -206,7 +333,7 @@ class Connection(aiomqtt.Client):
             Those that the broker does not grant.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost, or no SUBACK came in time.
+            MqttError: the connection is lost, or no SUBACK came in time.
         """
         refused = []
         for topic in topics:
@@ -214,54 +341,266 @@ class Connection(aiomqtt.Client):
                 never = SubscribeOptions.RETAIN_DO_NOT_SEND
                 handling = never if fresh_only else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
                 options = SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=handling)
-                granted = await self.subscribe(topic, options=options)
+                granted = await self._ask(partial(self._client.subscribe, topic, options=options))
             else:
-                granted = await self.subscribe(topic, qos=1)
+                granted = await self._ask(partial(self._client.subscribe, topic, qos=1))
             if any(_value(code) >= _FAILURE for code in granted):
                 refused.append(topic)
         return refused
 
-    async def incoming(self) -> AsyncIterator[aiomqtt.Message]:
-        """What the broker sends for the subscriptions.
+    async def unsubscribe(self, topic: str) -> None:
+        """End a subscription.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost, or no UNSUBACK came in time.
         """
-        try:
-            async for message in self.messages:
-                yield message
-        except aiomqtt.MqttError:
-            raise self._loss() from None
+        await self._ask(partial(self._client.unsubscribe, topic))
+
+    async def incoming(self) -> AsyncIterator[Incoming]:
+        """What the broker sends for the subscriptions, and whatever else it sends.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        while True:
+            arriving = asyncio.ensure_future(self._queue.get())
+            try:
+                ends: set[asyncio.Future[Any]] = {arriving, self._ended}
+                await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+                if not arriving.done():
+                    raise self._loss()
+                message = arriving.result()
+            finally:
+                arriving.cancel()
+            yield message
 
     @property
     def shown_certificate(self) -> bytes | None:
         """The broker's certificate, DER; None without TLS."""
-        wire = self._client.socket()
-        return wire.getpeercert(binary_form=True) if isinstance(wire, ssl.SSLSocket) else None
+        wire = self._wire
+        return None if wire is None else wire.shown_certificate
 
     async def lost(self) -> None:
         """Wait until the connection is lost.
 
         Raises:
-            aiomqtt.MqttError: it is, however it ended.
+            MqttError: it is, however it ended.
         """
-        await asyncio.wait({self._disconnected})
+        await asyncio.wait({self._ended})
         raise self._loss()
 
     async def close(self, timeout_s: float) -> None:
         """Say goodbye to the broker, which drops the last will; let go after ``timeout_s`` at most."""
-        if not self._disconnected.done():
+        if not self._ended.done():
             self._client.disconnect()
-            await asyncio.wait({self._disconnected}, timeout=timeout_s)
+            await asyncio.wait({self._ended}, timeout=timeout_s)
         self.abandon()
 
     def abandon(self) -> None:
         """Drop the connection at once, without a word: the broker publishes the last will."""
         self._abandoned = True
-        self._client._sock_close()  # noqa: SLF001  paho offers no other way to drop a connection
-        for future in (self._connected, self._disconnected):
-            if future.done() and not future.cancelled():
-                future.exception()  # looked at, so that asyncio does not report it as never retrieved
+        self._detach()
+        self._finish(None)
+        self._shut()
+
+    # The library's side.
+
+    @property
+    def _wire(self) -> Wire | None:
+        wire = self._client.socket()
+        return wire if isinstance(wire, Wire) else None
+
+    def _reach(self, reached: asyncio.Future[Exception | None]) -> None:
+        """The blocking part, on a thread of its own."""
+        told = _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
+        error: Exception | None = None
+        try:
+            self._client.connect(*self._address, properties=told)
+        except OSError as failure:  # before ValueError, which unverified certificates are, too
+            error = failure
+        except ValueError:
+            # No host, or in the library of names an empty part, or one of more than 63 letters.
+            error = OSError(f"{self._address[0]!r} cannot be the name of a host; correct mqtt.url")
+        except Exception as failure:  # noqa: BLE001  whatever it is, the caller shall see it
+            error = failure
+        try:
+            self._loop.call_soon_threadsafe(self._settle, reached, error)
+        except RuntimeError:
+            # A closed loop means that the process ends and nobody waits for the connection any more.
+            self._shut()
+
+    def _settle(self, reached: asyncio.Future[Exception | None], error: Exception | None) -> None:
+        wire = self._wire
+        if self._abandoned or error is not None or wire is None:
+            self._shut()
+        else:
+            self._attach(wire)
+        if not reached.done():
+            reached.set_result(error)
+
+    def _attach(self, wire: Wire) -> None:
+        """From here on the event loop has the socket, until `_detach`."""
+        self._held = wire
+        self._fd = wire.fileno()
+        self._read_again()
+        if self._client.want_write():
+            self._write_later()
+        self._misc = self._loop.call_later(_MISC_S, self._look_after)
+
+    def _detach(self) -> None:
+        """Before the socket is closed, by whomever."""
+        if self._misc is not None:
+            self._misc.cancel()
+        if self._fd is None:
+            return
+        self._loop.remove_reader(self._fd)
+        self._loop.remove_writer(self._fd)
+        self._fd, self._reads = None, False
+
+    def _shut(self) -> None:
+        wire = self._client.socket()
+        if wire is not None:
+            wire.close()
+
+    def _look_after(self) -> None:
+        """Keep-alive."""
+        self._misc = self._loop.call_later(_MISC_S, self._look_after)
+        self._guarded(self._client.loop_misc)
+
+    def _write_later(self) -> None:
+        if self._fd is not None:
+            self._loop.add_writer(self._fd, self._writable)
+
+    def _write_no_more(self) -> None:
+        if self._fd is not None:
+            self._loop.remove_writer(self._fd)
+
+    def _writable(self) -> None:
+        self._guarded(self._client.loop_write)
+        if not self._client.want_write():
+            self._read_again()
+
+    def _read_again(self) -> None:
+        wire = self._wire
+        if self._fd is None or self._reads or wire is None:
+            return
+        self._owed_before = wire.packets
+        self._reads = True
+        self._loop.add_reader(self._fd, self._readable)
+        if wire.pending():
+            self._loop.call_soon(self._readable)
+
+    def _read_no_more(self) -> None:
+        if self._fd is not None:
+            self._loop.remove_reader(self._fd)
+            self._reads = False
+
+    def _readable(self) -> None:
+        for _ in range(_AT_ONCE):
+            wire = self._wire
+            if self._fd is None or not self._reads or wire is None:
+                return
+            self._guarded(self._client.loop_read)
+            if self._fd is None:
+                return
+            self._hold_back(wire)
+            if not wire.pending():
+                return
+        self._loop.call_soon(self._readable)
+
+    def _hold_back(self, wire: Wire) -> None:
+        """Read no more for now from a broker that floods the box, or takes nothing while it sends."""
+        now_s = self._loop.time()
+        if now_s - self._second_s >= 1.0:
+            self._second_s, self._packets_before, self._asked_for = now_s, wire.packets, 0
+        if not self._client.want_write():
+            self._owed_before = wire.packets
+        if wire.packets - self._packets_before - self._asked_for > FLOOD_PER_S:
+            self._read_no_more()
+            self._loop.call_at(self._second_s + 1.0, self._read_again)
+        elif wire.packets - self._owed_before > OWED:
+            self._read_no_more()  # until all is written that waits
+
+    def _guarded(self, work: Callable[[], object]) -> None:
+        """Have the library do something; what it cannot make sense of ends the connection."""
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001  any, for what a broker sends decides which
+            self._detach()
+            self._finish(MqttError(f"what the broker sent makes no sense ({type(error).__name__}: {error})"))
+            self._shut()
+
+    def _answered(self, code: ReasonCode, told: Properties | None) -> None:
+        if self._consent.done():
+            return
+        # paho does not keep to the broker's limits, and the broker ends a connection that exceeds them.
+        self._largest_packet = getattr(told, "MaximumPacketSize", None)
+        self._most_in_flight = max(getattr(told, "ReceiveMaximum", RECEIVE_MAXIMUM), 1)
+        if self._most_in_flight < self._in_flight:
+            self._in_flight = self._most_in_flight
+            self._window = asyncio.Semaphore(self._in_flight)
+        self._consent.set_result(MqttCodeError(code) if code.is_failure else None)
+
+    def _disconnected(self, code: ReasonCode) -> None:
+        self._finish(MqttCodeError(code) if code.value else None)
+
+    def _arrived(self, message: MQTTMessage) -> None:
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:
+            topic = ""
+        if not topic or not self._consent.done():
+            self._on_ignored()
+            return
+        told = message.properties
+        answer = getattr(told, "ResponseTopic", None)
+        correlation = getattr(told, "CorrelationData", None)
+        try:
+            self._queue.put_nowait(
+                Incoming(
+                    topic,
+                    bytes(message.payload),
+                    retain=bool(message.retain),
+                    response_topic=answer if isinstance(answer, str) else None,
+                    correlation=bytes(correlation) if isinstance(correlation, bytes | bytearray) else None,
+                )
+            )
+        except asyncio.QueueFull:
+            self._on_overlooked()
+
+    def _acknowledged(self, mid: int, code: ReasonCode) -> None:
+        _, waiting = self._acknowledgements.get(mid, ("", None))
+        if waiting is not None and not waiting.done():
+            self._asked_for += 1
+            waiting.set_result(code)
+
+    def _granted(self, mid: int, codes: list[ReasonCode]) -> None:
+        waiting = self._grants.get(mid)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(codes)
+
+    # This side.
+
+    async def _ask(self, ask: Callable[[], tuple[int, int | None]]) -> list[ReasonCode]:
+        """Have the broker answer to a subscription, or to the end of one."""
+        if self._ended.done():
+            raise self._loss()
+        code, mid = ask()
+        if code != 0 or mid is None:
+            raise MqttCodeError(code, "could not subscribe")
+        granted: asyncio.Future[list[ReasonCode]] = self._loop.create_future()
+        self._grants[mid] = granted
+        try:
+            async with asyncio.timeout(PUBACK_S):
+                ends: set[asyncio.Future[Any]] = {granted, self._ended}
+                await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        except TimeoutError:
+            raise SilentBrokerError(f"no answer to a subscription within {PUBACK_S:g} s") from None
+        finally:
+            self._grants.pop(mid, None)
+        if not granted.done():
+            raise self._loss()
+        return granted.result()
 
     def _told(self, expiry_s: float | None, correlation: bytes | None) -> Properties | None:
         """What MQTT 5 can say about a message."""
@@ -274,85 +613,35 @@ class Connection(aiomqtt.Client):
             told["CorrelationData"] = correlation
         return _properties(PacketTypes.PUBLISH, **told)
 
-    def _loss(self) -> aiomqtt.MqttError:
-        """Why the connection has ended."""
-        error = self._disconnected.exception() if self._disconnected.done() else None
-        if _value(getattr(error, "rc", None)) == _SESSION_TAKEN_OVER:
-            return TakenOverError("another client has connected with the same client_id")
-        return aiomqtt.MqttError(
-            f"connection lost: {in_words(error if isinstance(error, Exception) else None)}"
+    def _finish(self, error: Exception | None) -> None:
+        """The connection has ended: nothing that is under way will be acknowledged any more."""
+        if self._ended.done():
+            return
+        violation = "" if self._held is None else self._held.violation
+        if violation:
+            error = MqttError(violation)
+        self._ended.set_result(error)
+        self.unacknowledged = tuple(
+            topic for topic, waiting in self._acknowledgements.values() if not waiting.done()
         )
-
-    def _give_up(self, _disconnected: object) -> None:
-        """Nothing that is under way will be acknowledged any more."""
-        for waiting in self._acknowledgements.values():
+        if not self._consent.done():
+            closed = NoConsentError("the broker closed the connection at once")
+            self._consent.set_result(error if violation else closed)
+        for _, waiting in self._acknowledgements.values():
             if not waiting.done():
                 waiting.set_exception(self._loss())
 
-    def _reach(self, reached: asyncio.Future[None]) -> None:
-        """The blocking part, on a thread of its own."""
-        error: Exception | None = None
-        try:
-            self._client_connect()
-        except Exception as failure:  # noqa: BLE001  whatever it is, the caller shall see it
-            error = failure
-        # A closed loop means that the process ends and nobody waits for the connection any more.
-        with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._settle, reached, error)
+    def _loss(self) -> MqttError:
+        """Why the connection has ended."""
+        error = self._ended.result() if self._ended.done() else None
+        if _value(getattr(error, "rc", None)) == _SESSION_TAKEN_OVER:
+            return TakenOverError("another client has connected with the same client_id")
+        return MqttError(f"connection lost: {in_words(error)}")
 
-    def _settle(self, reached: asyncio.Future[None], error: Exception | None) -> None:
-        if self._abandoned:
-            self.abandon()
-        elif error is not None:
-            reached.set_exception(error)
-        else:
-            reached.set_result(None)
 
-    def _on_connect(
-        self,
-        client: Client,
-        userdata: Any,
-        flags: ConnectFlags,
-        reason_code: ReasonCode,
-        properties: Properties | None = None,
-    ) -> None:
-        # paho does not keep to the broker's limits, and the broker ends a connection that exceeds them.
-        self._largest_packet = getattr(properties, "MaximumPacketSize", None)
-        least = min(getattr(properties, "ReceiveMaximum", self._in_flight), self._in_flight)
-        if not self._connected.done() and least < self._in_flight:
-            self._window = asyncio.Semaphore(least)
-        super()._on_connect(client, userdata, flags, reason_code, properties)
-
-    def _on_message(self, client: Client, userdata: Any, message: MQTTMessage) -> None:
-        if self._queue.full():
-            self._on_overlooked()
-        else:
-            super()._on_message(client, userdata, message)
-
-    def _on_publish(
-        self,
-        client: Client,  # noqa: ARG002
-        userdata: Any,  # noqa: ARG002
-        mid: int,
-        reason_code: ReasonCode,
-        properties: Properties,  # noqa: ARG002
-    ) -> None:
-        waiting = self._acknowledgements.get(mid)
-        if waiting is not None and not waiting.done():
-            waiting.set_result(reason_code)
-
-    def _on_disconnect(
-        self,
-        client: Client,
-        userdata: Any,
-        flags: DisconnectFlags,
-        reason_code: ReasonCode,
-        properties: Properties | None = None,
-    ) -> None:
-        if not self._connected.done():
-            self._connected.set_exception(NoConsentError("the broker closed the connection at once"))
-            return
-        super()._on_disconnect(client, userdata, flags, reason_code, properties)
+def _raise(error: Exception | None) -> None:
+    if error is not None:
+        raise error
 
 
 def _properties(packet: int, **values: Any) -> Properties:

@@ -6,9 +6,11 @@ stays in the settings. Secrets are in no message of this module and in no ``repr
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import ssl
+import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
     from daqsvc.publish.settings import MqttSettings
 
 log = logging.getLogger(__name__)
+
+LONGEST_PASSWORD = 65_535
+"""Bytes of the longest password that MQTT can carry."""
 
 CREDENTIALS_DIRECTORY = "CREDENTIALS_DIRECTORY"
 """Where systemd tells a service the directory of its credentials (systemd.exec, LoadCredential=)."""
@@ -34,6 +39,7 @@ class Credentials:
         own: the box's certificate; None without one.
         trusted: the authorities of `ca_file`; empty for those of the system.
         stamp: changes whenever one of the files does; see `stamp_of`.
+        exposed: files with a secret that every user of the machine can read.
     """
 
     password: str | None = field(repr=False)
@@ -41,6 +47,7 @@ class Credentials:
     own: Certificate | None
     trusted: tuple[Certificate, ...]
     stamp: tuple[object, ...]
+    exposed: tuple[Path, ...] = ()
 
 
 def read_credentials(settings: MqttSettings) -> Credentials:
@@ -50,9 +57,12 @@ def read_credentials(settings: MqttSettings) -> Credentials:
         OSError: a file cannot be read, or does not hold what it should; the message names it.
     """
     stamp = stamp_of(settings)  # before reading: what is replaced meanwhile is seen as changed later
+    for path in _files(settings):
+        _check_regular(path)
     password = _password(settings)
+    exposed = tuple(path for path in _secrets(settings) if _is_exposed(path))
     if not settings.tls:
-        return Credentials(password, None, None, (), stamp)
+        return Credentials(password, None, None, (), stamp, exposed)
     context = tls_context(settings.ca_file)
     own = None
     if settings.cert_file is not None:
@@ -60,7 +70,7 @@ def read_credentials(settings: MqttSettings) -> Credentials:
         _show(context, settings.cert_file, key)
         own = next(iter(_watched(settings.cert_file)), None)
     trusted = () if settings.ca_file is None else tuple(_watched(settings.ca_file))
-    return Credentials(password, context, own, trusted, stamp)
+    return Credentials(password, context, own, trusted, stamp, exposed)
 
 
 def stamp_of(settings: MqttSettings) -> tuple[object, ...]:
@@ -83,7 +93,8 @@ def tls_context(ca_file: Path | None) -> ssl.SSLContext:
         raise OSError(f"ca_file {ca_file} holds no certificate in PEM: {error}") from error
     except OSError as error:
         raise OSError(f"ca_file {ca_file} cannot be read: {error.strerror or error}") from error
-    context.sslsocket_class = _TidySocket
+    # A certificate without alternative names says of no host that it is its own (RFC 9525, section 6.3).
+    context.hostname_checks_common_name = False
     return context
 
 
@@ -120,12 +131,53 @@ def _password(settings: MqttSettings) -> str | None:
     file = _password_file(settings)
     if file is None:
         return None
+    line = _first_line(file)
+    if len(line) > LONGEST_PASSWORD:
+        raise OSError(
+            f"the first line of {file} has more than {LONGEST_PASSWORD} bytes, which MQTT cannot carry; "
+            "write the password, and nothing else, into it"
+        )
     try:
-        text = file.read_text(encoding="utf-8")
+        return line.decode("utf-8")
     except UnicodeDecodeError:
         # The error itself would hold the bytes of the password.
         raise OSError(f"{file} is not UTF-8 text; write the password into it, in its first line") from None
-    return text.partition("\n")[0].rstrip("\r")
+
+
+def _first_line(file: Path) -> bytes:
+    """The first line, as far as it can be a password."""
+    # Not to wait for whoever might write into it: what it is may have changed since it was looked at.
+    handle = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    with os.fdopen(handle, "rb") as opened:
+        return opened.read(LONGEST_PASSWORD + 2).partition(b"\n")[0].rstrip(b"\r")
+
+
+def _check_regular(path: Path) -> None:
+    """Refuse what might never end, such as a pipe; what is not there is said by whoever reads it."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return
+    if not stat.S_ISREG(mode):
+        raise OSError(f"{path} is no regular file, and reading it might never end; put a file there")
+
+
+def _is_exposed(path: Path) -> bool:
+    try:
+        return bool(path.stat().st_mode & stat.S_IROTH)
+    except OSError:
+        return False
+
+
+def _secrets(settings: MqttSettings) -> list[Path]:
+    """The files of password and key, as far as there are any."""
+    found = []
+    for wanted in (_password_file, _key_file) if settings.tls else (_password_file,):
+        with contextlib.suppress(FileNotFoundError):  # said when it is read
+            path = wanted(settings)
+            if path is not None:
+                found.append(path)
+    return found
 
 
 def _password_file(settings: MqttSettings) -> Path | None:
@@ -152,13 +204,8 @@ def _credential(name: str) -> Path:
 
 
 def _files(settings: MqttSettings) -> list[Path]:
-    files = [settings.ca_file, settings.cert_file] if settings.tls else []
-    for wanted in (_password_file, _key_file):
-        try:
-            files.append(wanted(settings))
-        except FileNotFoundError:
-            continue  # said when it is read
-    return [path for path in files if path is not None]
+    shown = [settings.ca_file, settings.cert_file] if settings.tls else []
+    return [*(path for path in shown if path is not None), *_secrets(settings)]
 
 
 def _stamp(path: Path) -> object:
@@ -167,14 +214,3 @@ def _stamp(path: Path) -> object:
     except OSError:
         return path, None
     return path, status.st_ino, status.st_size, status.st_mtime_ns
-
-
-class _TidySocket(ssl.SSLSocket):
-    """Closes itself when the handshake fails; paho would leave it to the garbage collector."""
-
-    def do_handshake(self, block: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        try:
-            super().do_handshake(block)
-        except BaseException:
-            self.close()
-            raise

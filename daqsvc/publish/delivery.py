@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from daqsvc.outbox.messages import OutboxError
+from daqsvc.publish.errors import PublishRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,11 +17,16 @@ if TYPE_CHECKING:
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.connection import Connection
 
+log = logging.getLogger(__name__)
+
 IN_FLIGHT = 20
 """QoS 1 messages that may wait for their PUBACK at a time."""
 
 READ_AHEAD = 200
 """Messages that are read from the outbox at a time."""
+
+TRY_AGAIN_S = 300.0
+"""How often what the broker has refused is tried again; a new connection tries at once."""
 
 
 class Delivery:
@@ -27,6 +36,9 @@ class Delivery:
     messages in the order of the outbox. First come the retained states that the broker has acknowledged
     before: it may have forgotten them, and a repeat has the same id.
 
+    What the broker refuses goes to the dead letters, and so does what follows on the same topic: nothing else
+    waits for it.
+
     Args:
         outbox: where the messages are.
         connection: where they go.
@@ -34,6 +46,7 @@ class Delivery:
         stopping: ends the delivery as soon as nothing is left.
         on_sent: called for each message handed to the broker.
         on_acknowledged: called with each message for which a PUBACK came.
+        on_refused: called with the topic and the reason of each message that the broker will not take.
     """
 
     def __init__(
@@ -44,24 +57,28 @@ class Delivery:
         stopping: asyncio.Event,
         on_sent: Callable[[], None],
         on_acknowledged: Callable[[OutboxMessage], None],
+        on_refused: Callable[[str, str], None],
     ) -> None:
         self._outbox = outbox
+        self._letters = outbox.dead_letters
         self._connection = connection
         self._base = base
         self._stopping = stopping
         self._on_sent = on_sent
         self._on_acknowledged = on_acknowledged
+        self._on_refused = on_refused
         self._ready: deque[OutboxMessage] = deque()
-        self._under_way: deque[tuple[OutboxMessage, asyncio.Task[None]]] = deque()
+        self._under_way: deque[tuple[OutboxMessage, asyncio.Task[Literal["taken", "kept", "left"]]]] = deque()
         self._arriving: asyncio.Task[list[OutboxMessage]] | None = None
         self._read_to = 0
+        self._left_from: int | None = None
+        self._left: set[str] = set()
 
     async def run(self) -> None:
         """Deliver until `stopping` is set and nothing is left.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost or the broker refuses; what was under way will be
-                sent again.
+            MqttError: the connection is lost; what was under way will be sent again.
         """
         stopping = asyncio.create_task(self._stopping.wait())
         try:
@@ -81,15 +98,74 @@ class Delivery:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
+    async def try_again(self) -> None:
+        """Now and then, try what the broker has refused; each topic from its oldest on. Until cancelled.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        while True:
+            for topic in sorted(self._letters.reasons):
+                try:
+                    await self._try_topic(topic)
+                except OutboxError as error:
+                    log.error("%s; tried again in %g s", error, TRY_AGAIN_S)  # noqa: TRY400  the message says it
+            self._read_again()
+            await asyncio.sleep(TRY_AGAIN_S)
+
+    def _read_again(self) -> None:
+        """Go back to what is still in the journal because the disk would not take it as refused."""
+        if self._left_from is None or not self._is_idle():
+            return
+        self._read_to = min(self._read_to, self._left_from - 1)
+        self._left_from = None
+        self._left.clear()
+        if self._arriving is not None:
+            self._arriving.cancel()
+
+    async def _try_topic(self, topic: str) -> None:
+        while (message := await self._letters.oldest(topic)) is not None:
+            try:
+                await self._connection.deliver(topic, message.payload, retain=message.retain)
+            except PublishRefusedError as error:
+                await self._letters.put(message, str(error))
+                return
+            await self._letters.remove(message)
+            self._on_acknowledged(message)
+
     def _is_idle(self) -> bool:
         return not (self._ready or self._under_way)
 
     def _send(self) -> None:
         while self._ready and len(self._under_way) < IN_FLIGHT:
             message = self._ready.popleft()
-            delivery = self._connection.deliver(message.topic, message.payload, retain=message.retain)
-            self._under_way.append((message, asyncio.create_task(delivery)))
+            self._under_way.append((message, asyncio.create_task(self._deliver(message))))
+
+    async def _deliver(self, message: OutboxMessage) -> Literal["taken", "kept", "left"]:
+        """Have the broker take a message, or keep it among those that it will not take."""
+        try:
+            if message.topic in self._left:
+                return self._leave(message)
+            if await self._letters.hold(message):
+                return "kept"
             self._on_sent()
+            try:
+                await self._connection.deliver(message.topic, message.payload, retain=message.retain)
+            except PublishRefusedError as error:
+                await self._letters.put(message, str(error))
+                self._on_refused(message.topic, str(error))
+                return "kept"
+            await self._letters.overtake(message)
+        except OutboxError as error:
+            log.error("%s; the message on %s waits in the journal", error, message.topic)  # noqa: TRY400
+            return self._leave(message)
+        return "taken"
+
+    def _leave(self, message: OutboxMessage) -> Literal["left"]:
+        """Leave a message, and what follows on its topic, where it is, for later."""
+        self._left.add(message.topic)
+        self._left_from = min(self._left_from or message.sequence, message.sequence)
+        return "left"
 
     async def _wait(self, stopping: asyncio.Task[Any]) -> None:
         """Until the oldest is acknowledged, more arrives, or there is nothing left to wait for."""
@@ -104,12 +180,15 @@ class Delivery:
 
     def _settle(self) -> None:
         if self._arriving is not None and self._arriving.done():
-            self._ready.extend(self._arriving.result())
-            self._read_to = self._ready[-1].sequence
+            if not self._arriving.cancelled():
+                self._ready.extend(self._arriving.result())
+                self._read_to = self._ready[-1].sequence
             self._arriving = None
         while self._under_way and self._under_way[0][1].done():
             message, task = self._under_way[0]
-            task.result()
+            outcome = task.result()
             self._under_way.popleft()
-            self._outbox.mark_sent(message.sequence)
-            self._on_acknowledged(message)
+            if outcome != "left":
+                self._outbox.mark_sent(message.sequence)
+            if outcome == "taken":
+                self._on_acknowledged(message)

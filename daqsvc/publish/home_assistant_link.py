@@ -9,16 +9,14 @@ import logging
 import random
 from typing import TYPE_CHECKING
 
-from daqsvc.publish.connection import PublishRefusedError
+from daqsvc.publish.errors import PublishRefusedError
 from daqsvc.publish.home_assistant import Discovery
 from daqsvc.publish.summary import Summary
 
 if TYPE_CHECKING:
-    import aiomqtt
-
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.settings import HomeAssistantSettings
     from daqsvc.publish.topics import Topics
 
@@ -71,16 +69,16 @@ class HomeAssistantLink:
                 error,
             )
 
-    def take(self, message: aiomqtt.Message) -> bool:
+    def take(self, message: Incoming) -> bool:
         """Take in a message from the broker; whether it was meant for this link."""
-        topic = str(message.topic)
+        topic = message.topic
         if topic == self._discovery.birth_topic:
             # What is retained tells of a birth in the past: the connection has just told everything.
             if message.payload == b"online" and not message.retain:
                 self._born.set()
         elif topic == self._discovery.topic:
             if self._earlier is not None and not self._earlier.done():
-                self._earlier.set_result(bytes(message.payload))
+                self._earlier.set_result(message.payload)
         else:
             return False
         return True
@@ -89,7 +87,7 @@ class HomeAssistantLink:
         """Tell what there is to tell over one connection; ends at once if nothing shall be told any more.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost.
         """
         try:
             await self._run(connection)

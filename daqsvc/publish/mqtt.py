@@ -5,37 +5,40 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+import time
 from dataclasses import asdict
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-import aiomqtt
-
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.certificates import CertificateError, certificate, voucher
 from daqsvc.publish.command_intake import CommandIntake
-from daqsvc.publish.connection import (
-    PUBACK_S,
-    Connection,
-    NoConsentError,
+from daqsvc.publish.connection import PUBACK_S, Connection, Will
+from daqsvc.publish.counters import PublishCounters
+from daqsvc.publish.credentials import read_credentials
+from daqsvc.publish.delivery import IN_FLIGHT
+from daqsvc.publish.errors import (
+    MqttError,
     PublishRefusedError,
     SilentBrokerError,
     TakenOverError,
 )
-from daqsvc.publish.counters import PublishCounters
-from daqsvc.publish.credentials import read_credentials
-from daqsvc.publish.delivery import IN_FLIGHT
+from daqsvc.publish.faults import Faults
 from daqsvc.publish.home_assistant_link import HomeAssistantLink
 from daqsvc.publish.outage import Outage, has_expired, in_words
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.session import CredentialsReplacedError, Session
 from daqsvc.publish.settings import MqttSettings
+from daqsvc.publish.spoken import Spoken
 from daqsvc.publish.stopping import unless
+from daqsvc.publish.suspects import FIRST_BAR_S, Suspects
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
@@ -65,8 +68,6 @@ NS_PER_DAY = 86_400 * NS_PER_S
 
 SOON_DAYS = 15
 """A day before anybody is alarmed by a certificate that ends, the broker is asked for the one it has now."""
-
-_UNSUPPORTED_PROTOCOL_VERSION = 132
 
 
 class MqttPublisher:
@@ -101,7 +102,7 @@ class MqttPublisher:
         self._clock = clock
         self._intake: CommandIntake | None = None
         if settings.commands is not None and commands is not None:
-            self._intake = CommandIntake(settings.commands, self.topics, commands, clock)
+            self._intake = CommandIntake(settings.commands, self.topics, commands, clock, outbox.command_ids)
         self._home_assistant: HomeAssistantLink | None = None
         if settings.home_assistant is not None:
             self._home_assistant = HomeAssistantLink(settings.home_assistant, self.topics, clock)
@@ -110,9 +111,13 @@ class MqttPublisher:
         self._quick_losses = 0
         self._outage = Outage(log)
         self._has_expired = False
-        self._protocol = (
-            aiomqtt.ProtocolVersion.V311 if settings.protocol == "3.1.1" else aiomqtt.ProtocolVersion.V5
+        self._spoken = Spoken(
+            outbox.directory, settings.host, settings.port, settings.protocol, clock.wall_ns
         )
+        self._suspects = Suspects()
+        self._faults = Faults()
+        self._not_available = ""
+        self._exposed: set[Path] = set()
         self._stopping = asyncio.Event()
         self._stop_at_s = 0.0
         self._running: asyncio.Future[None] | None = None
@@ -137,6 +142,9 @@ class MqttPublisher:
             name: int(value) if isinstance(value, bool) else value
             for name, value in asdict(self.counters).items()
         }
+        figures["faults"] = self._faults.count
+        figures["dead_letters"] = self._outbox.dead_letters.waiting
+        figures["dead_letters_dropped"] = self._outbox.dead_letters.dropped
         if self._intake is not None:
             figures["commands"] = asdict(self._intake.counters)
         if self._expiry:
@@ -164,23 +172,44 @@ class MqttPublisher:
             f"{self.topics.base}/{topic}", payload, expiry_s=self._settings.telemetry_expiry_s
         )
 
+    @property
+    def refused(self) -> Mapping[str, str]:
+        """By topic, why the broker will not take messages that must not be lost, or any at all."""
+        found = dict(self._outbox.dead_letters.reasons)
+        if self._not_available:
+            found[self.topics.availability] = self._not_available
+        return self._suspects.barred(time.monotonic()) | found
+
     async def run(self) -> None:
-        """Publish until `stop`: connect, serve, and connect again after each loss."""
+        """Publish until `stop`: connect, serve, and connect again after each loss.
+
+        Nothing leaves it but its cancellation: watching the machine does not depend on telling of it.
+        """
         self._running = asyncio.get_running_loop().create_future()
         try:
             while not self._stopping.is_set():
-                made = await unless(self._stopping, self._connect())
-                if made is None:
-                    await self._wait(self._backoff.next_ns() / NS_PER_S)
-                    continue
-                connection, credentials = made
                 try:
-                    await self._serve(connection, credentials)
-                finally:
-                    self.counters.connected = False
-                    connection.abandon()
+                    await self._once()
+                except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
+                    self._faults.note(
+                        "publishing was interrupted and begins anew with a new connection", error
+                    )
+                    await self._wait(self._backoff.next_ns() / NS_PER_S)
         finally:
             self._running.set_result(None)
+
+    async def _once(self) -> None:
+        """Connect and serve, once."""
+        made = await unless(self._stopping, self._connect())
+        if made is None:
+            await self._wait(self._backoff.next_ns() / NS_PER_S)
+            return
+        connection, credentials = made
+        try:
+            await self._serve(connection, credentials)
+        finally:
+            self.counters.connected = False
+            connection.abandon()
 
     async def stop(self, deadline_s: float = 1.0) -> None:
         """Hand over what is left, say that the box goes offline, and end `run`.
@@ -195,30 +224,39 @@ class MqttPublisher:
 
     async def _connect(self) -> tuple[Connection, Credentials] | None:
         """A connection at which the box is known as online; None after a failure."""
+        connection: Connection | None = None
         try:
+            await self._prepare()
             credentials = await asyncio.to_thread(read_credentials, self._settings)
             if credentials.own is not None:
                 self._expiry["client"] = credentials.own.not_after_ns
+            self._warn_of(credentials.exposed)
             connection = self._connection(credentials)
-            await connection.open()
-            try:
-                self._see(connection, credentials)
-                await connection.deliver(
-                    self.topics.availability, self._availability("online", "connected"), retain=True
-                )
-            except BaseException:
-                connection.abandon()
-                raise
-        except (aiomqtt.MqttError, OSError) as error:
+            await connection.open(self._spoken.consent_s)
+            self._see(connection, credentials)
+            await asyncio.to_thread(self._spoken.agreed)
+            await self._say_online(connection)
+            self._connected()
+        except (MqttError, OSError) as error:
             if isinstance(error, ssl.SSLCertVerificationError):
                 self._has_expired = has_expired(error)
-            if not self._falls_back(error):
+            if connection is not None and connection.unacknowledged:
+                self._outage.tell_lost(f"MQTT broker {self._name}", error)
+                self._suspect(connection)
+            elif not self._spoken.falls_back(error):
+                self._suspects.away()
                 self._report_outage(error)
             return None
+        finally:
+            if connection is not None and not self.counters.connected:
+                connection.abandon()
+        return connection, credentials
+
+    def _connected(self) -> None:
         self._has_expired = False
         self.counters.connections += 1
         self.counters.connected = True
-        if self._quick_losses >= SUSPICIOUS_LOSSES:
+        if self._quick_losses >= SUSPICIOUS_LOSSES or self._suspects.careful:
             log.info(
                 "connected to MQTT broker %s once more", self._name
             )  # it has been said that this goes on
@@ -227,22 +265,54 @@ class MqttPublisher:
             log.warning("MQTT broker %s is back", self._name)
         else:
             log.info("connected to MQTT broker %s", self._name)
-        return connection, credentials
+
+    def _warn_of(self, exposed: tuple[Path, ...]) -> None:
+        for path in sorted(set(exposed) - self._exposed):
+            log.warning("%s can be read by every user of this machine: chmod o-rwx it, and replace it", path)
+        self._exposed = set(exposed)
+
+    async def _prepare(self) -> None:
+        """Look what earlier runs have left."""
+        await asyncio.to_thread(self._spoken.recall)
+        try:
+            await self._outbox.dead_letters.load()
+        except OutboxError as error:
+            self._outage.warn_once(f"{error}; what was refused before waits until it can")
+
+    async def _say_online(self, connection: Connection) -> None:
+        try:
+            await connection.deliver(
+                self.topics.availability, self._availability("online", "connected"), retain=True
+            )
+        except PublishRefusedError as error:
+            if not self._not_available:
+                log.error(  # noqa: TRY400  the message says it all
+                    "MQTT broker %s refuses the box's availability on %s: %s; everything else goes on",
+                    self._name,
+                    self.topics.availability,
+                    error,
+                )
+            self._not_available = str(error)
+        else:
+            self._not_available = ""
 
     def _connection(self, credentials: Credentials) -> Connection:
         settings = self._settings
         return Connection(
             settings.host,
             settings.port,
-            in_flight=IN_FLIGHT,
-            protocol=self._protocol,
+            in_flight=1 if self._suspects.careful else IN_FLIGHT,
+            mqtt5=self._spoken.mqtt5,
+            reason_against=lambda topic: self._suspects.reason(topic, time.monotonic()),
+            on_taken=self._suspects.acknowledged,
             on_overlooked=self.counters.count_overlooked,
+            on_ignored=self.counters.count_ignored,
             identifier=settings.client_id,
             username=settings.username,
             password=credentials.password,
             tls_context=credentials.context,
             keepalive=settings.keepalive_s,
-            will=aiomqtt.Will(
+            will=Will(
                 self.topics.availability, self._availability("offline", "connection lost"), qos=1, retain=True
             ),
         )
@@ -277,12 +347,15 @@ class MqttPublisher:
             outbox=self._outbox,
             clock=self._clock,
             counters=self.counters,
+            faults=self._faults,
             intake=self._intake,
             home_assistant=self._home_assistant,
             ends_soon=self._ends_soon,
             stopping=self._stopping,
         )
-        since_s = asyncio.get_running_loop().time()
+        loop = asyncio.get_running_loop()
+        since_s = loop.time()
+        lasting = loop.call_later(STABLE_S, self._has_lasted, connection)
         try:
             await session.run(lambda: self._left_s() - GOODBYE_S)
         except CredentialsReplacedError:
@@ -291,24 +364,45 @@ class MqttPublisher:
         except TakenOverError as error:
             self._report_rival("this connection was ended by another client", error)
             await self._wait(TAKEN_OVER_S + self._backoff.next_ns() / NS_PER_S)
-        except (aiomqtt.MqttError, OSError) as error:
-            of_use_s = asyncio.get_running_loop().time() - since_s
+        except (MqttError, OSError) as error:
+            of_use_s = loop.time() - since_s
             if isinstance(error, SilentBrokerError):
                 # Connected but deaf: the time that it took to notice was no use to anybody.
                 of_use_s -= PUBACK_S
-            self._judge(of_use_s, error)
+            if connection.unacknowledged and not isinstance(error, SilentBrokerError):
+                self._calm_down(of_use_s)
+                self._outage.tell_lost(f"MQTT broker {self._name}", error)
+                self._suspect(connection)
+            else:
+                self._judge(of_use_s, error)
             await self._wait(self._backoff.next_ns() / NS_PER_S)
         else:
             await self._say_goodbye(connection)
+        finally:
+            lasting.cancel()
+
+    def _has_lasted(self, connection: Connection) -> None:
+        """A connection has been of use for a while."""
+        self._suspects.settled()
+        connection.widen(IN_FLIGHT)
+
+    def _suspect(self, connection: Connection) -> None:
+        """A connection has ended with messages under way: perhaps because of one of them."""
+        topic = self._suspects.lost(connection.unacknowledged, time.monotonic())
+        if topic is None:
+            return
+        self._backoff.reset()  # there may be more of them, each of which is to be found
+        log.error(
+            "MQTT broker %s ends the connection whenever a message on %s is sent: it is not allowed to this "
+            "client, or too large; it is left alone for %g min or more, and all others go on",
+            self._name,
+            topic,
+            FIRST_BAR_S / 60,
+        )
 
     def _judge(self, of_use_s: float, error: Exception) -> None:
-        """Report a loss, and how soon to come back after it.
-
-        Only a connection that has lasted longer than the waits by now is a reason to be quick again:
-        otherwise two clients with one id, who end each other's connections, would never calm down.
-        """
-        if of_use_s > max(STABLE_S, 2 * self._backoff.ceiling_ns / NS_PER_S):
-            self._backoff.reset()
+        """Report a loss, and how soon to come back after it."""
+        self._calm_down(of_use_s)
         refused = isinstance(error, PublishRefusedError | SilentBrokerError)
         self._quick_losses = self._quick_losses + 1 if of_use_s < STABLE_S and not refused else 0
         if of_use_s > STABLE_S:
@@ -318,6 +412,14 @@ class MqttPublisher:
             self._report_rival(how, error)
         self._report_outage(error)
 
+    def _calm_down(self, of_use_s: float) -> None:
+        """Be quick again after a connection that has lasted longer than the waits by now, and only then.
+
+        Otherwise two clients with one id, who end each other's connections, would never calm down.
+        """
+        if of_use_s > max(STABLE_S, 2 * self._backoff.ceiling_ns / NS_PER_S):
+            self._backoff.reset()
+
     async def _say_goodbye(self, connection: Connection) -> None:
         """Publish that the box goes offline; if that fails, the last will says so."""
         offline = self._availability("offline", "stopped")
@@ -326,7 +428,7 @@ class MqttPublisher:
                 await connection.deliver(self.topics.availability, offline, retain=True)
         except TimeoutError:
             log.warning("MQTT broker %s did not answer to the goodbye; the last will tells", self._name)
-        except aiomqtt.MqttError as error:
+        except MqttError as error:
             log.warning("MQTT broker %s did not take the goodbye: %s; the last will tells", self._name, error)
         else:
             await connection.close(max(self._left_s(), GOODBYE_S / 2))
@@ -339,21 +441,6 @@ class MqttPublisher:
 
     def _availability(self, state: Literal["online", "offline"], reason: str) -> bytes:
         return availability_payload(self.topics.site, self.topics.box, state, reason, self._clock).to_json()
-
-    def _falls_back(self, error: Exception) -> bool:
-        """Choose the other MQTT version if the failure may come of this one; whether that is 3.1.1.
-
-        A broker that does not know MQTT 5 says so, closes the connection or, misled by the longer
-        packet, waits for more of it.
-        """
-        code = getattr(getattr(error, "rc", None), "value", None)
-        if self._settings.protocol != "auto" or not (
-            isinstance(error, NoConsentError) or code == _UNSUPPORTED_PROTOCOL_VERSION
-        ):
-            return False
-        older = self._protocol is aiomqtt.ProtocolVersion.V5
-        self._protocol = aiomqtt.ProtocolVersion.V311 if older else aiomqtt.ProtocolVersion.V5
-        return older
 
     @property
     def _name(self) -> str:

@@ -6,8 +6,9 @@ import socket
 import ssl
 from typing import TYPE_CHECKING
 
-import aiomqtt
 from paho.mqtt.client import error_string
+
+from daqsvc.publish.errors import MqttCodeError
 
 if TYPE_CHECKING:
     import logging
@@ -63,6 +64,17 @@ class Outage:
         if self.note(broker, reason):
             self._log.warning("%s is %saway: %s; %s", broker, still, reason, until)
 
+    def tell_lost(self, broker: str, error: Exception) -> None:
+        """Say why a connection has ended, unless that has been said; the broker may be there all the same."""
+        reason = in_words(error)
+        if self.note(broker, reason):
+            self._log.warning("%s: %s; connecting again", broker, reason)
+
+    def warn_once(self, sentence: str) -> None:
+        """Say something else about it, unless that has been said."""
+        if self.note("", sentence):
+            self._log.warning("%s", sentence)
+
     def note(self, broker: str, reason: str) -> bool:
         """Take a reason as told; whether it is a new one that may be said."""
         if (broker, reason) in self._told or len(self._told) >= MOST_REASONS:
@@ -94,7 +106,7 @@ def in_words(error: Exception | None) -> str:
             words = f"its name is not known: {error.strerror}"
         case TimeoutError():
             words = "it does not answer"
-        case aiomqtt.MqttCodeError():
+        case MqttCodeError():
             words = _coded(error)
         case OSError() if error.strerror is not None:
             words = error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
@@ -110,7 +122,7 @@ def _unverified(error: ssl.SSLCertVerificationError) -> str:
     return _VERIFICATION.get(error.verify_code, f"its certificate is refused: {found}")
 
 
-def _coded(error: aiomqtt.MqttCodeError) -> str:
+def _coded(error: MqttCodeError) -> str:
     if isinstance(error.rc, int):
         return error_string(error.rc).rstrip(".")  # a number of the library's, not of the standard
     return _CODES.get(getattr(error.rc, "value", 0), str(error.rc))

@@ -6,9 +6,10 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.publish.connection import PublishRefusedError
+from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.credentials import read_credentials, stamp_of
 from daqsvc.publish.delivery import Delivery
+from daqsvc.publish.errors import MqttError, PublishRefusedError
 from daqsvc.publish.telemetry_delivery import TelemetryDelivery
 
 if TYPE_CHECKING:
@@ -18,9 +19,10 @@ if TYPE_CHECKING:
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.command_intake import CommandIntake
-    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.counters import PublishCounters
     from daqsvc.publish.credentials import Credentials
+    from daqsvc.publish.faults import Faults
     from daqsvc.publish.home_assistant_link import HomeAssistantLink
     from daqsvc.publish.settings import MqttSettings
     from daqsvc.publish.topics import Topics
@@ -52,6 +54,7 @@ class Session:
         outbox: what must reach the broker.
         clock: the service's clock.
         counters: what is counted here.
+        faults: takes mistakes of this program.
         intake: takes commands; None if there are none over MQTT.
         home_assistant: None to leave Home Assistant alone.
         ends_soon: whether the certificate that the broker has shown, or the one behind it, ends soon.
@@ -68,6 +71,7 @@ class Session:
         outbox: Outbox,
         clock: Clock,
         counters: PublishCounters,
+        faults: Faults,
         intake: CommandIntake | None,
         home_assistant: HomeAssistantLink | None,
         ends_soon: Callable[[], bool],
@@ -80,10 +84,12 @@ class Session:
         self._outbox = outbox
         self._clock = clock
         self._counters = counters
+        self._faults = faults
         self._intake = intake
         self._home_assistant = home_assistant
         self._ends_soon = ends_soon
         self._stopping = stopping
+        self._said_refused: set[str] = set()
 
     async def run(self, left_s: Callable[[], float]) -> None:
         """Publish and listen until `stopping` is set and everything is handed over, or time is up.
@@ -92,14 +98,24 @@ class Session:
             left_s: once `stopping` is set, how long the deliveries may take to hand over what is left, in s.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost or refuses an alarm.
+            MqttError: the connection is lost.
             CredentialsReplacedError: make a new connection.
         """
+        alarms = Delivery(
+            self._outbox,
+            self._connection,
+            self._topics.base,
+            self._stopping,
+            on_sent=self._counters.count_published,
+            on_acknowledged=self._acknowledged,
+            on_refused=self._refused,
+        )
         deliveries = {
-            asyncio.create_task(self._alarms(), name="mqtt-alarms"),
+            asyncio.create_task(alarms.run(), name="mqtt-alarms"),
             asyncio.create_task(self._telemetry(), name="mqtt-telemetry"),
         }
         others = {
+            asyncio.create_task(alarms.try_again(), name="mqtt-refused"),
             asyncio.create_task(self._connection.lost(), name="mqtt-lost"),
             asyncio.create_task(self._listen(), name="mqtt-listen"),
             asyncio.create_task(self._look_after_credentials(), name="mqtt-credentials"),
@@ -138,27 +154,34 @@ class Session:
                 task.result()
             left = left - done
 
-    async def _alarms(self) -> None:
-        delivery = Delivery(
-            self._outbox,
-            self._connection,
-            self._topics.base,
-            self._stopping,
-            on_sent=self._counters.count_published,
-            on_acknowledged=self._acknowledged,
-        )
-        await delivery.run()
-
     def _acknowledged(self, message: OutboxMessage) -> None:
         self._counters.acknowledged += 1
         if self._home_assistant is not None:
             self._home_assistant.note(message)
 
+    def _refused(self, topic: str, reason: str) -> None:
+        self._counters.refused += 1
+        if topic not in self._said_refused:
+            self._said_refused.add(topic)
+            log.error(
+                "MQTT broker %s:%d refuses an alarm message on %s: %s; it is kept on disk and tried again "
+                "now and then, and all others go on",
+                self._settings.host,
+                self._settings.port,
+                topic,
+                reason,
+            )
+
     async def _tell_home_assistant(self, link: HomeAssistantLink) -> None:
         # What the broker has known for long is not told again in time: the summary must not begin without it.
-        for message in await self._outbox.retained():
-            link.note(message)
-        await link.run(self._connection)
+        try:
+            for message in await self._outbox.retained():
+                link.note(message)
+            await link.run(self._connection)
+        except (MqttError, OutboxError):
+            raise
+        except Exception as error:  # noqa: BLE001  alarms matter more than discovery
+            self._faults.note("Home Assistant is told nothing more until the next connection", error)
 
     async def _telemetry(self) -> None:
         delivery = TelemetryDelivery(
@@ -184,22 +207,34 @@ class Session:
             # A broker that does not grant this only leaves mistakes unanswered.
             await self._connection.watch(self._topics.below_commands, fresh_only=True)
         async for message in self._connection.incoming():
-            if self._home_assistant is not None and self._home_assistant.take(message):
-                continue
-            if self._intake is None or self._topics.is_answer(str(message.topic)):
-                continue
-            answer = await self._intake.take(message)
             try:
-                await self._connection.deliver(
-                    answer.topic,
-                    answer.payload,
-                    retain=False,
-                    expiry_s=ANSWER_EXPIRY_S,
-                    correlation=answer.correlation,
-                )
-            except PublishRefusedError as error:
-                self._intake.counters.unanswered += 1
-                log.warning("an answer on %r is not taken: %s", answer.topic, error)
+                await self._take(message)
+            except MqttError:
+                raise
+            except Exception as error:  # noqa: BLE001  no message of anybody's ends the connection
+                self._faults.note("a message from the broker could not be dealt with", error)
+
+    async def _take(self, message: Incoming) -> None:
+        if self._home_assistant is not None and self._home_assistant.take(message):
+            return
+        if self._topics.command_of(message.topic) is None or self._intake is None:
+            # Brokers send what was never subscribed to: from a session of long ago, or out of malice.
+            self._counters.count_ignored()
+            return
+        answer = await self._intake.take(message)
+        if answer is None:
+            return
+        try:
+            await self._connection.deliver(
+                answer.topic,
+                answer.payload,
+                retain=False,
+                expiry_s=ANSWER_EXPIRY_S,
+                correlation=answer.correlation,
+            )
+        except PublishRefusedError as error:
+            self._intake.counters.unanswered += 1
+            log.warning("an answer on %.200r is not taken: %s", answer.topic, error)
 
     async def _look_after_credentials(self) -> None:
         """Ask for a new connection when files were replaced by others that can be used.

@@ -20,12 +20,14 @@ class CommandSettings:
         allow: what may be asked; everything else is refused.
         max_age_s: how old a command may be when it arrives, and how far ahead its clock may be.
         max_bytes: the longest payload that is looked at.
+        reserved: topics below which no answer goes, besides the box's own, e.g. a discovery prefix.
     """
 
     machines: tuple[str, ...]
     allow: frozenset[Verb]
     max_age_s: float = 60.0
     max_bytes: int = 4096
+    reserved: tuple[str, ...] = ()
 
 
 STALE_S = 120

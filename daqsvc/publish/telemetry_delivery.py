@@ -7,7 +7,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.publish.connection import PublishRefusedError
+from daqsvc.publish.errors import PublishRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -61,7 +61,7 @@ class TelemetryDelivery:
         """Deliver until `stopping` is set and nothing is left.
 
         Raises:
-            aiomqtt.MqttError: the connection is lost; what was under way will be sent again.
+            MqttError: the connection is lost; what was under way will be sent again.
         """
         read_to = 0
         while messages := await self._next(read_to):

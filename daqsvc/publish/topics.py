@@ -8,7 +8,24 @@ from dataclasses import dataclass
 ANSWER = "response"
 """The answer to a command goes to its topic with this below."""
 
+COMMANDS = "commands"
+
 _NAME = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
+
+
+@dataclass(frozen=True, slots=True)
+class CommandTopic:
+    """What a topic below the commands of a box says.
+
+    Attributes:
+        machine: the machine that is meant, in one part.
+        verb: what is asked; with ``/`` in it if something stands below a verb.
+        is_answer: whether it is where an answer goes, of whichever client.
+    """
+
+    machine: str
+    verb: str
+    is_answer: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,21 +78,29 @@ class Topics:
     @property
     def commands(self) -> str:
         """Filter for the commands to every machine of the box."""
-        return f"{self.base}/+/commands/+"
+        return f"{self.base}/+/{COMMANDS}/+"
 
     @property
     def below_commands(self) -> str:
         """Filter for what goes below a verb by mistake; answers lie there, too."""
-        return f"{self.base}/+/commands/+/+/#"
+        return f"{self.base}/+/{COMMANDS}/+/+/#"
 
-    def is_answer(self, topic: str) -> bool:
-        """Whether a topic below a command is one of its answers, of whichever client."""
-        _, _, *below = topic.removeprefix(f"{self.base}/").split("/")
-        return any(part.startswith(ANSWER) for part in below[1:])
+    def command_of(self, topic: str) -> CommandTopic | None:
+        """What a topic says that `commands` or `below_commands` matches; None for every other one.
+
+        The one place where a topic from outside is taken apart.
+        """
+        below = f"{self.base}/"
+        machine, *rest = topic.removeprefix(below).split("/")
+        if not topic.startswith(below) or len(rest) < 2 or rest[0] != COMMANDS:
+            return None
+        verb = rest[1:]
+        is_answer = any(part.startswith(ANSWER) for part in verb[1:])
+        return CommandTopic(machine, "/".join(verb), is_answer=is_answer)
 
     def command(self, machine: str, verb: str) -> str:
         """Where a command to a machine is expected."""
-        return f"{self.base}/{_safe(machine)}/commands/{_safe(verb)}"
+        return f"{self.base}/{_safe(machine)}/{COMMANDS}/{_safe(verb)}"
 
 
 def _safe(name: str) -> str:

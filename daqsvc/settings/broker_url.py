@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, TypeAlias
 from urllib.parse import SplitResult, urlsplit
 
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
+
+_HOST = re.compile(r"[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
+_LONGEST_HOST = 254
+"""Letters, with the dot at the end that a name may have."""
 
 _DEFAULT_PORTS = {"mqtt": 1883, "mqtts": 8883}
 
@@ -30,11 +35,31 @@ def _split_url(url: str) -> SplitResult:
         )
     if parts.scheme not in _DEFAULT_PORTS or not parts.hostname or port == 0:
         raise PydanticCustomError("broker_url", "is not the address of an MQTT broker", remedy)
+    _check_host(parts.hostname)
     if parts.path not in {"", "/"} or parts.query or parts.fragment:
         raise PydanticCustomError(
             "broker_url", "has something after host and port", {"remedy": "end the url after the port"}
         )
     return parts
+
+
+def _check_host(host: str) -> None:
+    """See that a name can be looked up at all (RFC 1035, section 2.3.4; RFC 3490)."""
+    if ":" in host:
+        return  # an IPv6 address, which urlsplit has checked
+    try:
+        name = host.encode("idna").decode("ascii")
+    except UnicodeError:
+        name = ""
+    if not _HOST.fullmatch(name) or len(name) > _LONGEST_HOST:
+        raise PydanticCustomError(
+            "broker_host",
+            "has a host that cannot be the name of one",
+            {
+                "remedy": "correct it: parts of letters, digits and '-', 1 to 63 of them each, with a dot "
+                "between two parts"
+            },
+        )
 
 
 def _broker_url(url: str) -> str:

@@ -32,6 +32,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.modbus import RegistersLayout
 from daqsvc.settings.modbus_checks import check_modbus
+from daqsvc.settings.mqtt_files import credential_files
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.record_checks import check_recorded_buses
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
@@ -110,6 +111,7 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
         if draft.mqtt is not None:
             yield _transport(draft.mqtt)
             yield _credentials(draft.mqtt)
+            yield credential_files(draft)
             yield _sparkplug(draft, draft.mqtt)
             yield _open_to_commands(draft.mqtt)
 

@@ -340,15 +340,15 @@ async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox
 
 
 @pytest.mark.mosquitto
-async def test_a_refused_alarm_stays_in_the_outbox(tmp_path, outbox, caplog):
+async def test_a_refused_alarm_stays_on_disk(tmp_path, outbox, caplog):
     acl = "topic write daqsvc/lab/edge-1/availability\n"
     with running_mosquitto(tmp_path, acl=acl) as mosquitto:
         async with publishing(outbox, mosquitto.port) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
             await Service(outbox).cycle()
             await eventually(lambda: "refuses messages: Not authorized" in caplog.text, "it is refused")
-    assert outbox.counters.sent == 0
-    assert len(await outbox.pending(0, 10)) == 4
+    assert outbox.dead_letters.waiting == 4
+    assert await outbox.pending(0, 10) == []
 
 
 async def test_an_old_broker_is_met_with_the_old_protocol(outbox, monkeypatch):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import os
 import shutil
 import subprocess
 
 import pytest
-from brokers import Consumer, eventually, free_port, listens, running_mosquitto
+from brokers import Consumer, TcpProxy, eventually, free_port, listens, running_mosquitto
 from tls_files import authority, openssl, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
@@ -338,3 +339,57 @@ async def test_a_missing_password_file_is_named_and_awaited(tmp_path, outbox, ca
             await eventually(lambda: str(mine) in caplog.text, "the file is named")
             mine.write_text(SECRET)
             await eventually(lambda: publisher.counters.connected, "the file is found")
+
+
+async def test_what_is_no_password_is_said_and_awaited(tmp_path, outbox, caplog):
+    """A pipe that nobody writes to, and a first line that MQTT cannot carry; a stop waits for neither."""
+    mine = tmp_path / "mine"
+    os.mkfifo(mine)
+    with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
+        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        async with publishing(outbox, settings):
+            await eventually(lambda: f"{mine} is no regular file" in caplog.text, "the pipe is named")
+        mine.unlink()
+        mine.write_bytes(b"x" * 70_000)
+        async with publishing(outbox, settings) as publisher:
+            await eventually(
+                lambda: f"first line of {mine} has more than 65535" in caplog.text, "it is named"
+            )
+            mine.write_text(SECRET + "\n")
+            await eventually(lambda: publisher.counters.connected, "the file is in order")
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, "", "\ud800"])
+async def test_a_host_that_cannot_be_one_is_an_outage_like_any_other(outbox, caplog, host):
+    async with publishing(outbox, MqttSettings(host, 1883, "c")) as publisher:
+        await eventually(lambda: "is away" in caplog.text, "it is said")
+        assert publisher.figures()["faults"] == 0
+    assert "Traceback" not in caplog.text
+
+
+async def test_a_secret_that_everybody_can_read_is_warned_of_once(tmp_path, outbox, caplog):
+    mine = tmp_path / "mine"
+    mine.write_text(SECRET + "\n")
+    mine.chmod(0o644)
+    with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
+        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        async with (
+            TcpProxy(mosquitto.port) as wire,
+            publishing(outbox, dataclasses.replace(settings, port=wire.port)) as publisher,
+        ):
+            await eventually(lambda: publisher.counters.connected, "connected")
+            wire.cut()
+            await eventually(lambda: publisher.counters.connections == 2, "connected again")
+    assert caplog.text.count("can be read by every user") == 1
+
+
+async def test_a_certificate_whose_common_name_alone_is_the_host_is_refused(tmp_path, outbox, caplog):
+    """RFC 9525: names count where certificates have them since 2000, in the subject alternative names."""
+    ca = authority(tmp_path, "ca")
+    broker = signed(tmp_path, "localhost", ca, host="email:a@example")  # CN=localhost
+    with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
+        settings = dataclasses.replace(tls_settings(mosquitto.port, ca.cert), host="localhost")
+        async with publishing(outbox, settings) as publisher:
+            await eventually(lambda: "is away" in caplog.text, "it is refused")
+            assert "for another host" in caplog.text
+            assert not publisher.counters.connected

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
-import aiomqtt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from paho.mqtt.packettypes import PacketTypes
-from paho.mqtt.properties import Properties
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.outbox.command_ids import CommandIds
 from daqsvc.publish.command_intake import CommandIntake
 from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.connection import Incoming
 from daqsvc.publish.settings import CommandSettings
 from daqsvc.publish.topics import Topics
 
@@ -51,25 +52,19 @@ def desk():
 
 
 @pytest.fixture
-def intake(desk):
-    return make(desk)
+def intake(desk, tmp_path):
+    return make(desk, tmp_path)
 
 
-def make(desk, settings=SETTINGS):
-    return CommandIntake(settings, TOPICS, desk, DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9))
+def make(desk, store, settings=SETTINGS):
+    clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
+    return CommandIntake(settings, TOPICS, desk, clock, CommandIds(store / "command-ids"))
 
 
 def message(payload=None, topic=ACKNOWLEDGE, *, retain=False, properties=None, **changes):
     if payload is None:
         payload = json.dumps(COMMAND | changes).encode()
-    return aiomqtt.Message(topic, payload, 1, retain, 1, properties)
-
-
-def mqtt5(**values):
-    made = Properties(PacketTypes.PUBLISH)
-    for name, value in values.items():
-        setattr(made, name, value)
-    return made
+    return Incoming(topic, payload, retain=retain, **(properties or {}))
 
 
 async def answer(intake, *arguments, **options):
@@ -204,7 +199,70 @@ def test_the_words_of_a_name_may_have_any_letters():
     ],
 )
 def test_an_answer_is_no_command(below, answers):
-    assert TOPICS.is_answer(f"daqsvc/lab/edge-1/rig/commands/{below}") is answers
+    assert TOPICS.command_of(f"daqsvc/lab/edge-1/rig/commands/{below}").is_answer is answers
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "",
+        "/",
+        "notice",
+        "company/notice",
+        "company/site/notice",
+        "company/site/box/notice",
+        "daqsvc",
+        "daqsvc/lab",
+        "daqsvc/lab/edge-1",
+        "daqsvc/lab/edge-1/",
+        "daqsvc/lab/edge-1/rig",
+        "daqsvc/lab/edge-1/rig/commands",
+        "daqsvc/lab/edge-1/rig/alarms/rotor-fault",
+        "daqsvc/lab/edge-2/rig/commands/acknowledge",
+        "daqsvc/lab/edge-11/rig/commands/acknowledge",
+        "x/daqsvc/lab/edge-1/rig/commands/acknowledge",
+        "daqsvc/lab/edge-1/rig/commands/acknowledge/response",
+        "daqsvc/lab/edge-1/rig/commands/acknowledge/response/ada",
+    ],
+)
+async def test_what_no_filter_of_the_box_matches_has_no_answer(intake, desk, topic):
+    assert await intake.take(message(topic=topic)) is None
+    assert desk.asked == []
+    assert not any(asdict(intake.counters).values())
+
+
+async def test_halves_of_characters_are_a_refusal_like_any_other(intake, desk):
+    """JSON can say \\ud800, which no text in UTF-8 can hold."""
+    for key in ("id", "alarm", "by", "reason", "occurrence", "schema", "issued_at", "\ud800"):
+        told = await intake.take(message(payload=json.dumps(COMMAND | {key: "x\ud800"}).encode()))
+        response = ResponsePayload.model_validate_json(told.payload)
+        assert not response.accepted
+        assert response.id in {"c1", "x?"}
+    assert desk.asked == []
+    assert intake.counters.malformed == 8
+
+
+async def test_a_command_that_comes_again_after_a_restart_is_not_obeyed_again(desk, tmp_path):
+    await answer(make(desk, tmp_path))
+    repeated, _ = await answer(make(desk, tmp_path))
+    assert "'c1' has come before" in repeated.reason
+    assert len(desk.asked) == 1
+
+
+async def test_a_command_whose_id_cannot_be_written_is_not_obeyed(desk, tmp_path):
+    (tmp_path / "command-ids").mkdir()
+    intake = make(desk, tmp_path)
+    response, _ = await answer(intake)
+    assert "its id cannot be written down" in response.reason
+    assert desk.asked == []
+    assert intake.counters.unwritten == 1
+
+
+async def test_a_topic_of_any_length_is_neither_logged_nor_answered_whole(intake, caplog):
+    topic = f"daqsvc/lab/edge-1/{'x' * 60_000}/commands/{'y' * 5000}"
+    response, _ = await answer(intake, topic=topic)
+    assert max(len(response.machine), len(response.verb), len(response.reason)) < 500
+    assert all(len(record.getMessage()) < 1000 for record in caplog.records)
 
 
 async def test_a_sender_may_not_allow_itself_more_time(intake, desk):
@@ -223,7 +281,7 @@ async def test_a_command_that_comes_twice_is_carried_out_once(intake, desk):
 
 
 async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.command_intake.REMEMBERED", 10)
+    monkeypatch.setattr("daqsvc.outbox.command_ids.REMEMBERED", 10)
     for number in range(30):
         await answer(intake, id=f"n{number}")
     repeated, _ = await answer(intake, id="n0")
@@ -232,10 +290,10 @@ async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk
     assert intake.counters.stale == 21
 
 
-async def test_ids_are_forgotten_when_a_repeat_would_be_too_old_anyway(desk, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.command_intake.REMEMBERED", 1)
+async def test_ids_are_forgotten_when_a_repeat_would_be_too_old_anyway(desk, tmp_path, monkeypatch):
+    monkeypatch.setattr("daqsvc.outbox.command_ids.REMEMBERED", 1)
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
-    intake = CommandIntake(SETTINGS, TOPICS, desk, clock)
+    intake = CommandIntake(SETTINGS, TOPICS, desk, clock, CommandIds(tmp_path / "ids"))
     await answer(intake)
     clock.advance_to(clock.monotonic_ns() + 121 * 10**9)
     repeated, _ = await answer(intake)
@@ -258,7 +316,7 @@ async def test_the_sender_learns_which_of_its_commands_was_refused(intake):
 
 
 async def test_mqtt5_senders_are_answered_where_they_want_and_recognise_it(intake):
-    wanted = mqtt5(ResponseTopic="operators/ada/answers", CorrelationData=b"\x01\x02")
+    wanted = {"response_topic": "operators/ada/answers", "correlation": b"\x01\x02"}
     _, told = await answer(intake, properties=wanted)
     assert (told.topic, told.correlation) == ("operators/ada/answers", b"\x01\x02")
 
@@ -270,14 +328,20 @@ async def test_mqtt5_senders_are_answered_where_they_want_and_recognise_it(intak
         "daqsvc/lab/edge-2/rig/commands/acknowledge",
         "daqsvc/lab/edge-1/rig/commands/acknowledge",
         "homeassistant/device/x/config",
+        "ha/discovery/device/x/config",
+        "ha/discovery",
+        "daqsvc",
+        "STATE/host",
+        "line\nbreak",
         "spBv1.0/g/NCMD/e",
         "$SYS/broker",
         "x" * 300,
     ],
 )
-async def test_an_answer_never_speaks_in_the_name_of_somebody_else(intake, topic):
+async def test_an_answer_never_speaks_in_the_name_of_somebody_else(desk, tmp_path, topic):
     """The box may write where the sender may not: the sender must not borrow that."""
-    response, told = await answer(intake, properties=mqtt5(ResponseTopic=topic))
+    intake = make(desk, tmp_path, replace(SETTINGS, reserved=("ha/discovery",)))
+    response, told = await answer(intake, properties={"response_topic": topic})
     assert told.topic == f"{ACKNOWLEDGE}/response"
     assert response.accepted
 
@@ -295,8 +359,8 @@ async def test_a_sender_writes_no_lines_into_the_log(intake, caplog):
     assert "\n" not in caplog.records[0].getMessage()
 
 
-async def test_the_limit_of_the_size_is_the_machine_files(desk):
-    intake = make(desk, replace(SETTINGS, max_bytes=300))
+async def test_the_limit_of_the_size_is_the_machine_files(desk, tmp_path):
+    intake = make(desk, tmp_path, replace(SETTINGS, max_bytes=300))
     response, _ = await answer(intake, reason="x" * 250)
     assert "at most 300" in response.reason
 
@@ -304,10 +368,17 @@ async def test_the_limit_of_the_size_is_the_machine_files(desk):
 @given(
     st.binary(max_size=300)
     | st.dictionaries(st.text(max_size=8), st.integers()).map(json.dumps).map(str.encode)
+    | st.dictionaries(
+        st.sampled_from([*COMMAND, "reason", "occurrence", "duration_s", "expires_s", "x"]),
+        st.text(st.characters(codec=None, categories=None), max_size=8)
+        | st.floats()
+        | st.integers()
+        | st.none(),
+    ).map(lambda told: json.dumps(COMMAND | told).encode())
 )
 async def test_whatever_comes_there_is_an_answer(payload):
     desk = Desk()
-    response, _ = await answer(make(desk), payload=payload)
-    assert not response.accepted
-    assert response.reason
-    assert desk.asked == []
+    with tempfile.TemporaryDirectory() as store:
+        response, _ = await answer(make(desk, Path(store)), payload=payload)
+    assert len(desk.asked) == response.accepted
+    assert response.accepted or response.reason

@@ -7,11 +7,11 @@ import logging
 import socket
 import ssl
 
-import aiomqtt
 import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
+from daqsvc.publish.errors import MqttCodeError, MqttError
 from daqsvc.publish.outage import MOST_REASONS, Outage, has_expired, in_words
 
 
@@ -22,7 +22,7 @@ def unverified(code, message):
 
 
 def coded(number):
-    return aiomqtt.MqttCodeError(ReasonCode(PacketTypes.CONNACK, identifier=number))
+    return MqttCodeError(ReasonCode(PacketTypes.CONNACK, identifier=number))
 
 
 @pytest.mark.parametrize(
@@ -43,8 +43,8 @@ def coded(number):
         (coded(134), "it refuses the user name or the password"),
         (coded(128), "the broker gave no reason"),
         (coded(136), "Server unavailable"),
-        (aiomqtt.MqttCodeError(4, "could not publish"), "The client is not currently connected"),
-        (aiomqtt.MqttError("no PUBACK within 10 s"), "no PUBACK within 10 s"),
+        (MqttCodeError(4, "could not publish"), "The client is not currently connected"),
+        (MqttError("no PUBACK within 10 s"), "no PUBACK within 10 s"),
         (None, "closed"),
     ],
 )
@@ -62,7 +62,7 @@ def test_only_an_expired_certificate_has_expired():
 
 def test_each_reason_is_said_once_in_an_outage_and_anew_in_the_next(caplog):
     outage = Outage(logging.getLogger("outage"))
-    lost, refused = aiomqtt.MqttError("connection lost: closed"), ConnectionRefusedError()
+    lost, refused = MqttError("connection lost: closed"), ConnectionRefusedError()
     for error in (lost, refused, lost, refused):
         outage.tell("MQTT broker a:1", error, "trying again")
     outage.end()

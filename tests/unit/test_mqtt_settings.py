@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
 URL = 'url = "mqtts://broker.example:8883"'
+PASSWORD = 'password_file = "/etc/daqsvc/mqtt-password"'  # noqa: S105  a name
 ROOT = 'topic_root = "daqsvc"'
 ALLOWED = 'allow = ["acknowledge", "shelve", "unshelve"]'
 
@@ -56,6 +58,48 @@ def test_commands_that_cannot_be_are_named(line, key, message):
     problem, _ = only_problem(LAVAL, (ALLOWED, line))
     assert problem.key == key
     assert message in problem.message
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, ".a", f"{'a.' * 130}b", "broker:@x", "a b", "a_b!"])
+def test_a_host_that_no_name_server_could_know_is_refused(host):
+    problem, _ = only_problem(LAVAL, (URL, f'url = "mqtts://{host}"'))
+    assert problem.key == "mqtt.url"
+
+
+@pytest.mark.parametrize(
+    "host", ["broker", "broker.example.", "10.0.0.1", "[::1]", "bröker.example", "x" * 63]
+)
+def test_a_host_that_may_be_one_is_taken(host):
+    assert machine((URL, f'url = "mqtts://{host}"')).mqtt.url == f"mqtts://{host}"
+
+
+def test_files_that_are_no_files_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pw")
+    problem, _ = only_problem(LAVAL, (PASSWORD, f'password_file = "{tmp_path}/pw"'))
+    assert problem.key == "mqtt.password_file"
+    assert "no regular file" in problem.message
+
+
+def test_a_password_that_mqtt_cannot_carry_is_refused(tmp_path):
+    path = tmp_path / "pw"
+    path.touch(0o600)
+    for length, fits in ((65_535, True), (65_536, False)):
+        path.write_bytes(b"x" * length + b"\nmore")
+        if fits:
+            machine((PASSWORD, f'password_file = "{path}"'))
+        else:
+            problem, _ = only_problem(LAVAL, (PASSWORD, f'password_file = "{path}"'))
+            assert "first line of more than 65535 bytes" in problem.message
+
+
+def test_a_password_that_everybody_can_read_is_warned_of(tmp_path):
+    path = tmp_path / "pw"
+    path.write_text("secret")
+    path.chmod(0o644)
+    (warning,) = machine((PASSWORD, f'password_file = "{path}"')).warnings
+    assert "can be read by every user" in warning.message
+    path.chmod(0o640)
+    assert machine((PASSWORD, f'password_file = "{path}"')).warnings == ()
 
 
 def test_plaintext_needs_to_be_meant():

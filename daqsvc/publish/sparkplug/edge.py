@@ -12,14 +12,14 @@ import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import aiomqtt
-
 import daqsvc
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
-from daqsvc.publish.connection import Connection, NoConsentError
+from daqsvc.publish.connection import Connection, Will
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
+from daqsvc.publish.errors import MqttError, NoConsentError
+from daqsvc.publish.faults import Faults
 from daqsvc.publish.outage import Outage
 from daqsvc.publish.sparkplug.memory import Memory
 from daqsvc.publish.sparkplug.metrics import (
@@ -92,6 +92,7 @@ class SparkplugEdge:
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._older = mqtt.protocol == "3.1.1"
         self._outage = Outage(log)
+        self._faults = Faults()
         self._stopping = asyncio.Event()
         self._running: asyncio.Future[None] | None = None
 
@@ -112,7 +113,13 @@ class SparkplugEdge:
         try:
             await asyncio.to_thread(self._memory.load)
             while not self._stopping.is_set():
-                await self._one_session(self._settings.servers[self._server])
+                try:
+                    await self._one_session(self._settings.servers[self._server])
+                except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
+                    self._faults.note(
+                        "Sparkplug was interrupted and begins anew with a new connection", error
+                    )
+                    await self._wait()
         finally:
             self._running.set_result(None)
 
@@ -126,7 +133,7 @@ class SparkplugEdge:
         """Connect to one broker and stay until that ends, for whatever reason."""
         try:
             made = await unless(self._stopping, self._connect(server))
-        except (aiomqtt.MqttError, OSError, ValueError) as error:
+        except (MqttError, OSError, ValueError) as error:
             if self._falls_back(error):
                 return
             self._report_outage(server, error)
@@ -144,7 +151,7 @@ class SparkplugEdge:
             await session.leave(GOODBYE_S)
             self._walk()
             await self._wait()
-        except (aiomqtt.MqttError, OSError) as error:
+        except (MqttError, OSError) as error:
             self._report_outage(server, error)
             if session.was_born:
                 self._backoff.reset()
@@ -164,13 +171,13 @@ class SparkplugEdge:
             server.host,
             server.port,
             in_flight=IN_FLIGHT,
-            protocol=aiomqtt.ProtocolVersion.V311 if self._older else aiomqtt.ProtocolVersion.V5,
+            mqtt5=not self._older,
             identifier=self._settings.client_id,
             username=mqtt.username,
             password=credentials.password,
             tls_context=credentials.context,
             keepalive=mqtt.keepalive_s,
-            will=aiomqtt.Will(death.topic, death.payload, qos=death.qos, retain=False),
+            will=Will(death.topic, death.payload, qos=death.qos, retain=False),
         )
         try:
             await connection.open()

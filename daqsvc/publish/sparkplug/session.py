@@ -7,8 +7,7 @@ import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import aiomqtt
-
+from daqsvc.publish.errors import MqttError
 from daqsvc.publish.sparkplug.codec import PayloadError
 from daqsvc.publish.sparkplug.host import PrimaryHost
 from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
-    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.sparkplug.codec import Metric
     from daqsvc.publish.sparkplug.memory import Memory
     from daqsvc.publish.sparkplug.metrics import Board
@@ -128,10 +127,10 @@ class EdgeSession:
 
         Raises:
             HostAwayError: the primary host has left this broker, or never came.
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost.
         """
         self._there = there
-        heard: asyncio.Queue[aiomqtt.Message] = asyncio.Queue()
+        heard: asyncio.Queue[Incoming] = asyncio.Queue()
         wanted = [self._node.commands, self._node.device_commands]
         await self._connection.watch(*wanted, *([self._host.topic] if self._host else []))
         listening = asyncio.create_task(self._listen(heard), name="sparkplug-listen")
@@ -161,7 +160,7 @@ class EdgeSession:
                     death = self._node.will(self._bd_seq, self._now_ms)
                     self._node.die()
                     await self._connection.deliver(death.topic, death.payload, retain=False)
-        except (TimeoutError, aiomqtt.MqttError) as error:
+        except (TimeoutError, MqttError) as error:
             log.info("the node's death was not published (%s); the last will tells it", error)
             return  # dropped without a word, so that the broker publishes the will
         await self._connection.close(timeout_s)
@@ -174,13 +173,13 @@ class EdgeSession:
     def _cursor(self) -> int:
         return self._memory.cursor or 0
 
-    async def _listen(self, heard: asyncio.Queue[aiomqtt.Message]) -> None:
+    async def _listen(self, heard: asyncio.Queue[Incoming]) -> None:
         async for message in self._connection.incoming():
             heard.put_nowait(message)
 
     async def _await_host(
         self,
-        heard: asyncio.Queue[aiomqtt.Message],
+        heard: asyncio.Queue[Incoming],
         listening: asyncio.Task[None],
         stopped: asyncio.Task[Any],
     ) -> None:
@@ -188,7 +187,7 @@ class EdgeSession:
 
         Raises:
             HostAwayError: it is not, and there are other brokers to try.
-            aiomqtt.MqttError: the connection is lost.
+            MqttError: the connection is lost.
         """
         assert self._host is not None  # noqa: S101 - asked for only with a host
         patience_s = None if self._alone else HOST_S
@@ -203,11 +202,11 @@ class EdgeSession:
 
     async def _first(
         self,
-        wanted: Coroutine[Any, Any, aiomqtt.Message],
+        wanted: Coroutine[Any, Any, Incoming],
         listening: asyncio.Task[None],
         stopped: asyncio.Task[Any],
         patience_s: float | None,
-    ) -> aiomqtt.Message | None:
+    ) -> Incoming | None:
         """The next message, or None if it takes too long or the service stops."""
         waiting = asyncio.ensure_future(wanted)
         try:
@@ -250,7 +249,7 @@ class EdgeSession:
 
     async def _tell(
         self,
-        heard: asyncio.Queue[aiomqtt.Message],
+        heard: asyncio.Queue[Incoming],
         listening: asyncio.Task[None],
         stopped: asyncio.Task[Any],
     ) -> None:
@@ -316,9 +315,9 @@ class EdgeSession:
             self._counters.data += 1
         self._told = _values(present)
 
-    def _hear(self, message: aiomqtt.Message) -> bool:
+    def _hear(self, message: Incoming) -> bool:
         """Take in what a host says; whether it asks for new births."""
-        topic, payload = message.topic.value, bytes(message.payload or b"")
+        topic, payload = message.topic, message.payload
         try:
             if self._host is not None and topic == self._host.topic:
                 if not self._host.take(payload):
