@@ -18,6 +18,7 @@ import numpy as np
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
+from daqsvc.confined.limits import GIGABYTE, Limits
 from drivers.base import BusCounters, BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
@@ -95,7 +96,8 @@ class ReplayDriver:
     if left out); ``at_end``, what to do at its end: ``"stop"`` (the link is down from then on, with the
     reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is writing the
     file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver takes it,
-    where the samples' times run ahead of the clock.
+    where the samples' times run ahead of the clock; ``max_memory_gb``, what reading a table may take (half of
+    the machine's memory, at most 4 GB, if left out).
 
     A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
     `ColumnLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
@@ -118,6 +120,8 @@ class ReplayDriver:
         self._sorter = FrameSorter(frames)
         self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
         self._place = Place()
+        memory_gb = port.options.get("max_memory_gb")
+        self._limits = Limits() if memory_gb is None else Limits(round(memory_gb * GIGABYTE))
         self._first_index: dict[str, int] = {}
         self._to_its_end = False
         self._shift_ns: int | None = None
@@ -171,7 +175,7 @@ class ReplayDriver:
         if self._at_end == "wait":
             return GrowingCandump(self._path, self._sort, self._place)
         if kind_of(self._path) == "table":
-            return SampleTable(self._path, self._port.streams, self._first_index)
+            return SampleTable(self._path, self._port.streams, self._first_index, self._limits)
         return CanLog(self._path, self._sort)
 
     def _close(self, recording: Recording) -> None:

@@ -12,6 +12,8 @@ import numpy as np
 from can.io import MESSAGE_READERS, ASCReader, BLFReader, SqliteReader
 from can.io.generic import BinaryIOMessageReader, TextIOMessageReader
 
+from daqsvc.confined.limits import UNBOUNDED, Budget, CountedFile
+from drivers.replay_blf import BlfFile
 from drivers.replay_files import RecordingError, words
 from drivers.replay_lines import TextLog, whole
 
@@ -72,6 +74,8 @@ class CanLog:
         return f"line {self._text.first_malformed_at}, {self._text.first_malformed}"
 
     def _open(self) -> Iterator[can.Message]:
+        if not self._path.is_file():
+            raise ValueError("it is no file but a folder, pipe or device")
         zipped = self._path.suffix.lower() == ".gz"
         reader = MESSAGE_READERS.get((self._path.with_suffix("") if zipped else self._path).suffix.lower())
         if reader is SqliteReader:
@@ -86,7 +90,9 @@ class CanLog:
         if reader is not None and issubclass(reader, BinaryIOMessageReader):
             # Given only a path, python-can leaves a file open that it cannot make sense of.
             file = self._open_bytes(zipped=zipped)
-            opened = reader(cast("BinaryIO", _NotCutShort(file)) if reader is BLFReader else file)
+            if reader is BLFReader:
+                file = BlfFile(file, Budget(self._path.stat().st_size, UNBOUNDED))
+            opened = reader(cast("BinaryIO", file))
         else:
             opened = can.LogReader(self._path)  # of a plugin, or of nothing at all
         self._files.callback(opened.stop)
@@ -94,7 +100,9 @@ class CanLog:
 
     def _open_bytes(self, *, zipped: bool) -> Any:
         if zipped:
-            return self._files.enter_context(gzip.open(self._path))
+            unpacked = self._files.enter_context(gzip.GzipFile(self._path))
+            budget = Budget(self._path.stat().st_size, UNBOUNDED)
+            return io.BufferedReader(CountedFile(cast("BinaryIO", unpacked), budget))
         return self._files.enter_context(self._path.open("rb"))
 
     def read(self, span_ns: int) -> Sorted | None:
@@ -146,26 +154,6 @@ class CanLog:
     def close(self) -> None:
         """See `drivers.replay_files.Recording.close`."""
         self._files.close()
-
-
-class _NotCutShort:
-    """A BLF file whose end is one: python-can takes one that is cut in the middle of an object for whole."""
-
-    _LONGEST_PADDING = 3
-
-    def __init__(self, file: Any) -> None:
-        self.close = file.close
-        self._file = file
-        self._cut = False
-
-    def read(self, length: int) -> bytes:
-        data: bytes = self._file.read(length)
-        if length > self._LONGEST_PADDING:
-            if self._cut and not data:
-                raise EOFError("it ends in the middle of a container")
-            # What there is of the last object may hold frames yet.
-            self._cut = 0 < len(data) < length
-        return data
 
 
 def recorded_ns(message: can.Message) -> int:

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.confined.limits import Limits
 from drivers.can_batches import Sorted, StreamFrames
 from drivers.frames import Decoded
+from drivers.replay_table import TableError, read_columns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 PIECE_SAMPLES = 65_536
 TABLE_COUNTER_BITS = 32
+MOST_NAMED = 50
+"""Columns that a message names."""
 
 
 class RecordingError(Exception):
@@ -90,6 +94,7 @@ class SampleTable:
         path: the file.
         specs: the streams; their layouts are `ColumnLayout`.
         first_index: where each stream's count of samples goes on, by name; kept up to date.
+        limits: what reading the file may take.
 
     Attributes:
         seamless: whether all streams last as long: played again, it goes on without a step in time.
@@ -101,11 +106,15 @@ class SampleTable:
     first_malformed = ""
 
     def __init__(
-        self, path: Path, specs: Sequence[StreamSpec[ColumnLayout]], first_index: dict[str, int]
+        self,
+        path: Path,
+        specs: Sequence[StreamSpec[ColumnLayout]],
+        first_index: dict[str, int],
+        limits: Limits | None = None,
     ) -> None:
         self._first_index = first_index
         wanted = [column for spec in specs for column in spec.layout.columns]
-        table = _table(path, wanted)
+        table = _table(path, wanted, limits or Limits())
         self._streams: list[tuple[StreamSpec[ColumnLayout], NDArray[np.float32]]] = []
         for spec in specs:
             columns = [table[name] for name in spec.layout.columns]
@@ -115,9 +124,11 @@ class SampleTable:
                     f"{path}: the columns of stream {spec.name!r} have the shapes {shapes}; "
                     "they must have one dimension and one length"
                 )
+            values = np.empty((len(columns[0]), len(columns)), np.float32)
             with np.errstate(over="ignore", invalid="ignore"):
-                values = np.stack(columns, axis=1) * spec.layout.scale + spec.layout.offset
-                self._streams.append((spec, values.astype(np.float32)))
+                for i, column in enumerate(columns):
+                    values[:, i] = column * spec.layout.scale[i] + spec.layout.offset[i]
+            self._streams.append((spec, values))
         self._t_ns = 0
         self.seamless = len({len(values) / spec.rate_hz for spec, values in self._streams}) == 1
 
@@ -169,22 +180,17 @@ def words(error: BaseException) -> str:
     return f"{error}" or type(error).__name__
 
 
-def _table(path: Path, wanted: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def _table(path: Path, wanted: Sequence[str], limits: Limits) -> dict[str, NDArray[np.float64]]:
     try:
-        if path.suffix.lower() == ".npz":
-            with path.open("rb") as packed, np.load(packed, allow_pickle=False) as arrays:
-                there = list(arrays.files)
-                found = {name: np.asarray(arrays[name], np.float64) for name in wanted if name in there}
-        else:
-            with path.open(encoding="utf-8") as file:
-                there = [name.strip().strip('"') for name in file.readline().split(",")]
-                rows = np.loadtxt(file, delimiter=",", ndmin=2)
-            found = {name: rows[:, there.index(name)] for name in wanted if name in there}
-    except Exception as error:
+        there, found = read_columns(path, wanted, limits)
+    except TableError as error:
         raise RecordingError(
             f"{path} cannot be read as a table of samples: {words(error)}; give an NPZ file with an array "
             "per column, or a CSV file of numbers with the columns' names in its first line"
         ) from error
     if missing := [name for name in wanted if name not in found]:
-        raise RecordingError(f"{path} has no column {missing[0]!r}; it has {', '.join(there)}")
+        shown = ", ".join(there[:MOST_NAMED]) + (
+            f" and {len(there) - MOST_NAMED} more" * (len(there) > MOST_NAMED)
+        )
+        raise RecordingError(f"{path} has no column {missing[0]!r}; it has {shown}")
     return found

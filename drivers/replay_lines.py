@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 LONGEST_LINE = 4096
 """No line of a log is as long, in characters."""
+MOST_WITHOUT_FRAME = 100_000
+"""Lines in a row that are no frames, after which a log is given up: a thread waits for the next frame."""
 _SHOWN = 60
 
 _NEVER = re.compile(r"(?!)")
@@ -66,6 +68,7 @@ class TextLog:
             try:
                 for message in self._reader(self._lines):  # type: ignore[arg-type]
                     yield whole(message)
+                    self._lines.without_frame = 0
             except Exception:
                 # A reader that fails at the header, which it is given again, would do so for ever.
                 stuck = self._lines.number == begun_at
@@ -97,6 +100,7 @@ class _Lines:
         self._header: list[str] = []
         self._again: list[str] = []
         self._loops = 0
+        self.without_frame = 0
         self.number = 0
         self._line = ""
 
@@ -126,6 +130,10 @@ class _Lines:
         if not line:
             raise StopIteration
         self.number += 1
+        self.without_frame += 1
+        if self.without_frame > MOST_WITHOUT_FRAME:
+            self.broken = True
+            raise ValueError(f"{MOST_WITHOUT_FRAME:,} lines in a row are no frames")
         self._line = line
         if self._loops == 1 and self._in_header.match(line):
             self._header.append(line)

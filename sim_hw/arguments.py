@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.recording.channels import channel_map, sampling_rate_hz
+from daqsvc.recording.channels import add_max_memory, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -46,6 +46,7 @@ def add_recording(group: Group) -> None:
         help="which variables of the recording to play, and as which sensors (default: by their names)",
     )
     group.add_argument("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate of the recording")
+    add_max_memory(group.add_argument)
 
 
 def add_speed(group: Group, remark: str = "") -> None:

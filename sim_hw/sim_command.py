@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 EXIT_FAILED = 1
 EXIT_BAD_FILE = 2
 SCENARIO = "paper"
-OF_RECORDINGS = ("map", "fs")
+OF_RECORDINGS = ("map", "fs", "max_memory")
 OF_PLANTS = ("snr_db",)
 """Options that go with the one or the other; a scenario's faults, and their seed, go with both."""
 DEFAULT_BUS = "daqsvc-can0"
@@ -248,9 +248,11 @@ def _script(
     faults = None if scenario is None else scenario.node_faults(arguments.seed)
     signals: Signals
     if arguments.recording is not None:
-        from daqsvc.recording.recording import load_recording  # noqa: PLC0415
+        from daqsvc.recording.recording import load_recording, set_memory, stop_reading  # noqa: PLC0415
 
+        set_memory(arguments.max_memory)
         recording = load_recording(arguments.recording, arguments.map, arguments.fs)
+        stop_reading()
         signals = RecordedSignals(recording, arguments.duration)
     elif isinstance(scenario, Scenario):
         signals = RotorSignals(scenario, arguments.duration, arguments.seed, arguments.snr_db)

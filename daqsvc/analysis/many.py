@@ -10,8 +10,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+from daqsvc.recording.recording import get_limits, set_limits
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
+    from daqsvc.confined.limits import Limits
 
 _BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -73,7 +77,10 @@ def judge_all(
     for name in _BLAS_THREADS:
         os.environ.setdefault(name, "1")
     pool = ProcessPoolExecutor(
-        processes, multiprocessing.get_context("spawn"), initializer=_leave_interrupts_to_the_parent
+        processes,
+        multiprocessing.get_context("spawn"),
+        initializer=_prepare,
+        initargs=(get_limits(),),
     )
     try:
         jobs = [pool.submit(analyst.judge, *job) for job in zip(recordings, figures, strict=True)]
@@ -89,6 +96,7 @@ def judge_all(
         pool.shutdown(cancel_futures=True)
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    """Ctrl-C goes to the whole group; only who waits for the others should say so."""
+def _prepare(limits: Limits) -> None:
+    """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    set_limits(limits)

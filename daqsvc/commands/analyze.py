@@ -91,6 +91,9 @@ class AnalyzeCommand:
             wrong, make = misuse(arguments, machine, recordings), None
         if wrong:
             self._parser.error(wrong)
+        from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
+
+        set_memory(arguments.max_memory)
         if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
             return _fail(wrong, EXIT_FAILED)
         if make is not None:
@@ -99,7 +102,7 @@ class AnalyzeCommand:
             analyst = self._rotor(arguments) if machine is None else self._machine(machine, arguments)
         if analyst is None:
             return EXIT_USAGE
-        from daqsvc.analysis.many import WorkerLostError  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.analysis.many import WorkerLostError  # noqa: PLC0415
 
         figures = _figure_names(recordings, arguments.plot)
         processes = _processes(arguments.jobs, len(recordings))

@@ -70,6 +70,9 @@ class CalibrateCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
+        from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
+
+        set_memory(arguments.max_memory)
         machine_path = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
         recordings = arguments.files[1:] if machine_path is not None else arguments.files
         if by_bearing(arguments):
@@ -85,7 +88,7 @@ class CalibrateCommand:
             if machine.pipeline.rotor_synchronous is None:
                 return self._without_rotor(recordings, arguments, machine)
             self._prepare_kernel_cache()
-        from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415 - each verb imports what it needs
+        from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415
 

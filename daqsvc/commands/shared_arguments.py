@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.option_types import not_negative, number, percent, positive, probe_pair, speed
-from daqsvc.recording.channels import channel_map, sampling_rate_hz
+from daqsvc.recording.channels import add_max_memory, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,6 +48,7 @@ def add_channel_map(add: Callable[..., argparse.Action]) -> None:
         help="which variable of the recordings is which channel or sensor (default: the one of its name)",
     )
     add("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it")
+    add_max_memory(add)
 
 
 def add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: str = "") -> None:

@@ -6,10 +6,11 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
+from daqsvc.confined.limits import GIGABYTE
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     import numpy as np
     from numpy.typing import NDArray
@@ -21,6 +22,9 @@ LengthUnit = Literal["m", "mm", "um", "mil"]
 LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
 
 UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
+
+LEAST_MEMORY_GB = 0.05
+MOST_MEMORY_GB = 1000.0
 
 LEAST_RATE_HZ = 1.0
 MOST_RATE_HZ = 10e6
@@ -63,6 +67,37 @@ def sampling_rate_hz(text: str) -> float:
             f"{text!r} is not a sampling rate from {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz"
         )
     return value
+
+
+def memory_limit(text: str) -> int:
+    """Memory in GB that reading a recording may take, in bytes (for argparse).
+
+    Raises:
+        argparse.ArgumentTypeError: it is not a number from `LEAST_MEMORY_GB` to `MOST_MEMORY_GB`.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not LEAST_MEMORY_GB <= value <= MOST_MEMORY_GB:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a number of GB from {LEAST_MEMORY_GB:g} to {MOST_MEMORY_GB:g}"
+        )
+    return round(value * GIGABYTE)
+
+
+def add_max_memory(add: Callable[..., argparse.Action]) -> None:
+    """The option ``--max-memory``; what it says goes to `daqsvc.recording.recording.set_limits`.
+
+    Args:
+        add: ``add_argument`` of the group that takes it.
+    """
+    add(
+        "--max-memory",
+        type=memory_limit,
+        metavar="GB",
+        help="memory that reading one recording may take (default: half of the machine's, at most 4)",
+    )
 
 
 def metres_per_unit(unit: str) -> float:

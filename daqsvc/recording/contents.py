@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.confined.limits import TooLargeError
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
@@ -18,6 +20,28 @@ NUMERIC = "iuf"
 
 MOST_LISTED = 50
 """Entries of a file that a message names."""
+
+LONGEST_NAME = 80
+"""Characters of a name in a message."""
+
+LONGEST_TEXT = 1000
+"""Characters of a text that are kept."""
+
+MOST_COLUMNS = 4096
+"""Channels that a file may have."""
+
+
+def check_columns(count: int) -> None:
+    """See whether a file may have so many channels.
+
+    Raises:
+        TooLargeError: it may not.
+    """
+    if count > MOST_COLUMNS:
+        raise TooLargeError(
+            f"it has {count:,} columns or variables, and at most {MOST_COLUMNS:,} are read; give the "
+            "channels only"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +77,7 @@ class Contents:
     def texts(self) -> dict[str, str]:
         """Single texts, e.g. a label."""
         return {
-            name: str(value)
+            name: str(value)[:LONGEST_TEXT]
             for name, value in self.entries.items()
             if value.ndim == 0 and value.dtype.kind == "U"
         }
@@ -69,6 +93,8 @@ class Contents:
 def _told(name: str, values: NDArray[np.generic]) -> str:
     if not name.isprintable():
         name = ascii(name)
+    if len(name) > LONGEST_NAME:
+        name = f"{name[:LONGEST_NAME]}..."
     if values.ndim > 1:
         return f"{name} ({values.ndim}-D)"
     if values.dtype.kind in NUMERIC and values.size and values.ndim:
@@ -80,12 +106,9 @@ def _told(name: str, values: NDArray[np.generic]) -> str:
 
 def column_names(headers: Sequence[str]) -> list[str]:
     """A name for each column: its header, or its number if it has none or shares it with one before."""
+    first = {header: i for i, header in reversed(list(enumerate(headers)))}
     return [
-        header
-        if header and headers.index(header) == i
-        else str(i)
-        if str(i) not in headers
-        else f"column {i}"
+        header if header and first[header] == i else str(i) if str(i) not in first else f"column {i}"
         for i, header in enumerate(headers)
     ]
 

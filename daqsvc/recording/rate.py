@@ -1,8 +1,9 @@
-"""How fast a recording was sampled: as given, as the file states it, or out of its time column."""
+"""How fast a recording was sampled, and where it lacks samples: as given, stated, or by its time column."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -27,7 +28,7 @@ RATE_NAMES = frozenset(
 
 TIME_NAME = re.compile(
     # A capital T alone is a temperature or a torque.
-    r"(?:.*\.)?(?:t|(?i:time|elapsed))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
+    r"(?:.*\.)?(?:t|(?i:time|elapsed|zeit))(?:[\s_]*[\[(]?(?P<unit>s|sec|seconds|ms|us|µs|μs|ns)[\])]?)?"
 )
 """Names that a column of time may have, with its unit or in seconds: ``t``, ``Time [ms]``, ``time_s``."""
 
@@ -39,25 +40,83 @@ SAME_RATE = 0.005
 MOST_UNEVEN = 0.5
 """Steps of an even column of time are within this fraction of their median (rounded times do that)."""
 
+LEAST_UNBROKEN = 0.75
+"""Part of the steps that are one sample where a column of time has gaps; with fewer it is uneven."""
 
-def rate_of(path: Path, contents: Contents, length: int, given_hz: float | None) -> tuple[float, str]:
-    """Samples per second of channels with ``length`` samples, and where the number comes from.
+MOST_OFF_GRID = 0.3
+"""A gap in a column of time is a whole number of samples to within so much of one, ..."""
+SHORT_GAP = 20
+"""... if it is not longer than so many samples; what was not sampled may have had a clock of its own."""
+
+MOST_STRETCHED = 4
+"""A recording is given up whose gaps make it so many times as long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """When the samples of a recording were taken.
+
+    Attributes:
+        rate_hz: samples per second.
+        source: where that comes from, in words.
+        rows: int64 ``[n]``, the place of each sample where some are missing between; None if none are.
+    """
+
+    rate_hz: float
+    source: str
+    rows: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _TimeColumn:
+    """A column of time, and what it says.
+
+    Attributes:
+        name: of the column.
+        unit: it was read in, in words.
+        unit_is_named: whether the file says that.
+        rate_hz: samples per second.
+        tolerance: how far the rate may be off by the digits of the column, relative.
+        rows: see `Timing`.
+        is_even: whether each sample has its place by the column; else only the mean rate is known.
+    """
+
+    name: str
+    unit: str
+    unit_is_named: bool
+    rate_hz: float
+    tolerance: float
+    rows: NDArray[np.int64] | None = None
+    is_even: bool = True
+
+    def agrees(self, hz: float) -> bool:
+        """Whether a rate is the column's, as far as its digits tell."""
+        return abs(self.rate_hz / hz - 1.0) <= SAME_RATE + self.tolerance
+
+    def agrees_in_other_unit(self, hz: float) -> bool:
+        """Whether a column that names no unit would be right in ms, us or ns."""
+        return not self.unit_is_named and any(self.agrees(hz / per) for per in (1e3, 1e6, 1e9))
+
+
+def timing_of(path: Path, contents: Contents, length: int, given_hz: float | None) -> Timing:
+    """When the samples of channels with ``length`` samples were taken.
 
     Args:
         path: the file, for messages.
         contents: what it holds.
         length: samples of a channel.
-        given_hz: what the user says; outranks a column of time, but never contradicts a rate that is stated.
+        given_hz: what the user says; it never contradicts what the file says, where that says one thing.
 
     Raises:
-        RecordingError: nobody says it, the file contradicts itself or what is given, or the rate is outside
-            of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
+        RecordingError: nobody says the rate, the file contradicts itself or what is given, most samples are
+            missing, or the rate is outside of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
     """
     stated = {
         name: value
         for name, value in contents.scalars().items()
         if name.rpartition(".")[2].lower() in RATE_NAMES
     }
+    column = _time(path, contents, length)
     if given_hz is not None:
         others = "".join(
             f"; {name} of the file says {hz:g} Hz" for name, hz in stated.items() if hz != given_hz
@@ -66,10 +125,8 @@ def rate_of(path: Path, contents: Contents, length: int, given_hz: float | None)
     elif len(set(stated.values())) == 1:
         name, rate_hz = next(iter(stated.items()))
         source = f"stated as {name}"
-    elif not stated and (time := time_column(contents, length)) is not None:
-        seconds, unit = _seconds(time, contents.entries[time])
-        rate_hz = float((length - 1) / (seconds[-1] - seconds[0]))
-        source = f"derived from time column {time!r}, read as {unit}"
+    elif not stated and column is not None and column.is_even:
+        rate_hz, source = column.rate_hz, f"derived from time column {column.name!r}, read as {column.unit}"
     else:
         told = f"states several: {stated}" if stated else f"does not state one{_why_not(contents, length)}"
         raise RecordingError(
@@ -80,34 +137,71 @@ def rate_of(path: Path, contents: Contents, length: int, given_hz: float | None)
             f"the sampling rate of {path} is said to be {rate_hz:g} Hz ({source}); give one from "
             f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs"
         )
-    if given_hz is not None:
-        _refuse_other(path, stated, given_hz)
-    return float(rate_hz), source
+    _refuse_contradictions(path, stated, column, given_hz)
+    rows = None if column is None else column.rows
+    return Timing(float(rate_hz), source, rows)
 
 
-def _refuse_other(path: Path, stated: Mapping[str, float], given_hz: float) -> None:
-    """Refuse a given rate that no statement of the file is near to.
+def _refuse_contradictions(
+    path: Path, stated: Mapping[str, float], column: _TimeColumn | None, given_hz: float | None
+) -> None:
+    """Refuse a rate that contradicts the file, and a file that contradicts itself.
+
+    Of a file that says several things one that is given chooses.
 
     Raises:
-        RecordingError: none is.
+        RecordingError: they do.
     """
-    if not stated or any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()):
+    said = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
+    if column is not None:
+        said.append(f"{column.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
+    if given_hz is None:
+        if column is not None and any(not _agrees(column, hz) for hz in stated.values()):
+            raise RecordingError(
+                f"the sampling rate of {path} is {' and '.join(said)} by the file, which contradicts itself: "
+                "say which with --fs, or correct the file"
+            )
         return
-    said = " and ".join(f"{hz:g} Hz ({name})" for name, hz in stated.items())
-    raise RecordingError(
-        f"the sampling rate of {path} is {said} by the file and {given_hz:g} Hz as given: leave --fs out, or "
-        "correct it"
+    agreed = any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()) or (
+        column is not None and _agrees(column, given_hz)
     )
+    if said and not agreed:
+        raise RecordingError(
+            f"the sampling rate of {path} is {' and '.join(said)} by the file and {given_hz:g} Hz as given: "
+            "leave --fs out, or correct it"
+        )
+
+
+def _agrees(column: _TimeColumn, hz: float) -> bool:
+    return column.agrees(hz) or column.agrees_in_other_unit(hz)
 
 
 def time_column(contents: Contents, length: int) -> str | None:
     """Name of the evenly spaced column of time that goes with channels of ``length`` samples.
 
-    That is the first which holds dates or is named like a time; in a table without a header it is the
-    first column if it rises by even steps, which no measured signal does. Steps of one are left: they
-    number the samples.
+    That is the first which holds dates or is named like a time, samples that are missing aside; in a table
+    without a header it is the first column if it rises by even steps, which no measured signal does. Steps
+    of one are left: they number the samples.
     """
-    return next((name for name in _candidates(contents, length) if _is_even(contents, name)), None)
+    found = (_read(contents, name) for name in _candidates(contents, length))
+    return next((column.name for column in found if column is not None and column.is_even), None)
+
+
+def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
+    """The column of time: the first even one, else the first that tells the mean rate at least.
+
+    Raises:
+        RecordingError: it lacks most of the samples.
+    """
+    found = [column for name in _candidates(contents, length) if (column := _read(contents, name))]
+    column = next((one for one in found if one.is_even), found[0] if found else None)
+    if column is not None and column.rows is not None and column.rows[-1] >= MOST_STRETCHED * length:
+        longest = int(np.argmax(np.diff(column.rows)))
+        raise RecordingError(
+            f"{path} lacks {column.rows[-1] + 1 - length:,} of {column.rows[-1] + 1:,} samples by its time "
+            f"column {column.name!r}, the most behind sample {longest + 1:,}; cut the recording there"
+        )
+    return column
 
 
 def _candidates(contents: Contents, length: int) -> list[str]:
@@ -116,45 +210,77 @@ def _candidates(contents: Contents, length: int) -> list[str]:
         for name, values in contents.entries.items()
         if values.ndim == 1 and len(values) == length > 2 and values.dtype.kind in "iufM"
     }
-    found = [
-        name for name, values in fitting.items() if values.dtype.kind == "M" or TIME_NAME.fullmatch(name)
-    ]
+    found = [name for name, values in fitting.items() if values.dtype.kind == "M" or _is_named(name)]
     if contents.is_table and not contents.has_header and "0" in fitting and len(fitting) > 1:
-        first = np.asarray(fitting["0"], np.float64)
+        first = np.asarray(fitting["0"][:2], np.float64)
         if abs(first[1] - first[0]) != 1.0:
             found.append("0")
     return found
 
 
-def _is_even(contents: Contents, name: str) -> bool:
-    steps = _steps(contents, name)
-    if not np.isfinite(steps).all():
-        return False
-    median = float(np.median(steps))
-    return bool(median > 0 and np.all(np.abs(steps - median) <= MOST_UNEVEN * median))
+def _is_named(name: str) -> bool:
+    return TIME_NAME.fullmatch(name) is not None
 
 
-def _steps(contents: Contents, name: str) -> Floats:
+def _read(contents: Contents, name: str) -> _TimeColumn | None:
+    """What a column says if it is one of time; None if it says nothing."""
+    values = contents.entries[name]
     with np.errstate(invalid="ignore"):  # infinities make NaN
-        return np.diff(_seconds(name, contents.entries[name])[0])
+        seconds, unit, unit_is_named = _seconds(name, values)
+        steps = np.diff(seconds)
+    by_name = values.dtype.kind == "M" or _is_named(name)
+    median = float(np.median(steps))
+    if not (np.isfinite(steps).all() and median > 0.0):
+        return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
+    ones = np.abs(steps - median) <= MOST_UNEVEN * median
+    period = float(steps[ones].mean())
+    rows = None
+    if not ones.all():
+        counts = np.maximum(np.rint(steps / period), 1.0)
+        off = np.abs(steps / period - counts)
+        short = counts <= SHORT_GAP
+        is_gap = (counts > 1) & (~short | (off <= MOST_OFF_GRID))
+        if not by_name or ones.mean() < LEAST_UNBROKEN or not (ones | is_gap).all():
+            return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
+        rows = np.concatenate(([0], np.cumsum(np.where(ones, 1.0, counts)))).astype(np.int64)
+    last_row = len(seconds) - 1 if rows is None else int(rows[-1])
+    rate_hz = last_row / (seconds[-1] - seconds[0]) if rows is None else 1.0 / period
+    rounding = float(np.abs(steps[ones] - period).max())
+    return _TimeColumn(
+        name, unit, unit_is_named, float(rate_hz), 2.0 * rounding / (period * ones.sum()), rows
+    )
 
 
-def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str]:
-    """Seconds since the first sample, and the unit that they were in."""
+def _mean_rate(name: str, unit: str, seconds: Floats, *, unit_is_named: bool) -> _TimeColumn | None:
+    """What a column with coarse stamps, or without some, says all the same; None if it goes back."""
+    there = np.flatnonzero(np.isfinite(seconds))
+    steps = np.diff(seconds[there])
+    if len(there) < 2 or steps.min() < 0.0 or steps.max() <= 0.0:
+        return None
+    span_s = float(seconds[there[-1]] - seconds[there[0]])
+    rate_hz = float(there[-1] - there[0]) / span_s
+    return _TimeColumn(name, unit, unit_is_named, rate_hz, 2.0 * float(steps.max()) / span_s, is_even=False)
+
+
+def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]:
+    """Seconds since the first sample, the unit that they were in, and whether the file names it."""
     if values.dtype.kind == "M":
-        return (values - values[0]) / np.timedelta64(1, "s"), "dates"
+        return (values - values[0]) / np.timedelta64(1, "s"), "dates", True
     named = TIME_NAME.fullmatch(name)
-    unit = (named["unit"] if named else None) or "s"
+    unit = named["unit"] if named else None
     # Nanoseconds since 1970 have more digits than a float64.
     since_first = (values - values[0]).astype(np.float64)
-    return since_first / PER_SECOND.get(unit, 1.0), unit if unit in PER_SECOND else "seconds"
+    if unit in PER_SECOND:
+        return since_first / PER_SECOND[unit], unit, True
+    return since_first, "seconds", unit is not None
 
 
 def _why_not(contents: Contents, length: int) -> str:
     """Why a column that looks like time is of no use."""
     for name in _candidates(contents, length):
-        if TIME_NAME.fullmatch(name):
-            steps = _steps(contents, name)
+        if _is_named(name):
+            with np.errstate(invalid="ignore"):
+                steps = np.diff(_seconds(name, contents.entries[name])[0])
             return (
                 f", and the steps of its time column {name!r} are uneven "
                 f"({np.min(steps):.3g} to {np.max(steps):.3g} s)"

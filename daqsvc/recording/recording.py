@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
-
-from daqsvc.recording.contents import NUMERIC
+from daqsvc.confined.limits import Limits
+from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
 from daqsvc.recording.errors import RecordingError
-from daqsvc.recording.formats import read
-from daqsvc.recording.rate import rate_of, time_column
+from daqsvc.recording.formats import find
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.recording.contents import Contents
+    from daqsvc.confined.process import Answer
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -53,6 +52,32 @@ class Recording:
     texts: Mapping[str, str] = field(default_factory=dict)
 
 
+class _Reading:
+    """How recordings are read by this process."""
+
+    limits = Limits()
+
+
+def set_limits(limits: Limits) -> None:
+    """Say what reading one recording may take, from now on.
+
+    Args:
+        limits: of the process that reads them.
+    """
+    _Reading.limits = limits
+
+
+def set_memory(memory_bytes: int | None) -> None:
+    """What ``--max-memory`` says; None leaves it as it is."""
+    if memory_bytes is not None:
+        set_limits(Limits(memory_bytes))
+
+
+def get_limits() -> Limits:
+    """What reading one recording may take."""
+    return _Reading.limits
+
+
 def load_recording(
     path: Path | str, channels: Mapping[str, str] | None = None, rate_hz: float | None = None
 ) -> Recording:
@@ -62,6 +87,9 @@ def load_recording(
     (``bearing.gs``), a column of a matrix (``data[2]``), the header or number from 0 of a table's column,
     or the number from 0 of a WAV file's channel.
 
+    The file is read in a process of its own, within the limits of `set_limits`: what is damaged or hostile
+    costs that process at most. Samples that are missing by a column of time are NaN.
+
     Integer samples of WAV files are scaled so that full scale is 1; all others stay as they are.
 
     Args:
@@ -70,34 +98,20 @@ def load_recording(
             given: every channel in the file that is as long as the longest one, under its own name; a
             column of time is none.
         rate_hz: samples per second. Unless given: what the file says under one of `rate.RATE_NAMES`, or
-            else what follows from a column of time, even steps provided (`rate.time_column`).
+            else what follows from a column of time, even steps provided (`rate.time_column`). A rate that
+            contradicts what the file says is refused.
 
     Raises:
-        RecordingError: the file cannot be read, a channel is not there, not numeric or empty, the
-            channels have different lengths, or the rate is not known or outside of
+        RecordingError: the file cannot be read within the limits, a channel is not there, not numeric or
+            empty, the channels have different lengths, or the rate is not known, contradicted, or outside of
             `channels.LEAST_RATE_HZ` to `channels.MOST_RATE_HZ`.
     """
     path = Path(path)
-    contents = read(path)
-    left_out: dict[str, int] = {}
-    if not channels:
-        channels, left_out = _longest(path, contents)
-    columns = {name: _channel(path, contents, variable) for name, variable in channels.items()}
-    length = _common_length(path, columns, channels)
-    rate_hz, rate_source = rate_of(path, contents, length, rate_hz)
-    samples = np.column_stack(list(columns.values()))
-    return Recording(
-        names=tuple(columns),
-        samples=samples,
-        rate_hz=rate_hz,
-        source=path,
-        nan_count=int(np.isnan(samples).sum()),
-        infinity_count=int(np.isinf(samples).sum()),
-        left_out=left_out,
-        rate_source=rate_source,
-        scalars=contents.scalars(),
-        texts=contents.texts(),
+    about, (samples,) = _there(
+        "load", path, {"channels": None if channels is None else dict(channels), "rate_hz": rate_hz}
     )
+    about["names"] = tuple(about["names"])
+    return Recording(samples=samples, source=path, **about)
 
 
 def list_channels(path: Path | str) -> dict[str, int]:
@@ -106,56 +120,40 @@ def list_channels(path: Path | str) -> dict[str, int]:
     Raises:
         RecordingError: the file cannot be read.
     """
-    vectors = read(Path(path)).vectors()
-    return {name: len(values) for name, values in vectors.items() if len(values) > 1}
+    found: dict[str, int] = _there("channels_of", Path(path), {}).found
+    return found
 
 
-def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, int]]:
-    """Channels as long as the longest under their own names, and the lengths of the others."""
-    lengths = {name: len(values) for name, values in contents.vectors().items() if len(values) > 1}
-    longest = max(lengths.values(), default=0)
-    time = time_column(contents, longest)
-    channels = {name: name for name, length in lengths.items() if length == longest and name != time}
-    if not channels:
-        numeric = any(values.dtype.kind in NUMERIC for values in contents.entries.values())
-        why = "is too short: no channel has two samples" if numeric else "holds no numeric channel"
-        if time is not None:
-            why = f"holds no channel beside its time column {time!r}"
-        raise RecordingError(f"{path} {why}; it holds {contents.listing()}")
-    return channels, {name: length for name, length in lengths.items() if length < longest}
+def stop_reading() -> None:
+    """End the process that reads recordings; the next recording begins another."""
+    shared.close()
 
 
-def _channel(path: Path, contents: Contents, variable: str) -> Floats:
-    entries = contents.entries
-    if (
-        contents.is_table
-        and variable not in entries
-        and variable.isascii()
-        and variable.isdecimal()
-        and int(variable) < len(entries)
-    ):
-        variable = list(entries)[int(variable)]
-    holds = f"it holds {contents.listing()}"
-    if variable not in entries:
-        raise RecordingError(f"{path} has no channel {variable!r}; {holds}")
-    values = entries[variable]
-    if values.dtype.kind not in NUMERIC:
-        raise RecordingError(f"{variable!r} of {path} is not numeric; {holds}")
-    if values.ndim != 1 or not len(values):
-        what = {0: "a single number", 1: "empty"}.get(values.ndim, f"{values.ndim}-dimensional")
-        raise RecordingError(f"{variable!r} of {path} is {what}, not a channel; {holds}")
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        return values.astype(np.float64)
+def _there(function: str, path: Path, arguments: Mapping[str, Any]) -> Answer:
+    """Call a function of `daqsvc.recording.loading` about a file in the process that reads.
 
-
-def _common_length(path: Path, columns: Mapping[str, Floats], channels: Mapping[str, str]) -> int:
-    lengths = {name: len(values) for name, values in columns.items()}
-    if len(set(lengths.values())) > 1:
-        stated = ", ".join(f"{name} ({channels[name]}) {length}" for name, length in lengths.items())
-        raise RecordingError(
-            f"the channels of {path} have different lengths: {stated}; map only channels taken together"
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    _, file_bytes = find(path)
+    limits = get_limits()
+    try:
+        return shared.call(
+            f"daqsvc.recording.loading:{function}",
+            {"path": str(path), "memory_bytes": limits.memory_bytes, **arguments},
+            memory_bytes=limits.memory_bytes,
+            cpu_s=limits.cpu_s(file_bytes),
         )
-    length = next(iter(lengths.values()))
-    if length < 2:
-        raise RecordingError(f"{path} is too short: it holds one sample a channel; give a longer recording")
-    return length
+    except RaisedThereError as error:
+        if error.kind == RecordingError.__name__:
+            raise RecordingError(error.message) from None
+        raise RecordingError(
+            f"{path} cannot be read: {error}; it may be damaged: copy or save it anew"
+        ) from None
+    except ConfinedError as error:
+        remedy = "it is damaged: copy or save it anew"
+        if error.reason != "crash":
+            remedy = f"unless it is that large it is damaged: {remedy.partition(': ')[2]}"
+        if error.reason == "memory":
+            remedy = f"allow more (--max-memory; it is {limits.memory_bytes / 1e9:.3g} GB), or {remedy}"
+        raise RecordingError(f"{path} cannot be read: {error.how}; {remedy}") from None

@@ -44,6 +44,14 @@ class ReplayBus(Section):
     pace: Literal["recorded", "unpaced"] = Field(
         default="recorded", description="as it was recorded, or as fast as it can be taken in"
     )
+    max_memory_gb: float | None = Field(
+        default=None,
+        ge=0.05,
+        le=1000.0,
+        description="memory that reading a table may take, in GB; if left out half of the machine's, "
+        "at most 4",
+        examples=[4.0],
+    )
     start: Literal["error", "retry", "ignore"] = Field(
         default="retry", description="what to do if the file is absent at start"
     )

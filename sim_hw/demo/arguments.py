@@ -7,7 +7,17 @@ from urllib.parse import urlsplit
 
 from sim_hw.arguments import given, misplaced
 
-OF_RECORDINGS = ("map", "fs", "unit", "baseline", "baseline_map", "baseline_fs", "bearing", "speed_rpm")
+OF_RECORDINGS = (
+    "map",
+    "fs",
+    "max_memory",
+    "unit",
+    "baseline",
+    "baseline_map",
+    "baseline_fs",
+    "bearing",
+    "speed_rpm",
+)
 OF_SCENARIOS = ("scenario", "seed", "snr_db")
 OF_BASELINES = ("baseline_map", "baseline_fs")
 

@@ -253,11 +253,13 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
 
 
 def _from_recording(arguments: argparse.Namespace) -> Script:
+    from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
     from sim_hw.demo.baseline import setpoints  # noqa: PLC0415
     from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
     from sim_hw.demo.playable import playable  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
+    set_memory(arguments.max_memory)
     recording = playable(_load(arguments.recording, arguments.map, arguments.fs, "--map"))
     limits = Setpoints()
     if arguments.baseline is not None:
@@ -272,6 +274,7 @@ def _from_recording(arguments: argparse.Namespace) -> Script:
                 f"baseline {healthy.source} gives {', '.join(limits)}, the recording "
                 f"{', '.join(recording.names)}; give both the same sensor names with --map and --baseline-map"
             )
+    stop_reading()
     unit = arguments.unit or UNIT
     bearing = None
     if arguments.bearing is not None:

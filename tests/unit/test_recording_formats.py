@@ -12,7 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat, wavfile
 
+from daqsvc.confined.limits import Budget, Limits
 from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.formats.parquet import read_parquet
 from daqsvc.recording.recording import list_channels, load_recording
 
 RATE_HZ = 8_000
@@ -156,7 +158,7 @@ def test_parquet_needs_its_extra(tmp_path, monkeypatch):
     with pytest.raises(
         RecordingError, match=r"needs pyarrow; install it with: pip install 'daqsvc\[parquet\]'"
     ):
-        load_recording(path, rate_hz=100)
+        read_parquet(path, Budget.of(path, Limits()))
 
 
 # Text tables.
@@ -198,15 +200,52 @@ def test_csv_empty_cells_among_decimal_commas(tmp_path):
 
 def test_csv_first_row_of_samples_is_damaged(tmp_path):
     path = write_text(tmp_path, "x,y\n1,?\n3,4\n5,6\n")
-    with pytest.raises(RecordingError, match=r"rig\.csv:2 column 1: '\?' is not a number"):
+    with pytest.raises(RecordingError, match=r"rig\.csv, line 2, column 2 \(y\): '\?' is not a number"):
         load_recording(path, rate_hz=1)
 
 
-def test_csv_not_in_utf8(tmp_path):
+LOGGER = (
+    "Datenlogger;XY-100\r\nSeriennummer;4711\r\nAbtastrate [Hz];500\r\nSampling rate;500\r\n\r\n"
+    "Messung vom;12.03.2026;14:00\r\nZeit [s];Kanal 1;Kanal 2\r\ns;µm;m/s²\r\n"
+) + "".join(f"{i / 500:.3f};{i % 7},5;-{i},25\r\n".replace(".", ",") for i in range(300))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_csv_behind_a_preamble(tmp_path, encoding):
+    path = tmp_path / "rig.csv"
+    path.write_bytes(LOGGER.encode(encoding))
+    recording = load_recording(path)
+    assert recording.names == ("Kanal 1", "Kanal 2")
+    assert recording.rate_hz == 500
+    assert recording.scalars["sampling_rate"] == 500
+    assert recording.samples[[0, 299]].tolist() == [[0.5, -0.25], [5.5, -299.25]]
+
+
+@pytest.mark.parametrize(
+    "preamble",
+    [
+        "Instrument: Scope 7\nSerial: 1\n\n",
+        "".join(f"Setting {i},{i}\n" for i in range(40)),  # looks like a table of two columns
+        "Sample Rate: 0.5 kHz\nComment, with, commas, and 1, 2\n",
+    ],
+)
+def test_csv_with_commas_behind_a_preamble(tmp_path, preamble):
+    path = write_text(tmp_path, preamble + "x,y\nmm,g\n" + "".join(f"{i},{i}.5\n" for i in range(200)))
+    recording = load_recording(path, rate_hz=500)
+    assert recording.names == ("x", "y")
+    assert recording.samples[:, 1].tolist() == [i + 0.5 for i in range(200)]
+
+
+def test_a_preamble_does_not_hide_damaged_samples(tmp_path):
+    path = write_text(tmp_path, "about: a rig\nx,y\n" + "1,2\n" * 5 + "3,?\n" + "1,2\n" * 200)
+    with pytest.raises(RecordingError, match=r"is not a number|columns"):
+        load_recording(path, rate_hz=1)
+
+
+def test_csv_in_latin_1(tmp_path):
     path = tmp_path / "rig.csv"
     path.write_bytes("x °C,y\n1,2\n3,4\n".encode("latin-1"))
-    with pytest.raises(RecordingError, match=r"not text in UTF-8 \(.* at byte 2\); save it as CSV in UTF-8"):
-        load_recording(path, rate_hz=1)
+    assert list_channels(path) == {"x °C": 2, "y": 2}
 
 
 def test_csv_comments_state_numbers(tmp_path):
@@ -279,10 +318,10 @@ def test_sample_numbers_are_no_time(tmp_path):
 def test_an_uneven_time_column_is_told(tmp_path):
     path = tmp_path / "rig.npz"
     t = np.arange(400) / 500
-    t[200:] += 0.01
+    t[200:] += 0.0109
     np.savez(path, time=t, x=X)
     with pytest.raises(
-        RecordingError, match=r"the steps of its time column 'time' are uneven \(0\.002 to 0\.012 s\)"
+        RecordingError, match=r"the steps of its time column 'time' are uneven \(0\.002 to 0\.0129 s\)"
     ):
         load_recording(path)
 
@@ -314,9 +353,9 @@ def test_time_of_other_channels_does_not_count(tmp_path):
     assert load_recording(path, {"s": "slow"}).rate_hz == pytest.approx(5)
 
 
-def test_what_is_stated_outranks_time_and_what_is_given_must_agree_with_it(tmp_path):
+def test_what_is_given_must_agree_with_what_is_stated(tmp_path):
     path = tmp_path / "rig.mat"
-    savemat(path, {"t": np.arange(400) / 500, "x": X, "fs": 640})
+    savemat(path, {"x": X, "fs": 640})
     recording = load_recording(path)
     assert (recording.rate_hz, recording.names) == (640, ("x",))
     recording = load_recording(path, rate_hz=641)
@@ -324,6 +363,90 @@ def test_what_is_stated_outranks_time_and_what_is_given_must_agree_with_it(tmp_p
     with pytest.raises(RecordingError, match=r"is 640 Hz \(fs\) by the file and 100 Hz as given: leave --fs"):
         load_recording(path, rate_hz=100)
     assert load_recording(path, rate_hz=640).rate_source == "given"
+
+
+def save_with_time(path, t, **others):
+    """The same table in the format that the suffix says; dates have a place in some formats only."""
+    columns = {"t": t, "x": np.linspace(-0.9, 0.9, len(t)), **others}
+    if path.suffix == ".npz":
+        np.savez(path, **columns)
+    elif path.suffix == ".mat":
+        savemat(path, columns)
+    elif path.suffix == ".parquet":
+        pq.write_table(pa.table(columns), path)
+    else:
+        names, rows = ";".join(columns), zip(*columns.values(), strict=True)
+        path.write_text(f"{names}\n" + "".join(";".join(f"{v:.12g}" for v in row) + "\n" for row in rows))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat", ".parquet"])
+def test_a_given_rate_that_contradicts_the_time_column_is_refused(tmp_path, suffix):
+    path = save_with_time(tmp_path / f"rig{suffix}", np.arange(400) / 48_000)
+    with pytest.raises(
+        RecordingError,
+        match=r"is 48000 Hz \(time column 't', read as seconds\) by the file and 12000 Hz as given: leave",
+    ):
+        load_recording(path, {"x": "x"}, 12_000)
+    assert load_recording(path, {"x": "x"}, 48_100).rate_hz == 48_100
+
+
+def test_a_wav_file_states_its_rate(tmp_path):
+    path = tmp_path / "rig.wav"
+    wavfile.write(path, RATE_HZ, X)
+    with pytest.raises(RecordingError, match=r"is 8000 Hz \(rate_hz\) by the file and 9000 Hz as given"):
+        load_recording(path, rate_hz=9000)
+
+
+def test_a_time_column_is_believed_as_far_as_its_digits_go(tmp_path):
+    """Stamps in whole seconds tell the rate of a long recording, and nothing of a short one."""
+    seconds = np.floor(np.arange(90_000) / 1000)
+    path = save_with_time(tmp_path / "rig.csv", seconds)
+    assert load_recording(path, {"x": "x"}, 1010).rate_hz == 1010
+    with pytest.raises(RecordingError, match=r"'t', read as seconds\) by the file and 1200 Hz as given"):
+        load_recording(path, {"x": "x"}, 1200)
+    short = save_with_time(tmp_path / "short.csv", seconds[:2000])
+    assert load_recording(short, {"x": "x"}, 1200).rate_hz == 1200
+
+
+def test_a_time_column_without_a_unit_may_be_in_another_one(tmp_path):
+    path = save_with_time(tmp_path / "rig.csv", np.arange(400) / 12.0)
+    assert load_recording(path, {"x": "x"}, 12_000).rate_hz == 12_000
+    with pytest.raises(RecordingError, match="by the file and 48000 Hz as given"):
+        load_recording(path, {"x": "x"}, 48_000)
+
+
+def test_a_file_that_contradicts_itself_is_refused_unless_the_rate_is_given(tmp_path):
+    path = save_with_time(tmp_path / "rig.npz", np.arange(400) / 500, fs=640)
+    with pytest.raises(
+        RecordingError,
+        match=r"is 640 Hz \(fs\) and 500 Hz \(time column 't'.*\) by the file, which contradicts",
+    ):
+        load_recording(path)
+    assert load_recording(path, rate_hz=500).rate_hz == 500
+    assert load_recording(path, rate_hz=640).rate_hz == 640
+
+
+@pytest.mark.parametrize("given", [None, 500.0])
+def test_a_gap_in_the_time_column_is_a_gap(tmp_path, given):
+    t = np.round(np.arange(1000) / 500, 4)
+    there = np.ones(1000, bool)
+    there[[100, *range(300, 420), 700]] = False
+    path = save_with_time(tmp_path / "rig.csv", t[there])
+    recording = load_recording(path, {"x": "x"}, given)
+    assert recording.rate_hz == pytest.approx(500)
+    assert np.array_equal(np.isfinite(recording.samples[:, 0]), there)
+    assert recording.nan_count == 122
+
+
+def test_a_recording_that_is_mostly_a_gap_is_refused(tmp_path):
+    t = np.arange(400) / 500
+    t[200:] += 3600.0
+    path = save_with_time(tmp_path / "rig.csv", t)
+    with pytest.raises(
+        RecordingError, match=r"lacks 1,800,000 of .* by its time column 't', .* behind sample 200;"
+    ):
+        load_recording(path)
 
 
 def test_a_derived_rate_must_be_sensible(tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import stat
 from typing import TYPE_CHECKING
 
+from daqsvc.confined.limits import Budget, TooLargeError
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats.delimited import read_csv
 from daqsvc.recording.formats.matlab import read_mat
@@ -15,9 +17,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from daqsvc.confined.limits import Limits
     from daqsvc.recording.contents import Contents
 
-READERS: Mapping[str, Callable[[Path], Contents]] = {
+READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
     ".npz": read_npz,
     ".mat": read_mat,
     ".csv": read_csv,
@@ -27,30 +30,53 @@ READERS: Mapping[str, Callable[[Path], Contents]] = {
 }
 
 
-def read(path: Path) -> Contents:
-    """Everything in a file.
+_LONGEST_REASON = 300
+
+
+def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
+    """The reader of a file, and its size in bytes.
 
     Raises:
-        RecordingError: the file cannot be read; nothing else, whatever the file is.
+        RecordingError: there is no such file, or none that can be read.
     """
     # Asked first, as the readers say it in words of their own.
-    if not path.exists():
-        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path")
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise RecordingError(f"{path} cannot be read: there is no such file; correct the path") from None
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path!s:.200} cannot be read: {_one_line(error)}; correct the path") from None
     name = path.name.lower()
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
     if reader is None:
         raise RecordingError(f"{path} is not a kind of file that can be read; use {', '.join(READERS)}")
+    if not stat.S_ISREG(status.st_mode):
+        raise RecordingError(
+            f"{path} cannot be read: it is no file but a folder, pipe or device; give a file"
+        )
+    return reader, status.st_size
+
+
+def read(path: Path, limits: Limits) -> Contents:
+    """Everything in a file.
+
+    Raises:
+        RecordingError: the file cannot be read.
+        MemoryError: it asks for more than there is; nothing else, whatever the file is.
+    """
+    reader, _ = find(path)
     try:
-        return reader(path)
-    except RecordingError:
+        return reader(path, Budget.of(path, limits))
+    except (RecordingError, MemoryError):
         raise
+    except TooLargeError as error:
+        raise RecordingError(f"{path} is too large: {error}") from None
     except OSError as error:
         told = error.strerror or _one_line(error)
         raise RecordingError(f"{path} cannot be read: {told}; copy it anew, or give another file") from error
-    except MemoryError as error:
+    except RecursionError as error:
         raise RecordingError(
-            f"{path} cannot be read: it asks for more memory than there is; "
-            "unless it is that large it is damaged, and has to be copied or saved anew"
+            f"{path} cannot be read: what it holds is nested too deep; save the channels themselves"
         ) from error
     except Exception as error:
         # On damaged bytes the libraries behind the readers raise almost anything.
@@ -60,4 +86,4 @@ def read(path: Path) -> Contents:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    return " ".join(str(error).split())[:_LONGEST_REASON] or type(error).__name__

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    from daqsvc.confined.limits import Budget
+
 HEADER_BYTES = 128
 BIG_ENDIAN = b"MI"
 
@@ -52,11 +54,16 @@ class _DamageError(ValueError):
     """The structure is not that of a MATLAB file."""
 
 
-def check_mat_structure(path: Path) -> None:
+def check_mat_structure(path: Path, budget: Budget) -> None:
     """Follow every element of a file of level 5.
+
+    Args:
+        path: the file.
+        budget: of the file; what its variables unpack to is counted.
 
     Raises:
         RecordingError: the file is damaged or cut short.
+        TooLargeError: it unpacks to more than it may.
         zlib.error: a compressed variable is damaged.
     """
     content = memoryview(path.read_bytes())
@@ -65,11 +72,21 @@ def check_mat_structure(path: Path) -> None:
         for kind, body in _elements(content[HEADER_BYTES:], order):
             variables = [_Element(kind, body)]
             if kind == COMPRESSED:
-                variables = list(_elements(memoryview(zlib.decompress(body)), order))
+                variables = list(_elements(memoryview(_unpacked(body, budget)), order))
             for variable in variables:
                 _check_array(variable, order)
     except _DamageError as damage:
         raise RecordingError(f"{path} cannot be read: {damage}; copy or save it anew") from None
+
+
+def _unpacked(body: memoryview, budget: Budget) -> bytes:
+    """A compressed variable, no more of it than the file may hold."""
+    unpacking = zlib.decompressobj()
+    found = unpacking.decompress(body, budget.left_bytes + 1)
+    budget.take(len(found))
+    if not unpacking.eof:
+        raise _DamageError("a compressed variable is cut short")
+    return found
 
 
 def _elements(content: memoryview, order: str) -> Iterator[_Element]:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import zipfile
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from daqsvc.recording.contents import Contents, flattened
+from daqsvc.confined.archives import load_array
+from daqsvc.recording.contents import Contents, check_columns, flattened
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy.lib.npyio import NpzFile
-    from numpy.typing import NDArray
+    from daqsvc.confined.limits import Budget
+
+ARRAY = ".npy"
+"""How the names of members end that are arrays."""
 
 
-def read_npz(path: Path) -> Contents:
+def read_npz(path: Path, budget: Budget) -> Contents:
     """All arrays; Python objects stay unread, as they could run code."""
     with path.open("rb") as file:
         if not zipfile.is_zipfile(file):
@@ -25,20 +26,17 @@ def read_npz(path: Path) -> Contents:
                 f"{path} cannot be read: it is not a zip archive, as numpy.savez writes; "
                 "save it anew, or give it the suffix of what it is"
             )
-        with np.load(file, allow_pickle=False) as archive:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            check_columns(len(members))
+            budget.check_declared(sum(member.file_size for member in members))
             return Contents(
                 {
                     entry: values
-                    for name in archive.files
-                    for entry, values in flattened(name, _unless_objects(archive, name))
+                    for member in members
+                    if member.filename.endswith(ARRAY)
+                    for entry, values in flattened(
+                        member.filename.removesuffix(ARRAY), load_array(archive, member, budget)
+                    )
                 }
             )
-
-
-def _unless_objects(archive: NpzFile, name: str) -> NDArray[np.generic]:
-    try:
-        return np.asarray(archive[name])
-    except ValueError as error:
-        if "pickle" not in str(error):
-            raise
-        return np.empty(0, dtype=object)

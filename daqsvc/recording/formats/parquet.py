@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.recording.contents import Contents, column_names
+from daqsvc.recording.contents import Contents, check_columns, column_names
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -14,40 +14,64 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.confined.limits import Budget
+
 OF_LIBRARIES = frozenset({"pandas", "ARROW:schema"})
 """Metadata that libraries write for themselves."""
 
+_BATCH_ROWS = 1 << 20
+_ITEM_BYTES = 8
 
-def read_parquet(path: Path) -> Contents:
+
+def read_parquet(path: Path, budget: Budget) -> Contents:
     """Numeric columns with NaN for null, columns of dates, and the file's key-value metadata."""
     try:
-        import pyarrow.parquet as pq  # noqa: PLC0415 - an extra, and only this format needs it
+        import pyarrow as pa  # noqa: PLC0415 - an extra, and only this format needs it
+        import pyarrow.parquet as pq  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise RecordingError(
             f"{path} is a Parquet file, and reading it needs pyarrow; "
             "install it with: pip install 'daqsvc[parquet]'"
         ) from error
+    # More threads would take more memory, and no file is read by several.
+    pa.set_cpu_count(1)
+    pa.set_io_thread_count(1)
     with pq.ParquetFile(path, page_checksum_verification=True) as file:
-        metadata = file.schema_arrow.metadata or {}
-        table = file.read()
+        schema, rows = file.schema_arrow, file.metadata.num_rows
+        check_columns(len(schema.names))
+        is_read = [_is_read(kind) for kind in schema.types]
+        budget.check_declared(_ITEM_BYTES * rows * sum(is_read))
+        numbers = [i for i, wanted in enumerate(is_read) if wanted]
+        pieces: list[list[Any]] = [[] for _ in numbers]
+        wanted = None if len(set(schema.names)) < len(schema.names) else [schema.names[i] for i in numbers]
+        for batch in file.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
+            columns = batch.columns if wanted is not None else [batch.columns[i] for i in numbers]
+            budget.take(_ITEM_BYTES * len(batch) * len(columns))
+            for piece, column in zip(pieces, columns, strict=True):
+                piece.append(column)
+    pieces.reverse()
+    # Taken away one by one, so that a column is held twice and not the table.
+    found = {i: _array(pa.chunked_array(pieces.pop(), schema.types[i])) for i in numbers}
     entries = {
-        name: _array(column)
-        for name, column in zip(column_names(table.column_names), table.columns, strict=True)
+        name: found[i] if i in found else np.empty(rows and 1, dtype=object)
+        for i, name in enumerate(column_names(schema.names))
     }
-    for key, value in metadata.items():
+    for key, value in (schema.metadata or {}).items():
         name, text = key.decode(), value.decode()
         if name not in OF_LIBRARIES:
             entries.setdefault(name, _scalar(text))
     return Contents(entries, is_table=True)
 
 
-def _array(column: Any) -> NDArray[np.generic]:
+def _is_read(kind: Any) -> bool:
+    """Whether a column of a type is numbers or dates."""
     import pyarrow.types as kinds  # noqa: PLC0415 - see above
 
-    kind = column.type
-    if kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_timestamp(kind):
-        return np.asarray(column.to_numpy())
-    return np.empty(len(column), dtype=object)
+    return bool(kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_timestamp(kind))
+
+
+def _array(column: Any) -> NDArray[np.generic]:
+    return np.asarray(column.to_numpy())
 
 
 def _scalar(text: str) -> NDArray[np.generic]:

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from daqsvc.recording.contents import Contents
+from daqsvc.recording.contents import Contents, check_columns
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from daqsvc.confined.limits import Budget
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -30,7 +32,7 @@ SUBFORMAT_AT = 24
 ENCODINGS = {PCM: (8, 16, 24, 32), FLOAT: (32, 64)}
 
 
-def read_wav(path: Path) -> Contents:
+def read_wav(path: Path, budget: Budget) -> Contents:
     """Channels "0", "1", ... float64, integers scaled to a full scale of 1; and ``rate_hz``."""
     content = path.read_bytes()
     chunks = _chunks(path, content)
@@ -48,6 +50,8 @@ def read_wav(path: Path) -> Contents:
             f"{path} cannot be read: its {len(data)} bytes of samples are no whole number of frames of "
             f"{frame_bytes} bytes; copy or save it anew"
         )
+    check_columns(channels)
+    budget.check_declared(len(data) * 64.0 / bits)
     samples = _decoded(data, encoding, bits).reshape(-1, channels)
     return Contents(
         {str(i): samples[:, i] for i in range(channels)} | {"rate_hz": np.array(rate_hz)},
@@ -100,12 +104,19 @@ def _decoded(data: memoryview, encoding: int, bits: int) -> Floats:
     """Samples of all channels in turn."""
     if encoding == FLOAT:
         with np.errstate(invalid="ignore"):  # signalling NaN
-            return np.frombuffer(data, f"<f{bits // 8}").astype(np.float64)
+            return np.frombuffer(data, f"<f{bits // 8}").astype(np.float64, copy=False)
     if bits == 8:
-        return (np.frombuffer(data, np.uint8).astype(np.float64) - 128.0) / 128.0
+        samples = np.frombuffer(data, np.uint8).astype(np.float64)
+        samples -= 128.0
+        samples /= 128.0
+        return samples
     if bits == 24:
         # As the upper three bytes of 32 bits.
         widened = np.zeros((len(data) // 3, 4), np.uint8)
         widened[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
-        return widened.view("<i4").ravel().astype(np.float64) / 2.0**31
-    return np.frombuffer(data, f"<i{bits // 8}").astype(np.float64) / 2.0 ** (bits - 1)
+        samples = widened.view("<i4").ravel().astype(np.float64)
+        samples /= 2.0**31
+        return samples
+    samples = np.frombuffer(data, f"<i{bits // 8}").astype(np.float64)
+    samples /= 2.0 ** (bits - 1)
+    return samples

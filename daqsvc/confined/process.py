@@ -1,0 +1,251 @@
+"""A process that works for this one and can be lost: what it may take is bounded."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from threading import RLock
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+
+import numpy as np
+
+from daqsvc.confined.child import LENGTH
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+Reason = Literal["memory", "time", "crash"]
+
+_WALL_PER_CPU = 4.0
+_WALL_BASE_S = 60.0
+"""How long an answer may take: a process that is stuck uses no processor time."""
+
+_LONGEST_HEADER = 256_000_000
+_END_S = 2.0
+
+_ENVIRONMENT = {
+    # Threads that nobody needs take address space, which is what is bounded; so do the pools of Arrow.
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
+
+
+class ConfinedError(Exception):
+    """The work was not done: it took too much memory or time, or crashed the process that did it.
+
+    Attributes:
+        reason: which of these.
+        how: how it ended, in words.
+    """
+
+    def __init__(self, reason: Reason, how: str) -> None:
+        super().__init__(how)
+        self.reason = reason
+        self.how = how
+
+
+class RaisedThereError(Exception):
+    """The work raised an error.
+
+    Attributes:
+        kind: name of the error's class.
+        message: what it says.
+    """
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(f"{kind}: {message}")
+        self.kind = kind
+        self.message = message
+
+
+class Answer(NamedTuple):
+    """What the work has found.
+
+    Attributes:
+        found: what JSON can say.
+        arrays: and the numbers.
+    """
+
+    found: Any
+    arrays: Sequence[NDArray[Any]]
+
+
+@dataclass(slots=True)
+class _Running:
+    process: subprocess.Popen[bytes]
+    requests: int
+    replies: int
+
+
+class ConfinedProcess:
+    """Calls functions in a process of its own, one at a time; it is begun at need, and anew after a loss.
+
+    Calls of several threads wait for each other. It ends with `close`, or with this process.
+    """
+
+    def __init__(self) -> None:
+        self._lock = RLock()
+        self._running: _Running | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def call(self, function: str, arguments: Mapping[str, Any], *, memory_bytes: int, cpu_s: float) -> Answer:
+        """Call a function there.
+
+        Args:
+            function: ``module:name``; it returns what JSON can say and a sequence of arrays without objects.
+            arguments: of it, as JSON can say them.
+            memory_bytes: what it may take beyond what the process has, in address space.
+            cpu_s: processor time that it may take.
+
+        Raises:
+            ConfinedError: it took more than that, or crashed.
+            RaisedThereError: it raised an error.
+        """
+        request = {
+            "function": function,
+            "arguments": dict(arguments),
+            "memory_bytes": memory_bytes,
+            "cpu_s": cpu_s,
+        }
+        with self._lock:
+            running = self._running = self._running or _begin()
+            until = time.monotonic() + _WALL_BASE_S + _WALL_PER_CPU * cpu_s
+            try:
+                return _ask(running, request, memory_bytes, until)
+            except RaisedThereError as error:
+                if error.kind != "MemoryError":
+                    raise
+                self._kill()  # some of the memory may not have come back
+                raise ConfinedError("memory", "it takes more memory than it may") from None
+            except BaseException:
+                # Whatever it would still say belongs to no question any more.
+                self._kill()
+                raise
+
+    def close(self) -> None:
+        """End the process."""
+        with self._lock:
+            if self._running is None:
+                return
+            os.close(self._running.requests)
+            self._running.requests = -1
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._running.process.wait(_END_S)
+            self._kill()
+
+    def _kill(self) -> None:
+        if self._running is None:
+            return
+        running, self._running = self._running, None
+        running.process.kill()
+        running.process.wait()
+        os.close(running.replies)
+        if running.requests >= 0:
+            os.close(running.requests)
+
+
+def _begin() -> _Running:
+    """Begin the process: this interpreter and its modules, none of the working directory."""
+    code = f"import sys; sys.path[:] = {sys.path!r}; from daqsvc.confined.child import serve; serve()"
+    request_in, request_out = os.pipe()
+    reply_in, reply_out = os.pipe()
+    try:
+        process = subprocess.Popen(  # noqa: S603 - this interpreter and our own code
+            [sys.executable, "-I", "-c", code],
+            stdin=request_in,
+            stdout=reply_out,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **_ENVIRONMENT},
+        )
+    except BaseException:
+        os.close(request_out)
+        os.close(reply_in)
+        raise
+    finally:
+        os.close(request_in)
+        os.close(reply_out)
+    return _Running(process, request_out, reply_in)
+
+
+def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float) -> Answer:
+    try:
+        rest = json.dumps(request).encode() + b"\n"
+        while rest:
+            rest = rest[os.write(running.requests, rest) :]
+    except BrokenPipeError:
+        raise _lost(running) from None
+    (length,) = LENGTH.unpack(_take(running, bytearray(LENGTH.size), until))
+    if length > _LONGEST_HEADER:
+        raise ConfinedError("crash", "its reader answered without sense")
+    header = json.loads(bytes(_take(running, bytearray(length), until)))
+    if "raised" in header:
+        raise RaisedThereError(header["raised"], header["message"])
+    kinds = [(np.dtype(kind), tuple(shape)) for kind, shape in header["arrays"]]
+    if sum(kind.itemsize * float(np.prod(shape, dtype=np.float64)) for kind, shape in kinds) > memory_bytes:
+        raise ConfinedError("memory", "what it holds takes more memory than it may")
+    arrays = [np.empty(shape, kind) for kind, shape in kinds]
+    for array in arrays:
+        if array.size:
+            _take(running, array.reshape(-1).view(np.uint8).data, until)
+    return Answer(header["found"], arrays)
+
+
+def _take(running: _Running, into: bytearray | memoryview, until: float) -> bytearray | memoryview:
+    """Fill a buffer with what the process says.
+
+    Raises:
+        ConfinedError: it has ended, or says nothing.
+    """
+    left = memoryview(into)
+    poll = select.poll()
+    poll.register(running.replies, select.POLLIN)
+    while left:
+        if not poll.poll(max(0.0, until - time.monotonic()) * 1e3):
+            raise ConfinedError("time", "its reader is stuck")
+        count = os.readv(running.replies, [left])
+        if not count:
+            raise _lost(running)
+        left = left[count:]
+    return into
+
+
+def _lost(running: _Running) -> ConfinedError:
+    try:
+        code = running.process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        return ConfinedError("crash", "its reader closed its output")
+    if code == -signal.SIGXCPU:
+        return ConfinedError("time", "it takes more processor time than it may")
+    if code < 0:
+        return ConfinedError("crash", f"its reader was ended by {_signal_name(-code)}")
+    return ConfinedError("crash", f"its reader ended with exit code {code}")
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+shared = ConfinedProcess()
+"""The one that reads the recordings of a command; a service has one for each file, which ends with it."""
+
+atexit.register(shared.close)

@@ -1,0 +1,226 @@
+"""How the first lines of a text table say that it is laid out: delimiter, decimal point, preamble, header."""
+
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daqsvc.recording.contents import check_columns, column_names
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+DELIMITERS = ("\t", ";", "|", ",", " ")
+"""Between the columns, tried in this order (a comma may also be a decimal point)."""
+
+SNIFFED_LINES = 120
+"""Lines that the layout is found by; a preamble is shorter."""
+
+_TABLE_LINES = 20
+"""Of these, those that show a table which begins with the file."""
+
+_LEAST_TABLE_LINES = 2
+"""Rows of samples that show a table behind a preamble."""
+
+UNIT = re.compile(
+    r"(?i)[\[(]?\s*(?:|-+|%|s|sec|ms|us|µs|μs|ns|h|min|date|time|V|mV|uV|µV|A|mA|g|mg|m/s2|m/s²|m/s\^2|mm/s|m/s|in/s|"
+    r"m|mm|um|µm|μm|mil|mils|Hz|kHz|rpm|1/min|U/min|°|deg|rad|°C|C|degC|K|N|kN|Nm|Pa|kPa|MPa|bar|W|kW)\s*[\])]?"
+)
+"""What stands in a line of units."""
+
+STATED = re.compile(
+    r"""["\s]*(?P<name>[A-Za-z][\w .-]*?)\s*(?:[\[(]\s*(?P<in_name>k?Hz|S/s)\s*[\])])?["\s]*[:=;,\t|]["\s]*"""
+    r"""(?P<number>[-+]?\d[\d.,]*(?:[eE][-+]?\d+)?)\s*(?P<unit>k?Hz|S/s)?["\s;,\t|]*""",
+    re.IGNORECASE,
+)
+"""A number in a preamble, e.g. ``Sampling rate [Hz];25600`` or ``Sample Rate: 25.6 kHz``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a table is laid out.
+
+    Attributes:
+        delimiter: between the columns; None where there is only one.
+        decimal_comma: whether a comma is the decimal point.
+        lines_before: lines before the first one of samples, without comments and blanks.
+        has_header: whether they name the columns.
+        names: of the columns.
+        numeric: numbers of those that hold numbers.
+        scalars: numbers that the preamble states.
+    """
+
+    delimiter: str | None
+    decimal_comma: bool
+    lines_before: int
+    has_header: bool
+    names: Sequence[str]
+    numeric: Sequence[int]
+    scalars: Mapping[str, float]
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return len(self.names)
+
+    def split(self, line: str) -> list[str]:
+        """The cells of a line, without quotes."""
+        return split(line, self.delimiter)
+
+    def is_number(self, cell: str) -> bool:
+        """Whether a cell is a number."""
+        return is_number(cell, decimal_comma=self.decimal_comma)
+
+
+def layout_of(lines: Sequence[str]) -> Layout:
+    """How a table is laid out.
+
+    Args:
+        lines: the first `SNIFFED_LINES` of the file, or all if there are fewer; no comments, no blanks.
+
+    Raises:
+        TooLargeError: it has more columns than a recording may have.
+    """
+    plain, fits = _from_the_first_line(lines)
+    behind = None if fits else _behind_a_preamble(lines)
+    return behind or plain
+
+
+def _from_the_first_line(lines: Sequence[str]) -> tuple[Layout, bool]:
+    """The layout of a table that begins with the file, and whether the lines fit it."""
+    top = lines[:_TABLE_LINES]
+    delimiter, decimal_comma = _sniff(top)
+    rows = [split(line, delimiter) for line in top]
+    last = rows[-1]
+    check_columns(len(last))
+    # Loggers that end each line with a delimiter have no column after it.
+    width = len(last) - (len(last) > 1 and not any(row[len(last) - 1 :] != [""] for row in rows))
+    numbers = [[is_number(cell, decimal_comma=decimal_comma) for cell in row[:width]] for row in rows]
+    header_lines = _header_lines(numbers)
+    has_samples = header_lines < len(rows)
+    numeric = [i for i in range(width) if has_samples and (numbers[-1][i] or not last[i])]
+    header = rows[0] if header_lines else []
+    names = column_names([*header[:width], *[""] * (width - len(header))])
+    layout = Layout(delimiter, decimal_comma, header_lines, header_lines > 0, names, numeric, {})
+    body = [split(line, delimiter) for line in lines[header_lines:]]
+    fits = not has_samples or (bool(numeric) and all(_is_row(row, layout) for row in body))
+    return layout, fits
+
+
+def _is_row(row: Sequence[str], layout: Layout) -> bool:
+    return len(row) >= layout.width and all(not row[i] or layout.is_number(row[i]) for i in layout.numeric)
+
+
+def _behind_a_preamble(lines: Sequence[str]) -> Layout | None:
+    """The layout of a table behind lines about it, as loggers write them; None if there is none."""
+    for delimiter in (*DELIMITERS, None):
+        rows = [split(line, delimiter) for line in lines]
+        last = rows[-1]
+        check_columns(len(last))
+        if delimiter is not None and len(last) < 2:
+            continue
+        decimal_comma = _has_decimal_comma(last, delimiter)
+        numeric = [i for i, cell in enumerate(last) if is_number(cell, decimal_comma=decimal_comma)]
+        if not numeric:
+            continue
+        width = len(last) - (len(last) > 1 and all(row[-1] == "" for row in rows if len(row) == len(last)))
+        table = Layout(delimiter, decimal_comma, 0, False, [""] * width, numeric, {})
+        first = len(rows)
+        while first and len(rows[first - 1]) == len(last) and _is_row(rows[first - 1], table):
+            first -= 1
+        if len(rows) - first < _LEAST_TABLE_LINES:
+            continue
+        if any(_is_like(row, table) for row in rows[:first]):
+            return None
+        header = _header_above(rows, first, width)
+        names = column_names(rows[header][:width] if header is not None else [""] * width)
+        about = lines[: first if header is None else header]
+        return Layout(
+            delimiter, decimal_comma, first, header is not None, names, numeric, _stated(about, decimal_comma)
+        )
+    return None
+
+
+def _is_like(row: Sequence[str], table: Layout) -> bool:
+    """Whether a line is rather a damaged row of samples than one about them."""
+    if len(row) < table.width:
+        return False
+    numbers = [table.is_number(row[i]) for i in table.numeric]
+    return numbers[0] if table.numeric[0] == 0 else sum(numbers) * 2 >= len(numbers)
+
+
+def _header_above(rows: Sequence[Sequence[str]], first: int, width: int) -> int | None:
+    """Which line names the columns of samples that begin at a line: the one above, or above the units."""
+    if not first or len(rows[first - 1]) < width:
+        return None
+    above = first - 1
+    is_units = all(UNIT.fullmatch(cell) for cell in rows[above][:width])
+    if is_units and above and len(rows[above - 1]) >= width and all(rows[above - 1][:width]):
+        return above - 1
+    return above
+
+
+def _stated(lines: Sequence[str], decimal_comma: bool) -> dict[str, float]:  # noqa: FBT001
+    """Numbers that lines of a preamble state, by their names in small letters with ``_`` for blanks."""
+    found: dict[str, float] = {}
+    for line in lines:
+        stated = STATED.fullmatch(line.strip())
+        if stated is None or not is_number(stated["number"], decimal_comma=decimal_comma):
+            continue
+        number = float(stated["number"].replace(",", ".") if decimal_comma else stated["number"])
+        unit = stated["unit"] or stated["in_name"] or ""
+        name = re.sub(r"[\s.-]+", "_", stated["name"].strip().lower())
+        found.setdefault(name, number * (1e3 if unit.lower() == "khz" else 1.0))
+    return found
+
+
+def _header_lines(numbers: Sequence[Sequence[bool]]) -> int:
+    """How many of the first lines are a header, by which cells are numbers."""
+    if len(numbers) == 1:
+        return int(not any(numbers[0]))
+    if not any(numbers[-1]):
+        return 0
+    wordy = [not any(row) for row in numbers[:3]]
+    if wordy[0] and wordy[1]:
+        return 2
+    return int(any(later and not number for number, later in zip(numbers[0], numbers[1], strict=False)))
+
+
+def _sniff(lines: Sequence[str]) -> tuple[str | None, bool]:
+    """Delimiter of the columns (None where there is only one), and whether commas are decimal points."""
+    for delimiter in DELIMITERS:
+        rows = [split(line, delimiter) for line in lines]
+        # The first line may be longer: some loggers append totals to it.
+        if len(rows[-1]) < 2 or len({len(row) for row in rows[1:]}) > 1:
+            continue
+        decimal_comma = _has_decimal_comma(rows[-1], delimiter)
+        if any(is_number(cell, decimal_comma=decimal_comma) for cell in rows[-1]):
+            return delimiter, decimal_comma
+    return None, False
+
+
+def _has_decimal_comma(row: Sequence[str], delimiter: str | None) -> bool:
+    return delimiter not in {None, ","} and any(
+        "," in cell and is_number(cell, decimal_comma=True) for cell in row
+    )
+
+
+def split(line: str, delimiter: str | None) -> list[str]:
+    """The cells of a line, without quotes."""
+    if delimiter is None:
+        return [line.strip().strip('"')]
+    if delimiter == " ":
+        return [cell.strip('"') for cell in line.split()]
+    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    return [cell.strip() for cell in cells]
+
+
+def is_number(cell: str, *, decimal_comma: bool = False) -> bool:
+    """Whether a cell is a number."""
+    try:
+        float(cell.replace(",", ".") if decimal_comma else cell)
+    except ValueError:
+        return False
+    return True

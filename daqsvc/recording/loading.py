@@ -1,0 +1,142 @@
+"""What is done with a file where it is read: in a process of its own, as it may be damaged or hostile.
+
+`daqsvc.recording.recording` calls these there.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from daqsvc.confined.limits import Limits
+from daqsvc.recording.contents import NUMERIC
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.formats import read
+from daqsvc.recording.rate import time_column, timing_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from daqsvc.recording.contents import Contents
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+
+def load(
+    path: str, channels: Mapping[str, str] | None, rate_hz: float | None, memory_bytes: int
+) -> tuple[dict[str, Any], tuple[Floats]]:
+    """Read channels; arguments as of `daqsvc.recording.recording.load_recording`.
+
+    Returns:
+        The fields of a `daqsvc.recording.recording.Recording` but its samples and source; and the samples.
+
+    Raises:
+        RecordingError: see there.
+    """
+    file = Path(path)
+    contents = read(file, Limits(memory_bytes))
+    left_out: dict[str, int] = {}
+    if not channels:
+        channels, left_out = _longest(file, contents)
+    columns = {name: _channel(file, contents, variable) for name, variable in channels.items()}
+    length = _common_length(file, columns, channels)
+    timing = timing_of(file, contents, length, rate_hz)
+    about = {
+        "names": list(columns),
+        "rate_hz": timing.rate_hz,
+        "left_out": left_out,
+        "rate_source": timing.source,
+        "scalars": contents.scalars(),
+        "texts": contents.texts(),
+    }
+    del contents
+    samples = _together(columns, length, timing.rows)
+    about["nan_count"], about["infinity_count"] = _count_bad(samples)
+    return about, (samples,)
+
+
+def channels_of(path: str, memory_bytes: int) -> tuple[dict[str, int], tuple[()]]:
+    """See `daqsvc.recording.recording.list_channels`.
+
+    Raises:
+        RecordingError: see there.
+    """
+    vectors = read(Path(path), Limits(memory_bytes)).vectors()
+    return {name: len(values) for name, values in vectors.items() if len(values) > 1}, ()
+
+
+def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, int]]:
+    """Channels as long as the longest under their own names, and the lengths of the others."""
+    lengths = {name: len(values) for name, values in contents.vectors().items() if len(values) > 1}
+    longest = max(lengths.values(), default=0)
+    time = time_column(contents, longest)
+    channels = {name: name for name, length in lengths.items() if length == longest and name != time}
+    if not channels:
+        numeric = any(values.dtype.kind in NUMERIC for values in contents.entries.values())
+        why = "is too short: no channel has two samples" if numeric else "holds no numeric channel"
+        if time is not None:
+            why = f"holds no channel beside its time column {time!r}"
+        raise RecordingError(f"{path} {why}; it holds {contents.listing()}")
+    return channels, {name: length for name, length in lengths.items() if length < longest}
+
+
+def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generic]:
+    entries = contents.entries
+    if (
+        contents.is_table
+        and variable not in entries
+        and variable.isascii()
+        and variable.isdecimal()
+        and len(variable) < 9
+        and int(variable) < len(entries)
+    ):
+        variable = list(entries)[int(variable)]
+    holds = f"it holds {contents.listing()}"
+    if variable not in entries:
+        raise RecordingError(f"{path} has no channel {variable!r}; {holds}")
+    values = entries[variable]
+    if values.dtype.kind not in NUMERIC:
+        raise RecordingError(f"{variable!r} of {path} is not numeric; {holds}")
+    if values.ndim != 1 or not len(values):
+        what = {0: "a single number", 1: "empty"}.get(values.ndim, f"{values.ndim}-dimensional")
+        raise RecordingError(f"{variable!r} of {path} is {what}, not a channel; {holds}")
+    return values
+
+
+def _common_length(
+    path: Path, columns: Mapping[str, NDArray[np.generic]], channels: Mapping[str, str]
+) -> int:
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        stated = ", ".join(f"{name} ({channels[name]}) {length}" for name, length in lengths.items())
+        raise RecordingError(
+            f"the channels of {path} have different lengths: {stated}; map only channels taken together"
+        )
+    length = next(iter(lengths.values()))
+    if length < 2:
+        raise RecordingError(f"{path} is too short: it holds one sample a channel; give a longer recording")
+    return length
+
+
+def _together(columns: dict[str, NDArray[np.generic]], length: int, rows: NDArray[np.int64] | None) -> Floats:
+    """The samples float64 ``[n, channels]``; NaN in the rows that no sample has its place in.
+
+    Takes the columns away as it goes, so that they and the samples need not all be held at once.
+    """
+    total = length if rows is None else int(rows[-1]) + 1
+    samples = np.full((total, len(columns)), np.nan)
+    place: slice | NDArray[np.int64] = slice(None) if rows is None else rows
+    for i, name in enumerate(list(columns)):
+        with np.errstate(invalid="ignore"):  # signalling NaN
+            samples[place, i] = columns.pop(name)
+    return samples
+
+
+def _count_bad(samples: Floats) -> tuple[int, int]:
+    """How many samples are NaN, and how many infinite, counted channel by channel to save memory."""
+    nan = sum(int(np.isnan(column).sum()) for column in samples.T)
+    return nan, sum(int(np.isinf(column).sum()) for column in samples.T)

@@ -1,0 +1,174 @@
+"""What unpacks to far too much is refused in one sentence, at little cost, and the others are judged."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import file_bombs
+import numpy as np
+import pytest
+from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, OBJ_HEADER_BASE_STRUCT, BLFWriter
+from orbit_files import OPTIONS, Orbit
+
+from daqsvc.cli import main
+from daqsvc.confined.limits import Limits
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import load_recording, set_limits, shared, stop_reading
+from drivers.base import StreamSpec
+from drivers.replay_can import CanLog
+from drivers.replay_files import ColumnLayout, SampleTable
+from drivers.replay_files import RecordingError as ReplayError
+
+MOST_MB = 400
+"""Of the process that reads, with NumPy, SciPy or Arrow in it."""
+
+
+@pytest.fixture(autouse=True)
+def _fresh_process():
+    """So that its largest size is that of one file."""
+    stop_reading()
+    yield
+    stop_reading()
+    set_limits(Limits())
+
+
+def largest_mb():
+    status = Path(f"/proc/{shared._running.process.pid}/status").read_text()
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1e3
+
+
+@pytest.mark.parametrize("name", file_bombs.BOMBS)
+def test_a_bomb_is_refused(tmp_path, name):
+    path = file_bombs.write(tmp_path, name)
+    with pytest.raises(
+        RecordingError, match=r"is too large: its .* unpacks to .*, 200 times and more"
+    ) as refused:
+        load_recording(path, rate_hz=1000)
+    assert str(refused.value).startswith(str(path))
+    assert largest_mb() < MOST_MB
+
+
+def test_a_header_that_lies_takes_no_memory(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(file_bombs.npz_that_says_too_much())
+    with pytest.raises(RecordingError, match="says that it holds 8000000000000 bytes in"):
+        load_recording(path, rate_hz=1000)
+    assert largest_mb() < MOST_MB
+
+
+def test_memory_is_bounded_where_nothing_says_how_much_is_needed(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("x,y\n" + "1,2\n" * 600_000)
+    set_limits(Limits(12_000_000))
+    with pytest.raises(
+        RecordingError, match=r"more memory than it may; allow more \(--max-memory; it is 0.012 GB"
+    ):
+        load_recording(path, rate_hz=1000)
+    set_limits(Limits())
+    assert load_recording(path, rate_hz=1000).samples.shape == (600_000, 2)
+
+
+def analyze(capsys, *arguments):
+    code = main(["analyze", *map(str, arguments), "--json"])
+    captured = capsys.readouterr()
+    assert not captured.err
+    return code, [json.loads(line) for line in captured.out.splitlines()]
+
+
+def test_a_bomb_among_recordings_costs_its_own_line(tmp_path, capsys):
+    bomb, run = file_bombs.write(tmp_path, "a.npz"), Orbit().save(tmp_path / "run.npz")
+    code, said = analyze(capsys, bomb, run, *OPTIONS)
+    assert code == 3
+    assert ["too large" in (one["refused"] or "") for one in said] == [True, False]
+    assert said[1]["verdict"] == "normal"
+
+
+def test_memory_is_given_on_the_command_line(tmp_path, capsys):
+    run = tmp_path / "run.npz"
+    np.savez(run, **dict.fromkeys("xy", np.random.default_rng(1).normal(size=2_000_000)), fs=1000)
+    code, (said,) = analyze(capsys, run, *OPTIONS, "--max-memory", "0.05")
+    assert code == 3
+    assert "32 MB says that it unpacks to 32 MB, and 25 MB may be read; allow more memory" in said["refused"]
+    with pytest.raises(SystemExit):
+        main(["analyze", str(run), *OPTIONS, "--max-memory", "0.001"])
+    assert "is not a number of GB from 0.05 to 1000" in capsys.readouterr().err
+
+
+COLUMNS = ColumnLayout(channels=("x",), columns=("x",), scale=np.ones(1), offset=np.zeros(1))
+
+
+@pytest.mark.parametrize("name", ["a.npz", "said.npz"])
+def test_a_replayed_table_is_refused_likewise(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(file_bombs.npz() if name == "a.npz" else file_bombs.npz_that_says_too_much())
+    with pytest.raises(
+        ReplayError, match=r"cannot be read as a table of samples: .*says that it (unpacks|holds)"
+    ):
+        SampleTable(path, [StreamSpec("s", COLUMNS, 1000.0)], {})
+
+
+def test_a_replayed_table_may_take_what_the_bus_says(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.zeros(10_000_000))
+    spec = [StreamSpec("s", COLUMNS, 1000.0)]
+    with pytest.raises(ReplayError, match="may be read; allow more memory"):
+        SampleTable(path, spec, {}, Limits(100_000_000))
+    SampleTable(path, spec, {}, Limits(400_000_000)).close()
+
+
+def blf_of_containers(path, unpacked_bytes, count):
+    """A BLF file of containers that hold an object which goes on in the next one."""
+    with BLFWriter(path):
+        pass
+    endless = OBJ_HEADER_BASE_STRUCT.pack(b"LOBJ", OBJ_HEADER_BASE_STRUCT.size, 1, 2**31, 1)
+    packed = zlib.compress(endless + bytes(unpacked_bytes), 9)
+    body = LOG_CONTAINER_STRUCT.pack(2, unpacked_bytes) + packed
+    size = OBJ_HEADER_BASE_STRUCT.size + len(body)
+    header = OBJ_HEADER_BASE_STRUCT.pack(b"LOBJ", OBJ_HEADER_BASE_STRUCT.size, 1, size, LOG_CONTAINER)
+    with path.open("ab") as file:
+        for _ in range(count):
+            file.write(header + body + bytes(size % 4))
+    return path
+
+
+def read_whole(path):
+    log = CanLog(path, lambda *_: pytest.fail("there is no frame"))
+    try:
+        while log.read(10**9) is not None:
+            pass
+    finally:
+        log.close()
+
+
+@pytest.mark.parametrize(("unpacked_bytes", "count"), [(200_000_000, 1), (9_000_000, 20)])
+def test_a_can_log_unpacks_within_bounds(tmp_path, unpacked_bytes, count):
+    path = blf_of_containers(tmp_path / "a.blf", unpacked_bytes, count)
+    assert path.stat().st_size < 2_000_000
+    tracemalloc.start()
+    try:
+        with pytest.raises(ReplayError, match=r"unpacks to more than .*, 200 times and more"):
+            read_whole(path)
+        assert tracemalloc.get_traced_memory()[1] / 1e6 < MOST_MB
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_object_of_a_can_log_may_not_be_of_any_size(tmp_path):
+    path = blf_of_containers(tmp_path / "a.blf", 1000, 1)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"LOBJ")
+    struct.pack_into("<I", content, at + 8, 2**31)
+    path.write_bytes(content)
+    with pytest.raises(ReplayError, match="an object says that it has 2,147,483,632 bytes"):
+        read_whole(path)
+
+
+def test_a_can_log_of_nothing_but_other_lines_is_given_up(tmp_path):
+    path = tmp_path / "a.log.gz"
+    path.write_bytes(file_bombs.text_log_gz())
+    with pytest.raises(ReplayError, match="100,000 lines in a row are no frames"):
+        read_whole(path)
