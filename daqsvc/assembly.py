@@ -101,6 +101,8 @@ def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
 def _gap_check(sensor: Sensor) -> GapCheck | None:
     if not isinstance(sensor, ProximityProbe) or sensor.sensitivity_mv_per_unit is None:
         return None
+    if sensor.gap_ok_v is None:
+        return None
     return GapCheck(sensor.sensitivity_mv_per_unit / 1000.0, sensor.zero_v, *sensor.gap_ok_v)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
-from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
+from daqsvc.settings.section import MOST, DelayS, Kinds, Name, Nats, Quantity, Section, Text
 
 Measure = Literal["rms", "peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
 
@@ -23,13 +23,17 @@ class Setpoints(BaseAlarm):
     """Setpoints on a measure, in its unit (velocity RMS in mm/s)."""
 
     measure: Annotated[Measure, Field(description="what is held against the setpoints", examples=["rms"])]
-    alert: float | None = Field(default=None, description="first setpoint")
-    danger: float | None = Field(default=None, description="second setpoint")
-    alert_low: float | None = Field(default=None, description="first lower setpoint, of what can be too low")
-    danger_low: float | None = Field(default=None, description="second lower setpoint")
-    deadband: NotNegative = Field(default=0.0, description="how far from a setpoint it returns")
-    on_delay_s: NotNegative = Field(default=0.0, description="how long beyond it before it is raised")
-    off_delay_s: NotNegative = Field(default=0.0, description="how long clear of it before it returns")
+    alert: Quantity | None = Field(default=None, description="first setpoint")
+    danger: Quantity | None = Field(default=None, description="second setpoint")
+    alert_low: Quantity | None = Field(
+        default=None, description="first lower setpoint, of what can be too low"
+    )
+    danger_low: Quantity | None = Field(default=None, description="second lower setpoint")
+    deadband: Annotated[float, Field(ge=0, le=MOST)] = Field(
+        default=0.0, description="how far from a setpoint it returns"
+    )
+    on_delay_s: DelayS = Field(default=0.0, description="how long beyond it before it is raised")
+    off_delay_s: DelayS = Field(default=0.0, description="how long clear of it before it returns")
     trip_multiply: Annotated[
         float, Field(ge=1, le=10, description="factor on alert and danger while the machine starts up")
     ] = 1.0
@@ -66,9 +70,17 @@ class VotingAlarm(Setpoints):
 
     sensors: Annotated[
         tuple[Name, ...],
-        Field(strict=False, min_length=2, description="the sensors that vote", examples=[["de-x", "de-y"]]),
+        Field(
+            strict=False,
+            min_length=2,
+            max_length=1000,
+            description="the sensors that vote",
+            examples=[["de-x", "de-y"]],
+        ),
     ]
-    vote: Annotated[int, Field(ge=1, description="how many of them must be at a setpoint", examples=[2])]
+    vote: Annotated[
+        int, Field(ge=1, le=1000, description="how many of them must be at a setpoint", examples=[2])
+    ]
 
     @property
     def watched(self) -> tuple[str, ...]:
@@ -86,7 +98,7 @@ class DiagnosisAlarm(BaseAlarm):
     kind: ClassVar[str] = "an alarm on a detector"
 
     detector: Annotated[Name, Field(description="the detector it follows", examples=["rotor-bank"])]
-    evidence_nats: NotNegative = Field(
+    evidence_nats: Nats = Field(
         default=0.0, description="evidence without which it is not raised, where the detector states it"
     )
 
@@ -106,26 +118,37 @@ Alarm: TypeAlias = Annotated[
 class StartUp(Section):
     """How a start-up is recognised, during which ``trip_multiply`` holds: a range, a rate, or either."""
 
-    detector: Annotated[str, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
-    measure: str = Field(default="speed", description="the signal among its statistics")
-    between: Annotated[tuple[float, float], Field(strict=False)] | None = Field(
+    detector: Annotated[Text, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
+    measure: Text = Field(default="speed", description="the signal among its statistics")
+    between: Annotated[tuple[Quantity, Quantity], Field(strict=False)] | None = Field(
         default=None, description="the signal lies in this range", examples=[[300.0, 2700.0]]
     )
-    change_per_s: Positive | None = Field(default=None, description="the signal changes at least so fast")
-    at_most_s: Positive = Field(default=120.0, description="how long it may last at most")
+    change_per_s: Annotated[float, Field(ge=1e-9, le=MOST)] | None = Field(
+        default=None, description="the signal changes at least so fast"
+    )
+    at_most_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
+        default=120.0, description="how long it may last at most"
+    )
+
+
+AlarmSeconds = Annotated[float, Field(ge=0.1, le=86_400)]
 
 
 class AlarmHandling(Section):
     """What holds for all alarms of the machine."""
 
-    chatter_raises: Annotated[int, Field(ge=0)] = Field(
+    chatter_raises: Annotated[int, Field(ge=0, le=1000)] = Field(
         default=5, description="raises within the window beyond which an alarm chatters; 0: never"
     )
-    chatter_window_s: Positive = Field(default=60.0, description="the window that these are counted over")
-    chatter_quiet_s: Positive = Field(default=60.0, description="how long it must stand still to be quiet")
-    flood_alarms: Annotated[int, Field(ge=0)] = Field(
+    chatter_window_s: AlarmSeconds = Field(default=60.0, description="the window that these are counted over")
+    chatter_quiet_s: AlarmSeconds = Field(
+        default=60.0, description="how long it must stand still to be quiet"
+    )
+    flood_alarms: Annotated[int, Field(ge=0, le=100_000)] = Field(
         default=10, description="alarms within the window beyond which they are a flood; 0: never"
     )
-    flood_window_s: Positive = Field(default=600.0, description="the window that these are counted over")
-    shelve_at_most_s: Positive = Field(default=28_800.0, description="the longest time to shelve an alarm")
+    flood_window_s: AlarmSeconds = Field(default=600.0, description="the window that these are counted over")
+    shelve_at_most_s: Annotated[float, Field(ge=1, le=31_622_400)] = Field(
+        default=28_800.0, description="the longest time to shelve an alarm"
+    )
     start_up: StartUp | None = Field(default=None, description="when trip_multiply holds")

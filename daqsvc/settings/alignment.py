@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from daqsvc.settings.section import Positive, Section
+from daqsvc.settings.section import Section, WaitMs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 class Alignment(Section):
     """Lets a rotor detector take its sensors from several streams, with clocks of their own."""
 
-    max_error_us: Positive = Field(
+    max_error_us: Annotated[float, Field(ge=0.01, le=1_000_000)] = Field(
         default=200.0, description="samples that may be further off the reference's are left out"
     )
-    max_wait_ms: Annotated[Positive, Field(le=60_000)] = Field(
+    max_wait_ms: WaitMs = Field(
         default=1000.0, description="how long after all others a stream may come before the rest goes on"
     )
 

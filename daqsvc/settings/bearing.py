@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - pydantic reads the annotations
 from typing import Annotated
 
 from pydantic import Field
 
-from daqsvc.settings.section import Name, Positive, Section
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import Name, Section, Text
 
 BEARING = "bearing"
 """Name of the bearings' detector."""
@@ -15,29 +15,35 @@ BEARING = "bearing"
 WINDOW_S = 2.5
 """The race test looks at so much at a time; `daqsvc.bearing.race.watch` says why."""
 
-Triple = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+Order = Annotated[float, Field(ge=0.01, le=1000)]
+MassKg = Annotated[float, Field(ge=1e-6, le=1e6)]
+StiffnessNPerM = Annotated[float, Field(ge=1, le=1e13)]
+DampingNsPerM = Annotated[float, Field(ge=1e-6, le=1e9)]
 
 
 class FaultOrders(Section):
     """How often the parts of a bearing meet, per revolution of the shaft."""
 
-    bpfi: Annotated[Positive, Field(description="balls pass a point of the inner race", examples=[5.415])]
-    bpfo: Annotated[Positive, Field(description="balls pass a point of the outer race", examples=[3.585])]
-    bsf: Annotated[Positive, Field(description="a ball turns about itself", examples=[2.357])]
-    ftf: Annotated[Positive, Field(description="the cage turns", examples=[0.398])]
+    bpfi: Annotated[Order, Field(description="balls pass a point of the inner race", examples=[5.415])]
+    bpfo: Annotated[Order, Field(description="balls pass a point of the outer race", examples=[3.585])]
+    bsf: Annotated[Order, Field(description="a ball turns about itself", examples=[2.357])]
+    ftf: Annotated[Order, Field(description="the cage turns", examples=[0.398])]
 
 
 class ThreeMasses(Section):
     """The bearing as a chain of rotor, rolling elements and housing, to ground."""
 
     masses_kg: Annotated[
-        Triple, Field(description="rotor, rolling elements, housing", examples=["[4.0, 0.0185, 2.0]"])
+        tuple[MassKg, MassKg, MassKg],
+        Field(strict=False, description="rotor, rolling elements, housing", examples=["[4.0, 0.0185, 2.0]"]),
     ]
     stiffness_n_per_m: Annotated[
-        Triple, Field(description="shaft, contact, housing", examples=["[2e7, 1e8, 5e7]"])
+        tuple[StiffnessNPerM, StiffnessNPerM, StiffnessNPerM],
+        Field(strict=False, description="shaft, contact, housing", examples=["[2e7, 1e8, 5e7]"]),
     ]
     damping_n_s_per_m: Annotated[
-        Triple, Field(description="shaft, contact, housing", examples=["[200.0, 300.0, 2000.0]"])
+        tuple[DampingNsPerM, DampingNsPerM, DampingNsPerM],
+        Field(strict=False, description="shaft, contact, housing", examples=["[200.0, 300.0, 2000.0]"]),
     ]
     mismatch: Annotated[float, Field(ge=0, le=0.4)] = Field(
         default=0.1, description="share by which each of these figures may be wrong"
@@ -49,7 +55,7 @@ class WatchedBearing(Section):
 
     name: Annotated[Name, Field(description="name of the bearing", examples=["drive-end"])]
     sensor: Annotated[Name, Field(description="the accelerometer on its housing", examples=["accel-de"])]
-    type: Annotated[str, Field(min_length=1)] | None = Field(
+    type: Text | None = Field(
         default=None, description='designation in the catalogue, e.g. "6205-2RS"; or orders'
     )
     orders: FaultOrders | None = Field(default=None, description="its fault orders, in place of type")
@@ -72,6 +78,7 @@ class Bearing(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=64,
             description="the bearings; all of one machine, so that they can be compared",
             examples=['[{ name = "drive-end", sensor = "accel-de", type = "6205-2RS" }]'],
         ),
@@ -79,10 +86,10 @@ class Bearing(Section):
     keyphasor: Name | None = Field(
         default=None, description="what measures the speed; without it, the machine keeps to speed_rpm"
     )
-    calibrate_s: Annotated[Positive, Field(ge=10, le=120)] = Field(
+    calibrate_s: Annotated[float, Field(ge=10, le=120)] = Field(
         default=30.0, description="first seconds, which are the healthy state; kept over restarts"
     )
-    calibration: Annotated[Path, Field(strict=False)] | None = Field(
+    calibration: FilePath | None = Field(
         default=None, description="file with the healthy state, in place of the first seconds"
     )
     false_alarm_probability: Annotated[float, Field(ge=1e-9, le=0.1)] = Field(

@@ -9,6 +9,8 @@ from urllib.parse import SplitResult, urlsplit
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.section import Text
+
 _HOST = re.compile(r"[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 _LONGEST_HOST = 254
 """Letters, with the dot at the end that a name may have."""
@@ -67,7 +69,7 @@ def _broker_url(url: str) -> str:
     return url
 
 
-BrokerUrl: TypeAlias = Annotated[str, AfterValidator(_broker_url)]
+BrokerUrl: TypeAlias = Annotated[Text, AfterValidator(_broker_url)]
 """``mqtts://host:port``, or ``mqtt://`` without TLS; no credentials, no path."""
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import KeyPath
 
 DRIVERS = "daqsvc.drivers"
 """The group of entry points that drivers are registered in."""
@@ -51,3 +52,51 @@ def check_interfaces(draft: MachineFile) -> Iterator[Finding]:
                     "mean nothing to SocketCAN",
                     f"remove {', '.join(bus.options)}; set the interface up by `ip link set {bus.channel}`",
                 )
+
+
+def check_can_owners(draft: MachineFile) -> Iterator[Finding]:
+    """No interface belongs to two buses: each would take the other's frames for foreign ones."""
+    owners: dict[tuple[str, str], str] = {}
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if not isinstance(bus, CanBus):
+                continue
+            owner = owners.setdefault((bus.interface, bus.channel), name)
+            if owner != name:
+                yield Finding(
+                    ("buses", name, "channel"),
+                    f'belongs to bus "{owner}" already',
+                    "put all streams of the interface on one bus, or correct the channel",
+                )
+
+
+def check_can_keys(draft: MachineFile) -> Iterator[Finding]:
+    """What is said of a CAN bus has an effect, and goes together."""
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if not isinstance(bus, CanBus):
+                continue
+            at: KeyPath = ("buses", name)
+            if bus.data_bitrate is not None and not bus.fd:
+                yield Finding(
+                    (*at, "data_bitrate"),
+                    "has no effect on classic CAN",
+                    "write fd = true if CAN FD frames are on the bus, or remove it",
+                    fatal=False,
+                )
+            elif bus.data_bitrate is not None and bus.bitrate is not None and bus.data_bitrate < bus.bitrate:
+                yield Finding(
+                    (*at, "data_bitrate"),
+                    f"is less than bitrate = {bus.bitrate:,}, and the data of CAN FD never go slower",
+                    "swap the two, or correct one of them",
+                )
+            if bus.interface == "socketcan":
+                continue
+            for key in ("filter", "receive_buffer_bytes"):
+                if key in bus.model_fields_set:
+                    yield Finding(
+                        (*at, key),
+                        f'has no effect with interface "{bus.interface}", only with SocketCAN',
+                        "remove it",
+                        fatal=False,
+                    )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping  # noqa: TC003 - keeps the signature of `_bus_kind` resolvable
-from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.modbus import (
     WAYS,
     FifoLayout,
@@ -27,7 +27,7 @@ from daqsvc.settings.packing import (
     ValidRaw,
 )
 from daqsvc.settings.replay import ReplayBus, TableLayout
-from daqsvc.settings.section import Kinds, Name, NotNegative, Positive, Section
+from daqsvc.settings.section import MOST_CHANNELS, Kinds, Name, Section, Text
 from daqsvc.settings.serial import FRAMINGS, CobsBus, LineLayout, LinesBus, SerialLayout, SyncBus
 
 CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -51,9 +51,8 @@ class CanRecord(Section):
     """Files that every frame received on a CAN bus is recorded in."""
 
     folder: Annotated[
-        Path,
+        FilePath,
         Field(
-            strict=False,
             description="holds the files, relative to the machine file; must be there",
             examples=["/var/lib/daqsvc/can"],
         ),
@@ -73,15 +72,11 @@ class CanBus(Section):
     kind: ClassVar[str] = "a CAN bus"
 
     driver: Annotated[Literal["can"], Field(description="which driver reads the bus", examples=["can"])]
-    interface: Annotated[
-        str, Field(min_length=1, description="the python-can interface", examples=["socketcan"])
-    ]
-    channel: Annotated[
-        str, Field(min_length=1, description="the channel of that interface", examples=["can0"])
-    ]
+    interface: Annotated[Text, Field(description="the python-can interface", examples=["socketcan"])]
+    channel: Annotated[Text, Field(description="the channel of that interface", examples=["can0"])]
     fd: Annotated[bool, Field(description="whether CAN FD frames are on the bus", examples=[True])] = False
-    bitrate: Annotated[int, Field(gt=0, le=1_000_000, description="bit/s")] | None = None
-    data_bitrate: Annotated[int, Field(gt=0, le=20_000_000, description="bit/s of FD data")] | None = None
+    bitrate: Annotated[int, Field(ge=1000, le=1_000_000, description="bit/s")] | None = None
+    data_bitrate: Annotated[int, Field(ge=1000, le=20_000_000, description="bit/s of FD data")] | None = None
     options: dict[str, Any] = Field(
         default={}, description="handed to python-can as they are; none with SocketCAN"
     )
@@ -141,6 +136,7 @@ class PlainLayout(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
         ),
@@ -165,7 +161,7 @@ class PlainLayout(Section):
 class DbcCounter(Section):
     """The running count, as a signal of the DBC message."""
 
-    signal: Annotated[str, Field(min_length=1, description="the counter's signal", examples=["Sequence"])]
+    signal: Annotated[Text, Field(description="the counter's signal", examples=["Sequence"])]
     counts: Annotated[
         Counts,
         Field(description="what it counts; of samples, the first one in the frame", examples=["frames"]),
@@ -177,10 +173,11 @@ class DbcChannel(Section):
 
     name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
     signals: Annotated[
-        tuple[str, ...],
+        tuple[Text, ...],
         Field(
             strict=False,
             min_length=1,
+            max_length=512,
             description="signals that hold its samples, oldest first",
             examples=['["AccelX"]'],
         ),
@@ -193,10 +190,10 @@ class DbcLayout(Section):
 
     kind: ClassVar[str] = "a layout from a DBC file"
 
-    dbc: Annotated[Path, Field(strict=False, description="the DBC file, relative to the machine file")]
+    dbc: Annotated[FilePath, Field(description="the DBC file, relative to the machine file")]
     message: Annotated[
-        str,
-        Field(min_length=1, description="the message that carries the samples", examples=["Acceleration"]),
+        Text,
+        Field(description="the message that carries the samples", examples=["Acceleration"]),
     ]
     counter: (
         Annotated[
@@ -211,6 +208,7 @@ class DbcLayout(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x", signals = ["AccelX"] }]'],
         ),
@@ -288,9 +286,10 @@ class Stream(Section):
 
     bus: Annotated[Name, Field(description="the bus it comes over", examples=["can0"])]
     rate_hz: Annotated[
-        Positive, Field(le=10_000_000, description="samples per second and channel", examples=[640.0])
+        float,
+        Field(ge=1e-4, le=10_000_000, description="samples per second and channel", examples=[640.0]),
     ]
-    reorder_window_ms: Annotated[NotNegative, Field(le=1000)] = Field(
+    reorder_window_ms: Annotated[float, Field(ge=0, le=1000)] = Field(
         default=10.0, description="how long a gap may wait for a late frame"
     )
     latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)] = Field(

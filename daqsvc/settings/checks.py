@@ -14,30 +14,38 @@ from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.broker_url import is_tls
-from daqsvc.settings.bus_checks import check_drivers, check_interfaces
+from daqsvc.settings.bus_checks import check_can_keys, check_can_owners, check_drivers, check_interfaces
 from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.layout_checks import (
     check_bus_load,
     check_channel_use,
     check_channels,
     check_counter,
-    check_dbc_unit,
     check_frame_length,
     check_ids,
     check_plain_layout,
     check_sensor_channel,
     check_stream_bus,
-    check_voltages,
     unique,
 )
+from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.modbus import RegistersLayout
 from daqsvc.settings.modbus_checks import check_modbus
+from daqsvc.settings.modbus_overlaps import check_writes_and_samples
 from daqsvc.settings.mqtt_files import credential_files
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.record_checks import check_recorded_buses
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
 from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.sensor_checks import (
+    check_alarm_reach,
+    check_dbc_unit,
+    check_probe_angles,
+    check_reach,
+    check_sensitivity,
+    check_voltages,
+)
 from daqsvc.settings.serial_checks import check_serial, check_serial_ports
 
 if TYPE_CHECKING:
@@ -47,6 +55,8 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
     from daqsvc.settings.problems import KeyPath
 
+_MOST_FINDINGS = 200
+"""Whoever has mended these may ask again."""
 _RING_WINDOWS = 2
 _LEAST_WINDOW_SAMPLES = 16
 _WAVEFORMS = ("proximity", "accelerometer", "velocity")
@@ -64,7 +74,9 @@ def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Findin
     for found in _checks(draft, messages):
         with suppress(UnusableValueError):
             for finding in found:
-                findings.append(finding)  # noqa: PERF402 - extend would lose those before an unusable value
+                findings.append(finding)
+                if len(findings) >= _MOST_FINDINGS:
+                    return findings
     return findings
 
 
@@ -88,17 +100,15 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield _unused_buses(draft)
     yield check_drivers(draft)
     yield check_interfaces(draft)
+    yield check_can_owners(draft)
+    yield check_can_keys(draft)
     yield check_serial_ports(draft)
     yield check_replay_buses(draft)
     yield check_recorded_buses(draft)
-    with suppress(UnusableValueError):
-        for index, sensor in enumerate(draft.sensors):
-            at = ("sensors", index)
-            yield check_sensor_channel(draft, sensor, at)
-            yield check_voltages(sensor, at)
-            yield check_dbc_unit(draft, sensor, messages, at)
+    yield from _sensor_checks(draft, messages)
+    yield check_memory(draft)
     yield _names(draft)
-    yield check_channel_use(draft)
+    yield check_writes_and_samples(draft)
     with suppress(UnusableValueError):
         if draft.pipeline.levels is not None:
             yield _window(draft)
@@ -114,6 +124,21 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield credential_files(draft)
             yield _sparkplug(draft, draft.mqtt)
             yield _open_to_commands(draft.mqtt)
+
+
+def _sensor_checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Iterator[Finding]]:
+    """Every check of the sensors, and of what their channels can carry."""
+    with suppress(UnusableValueError):
+        for index, sensor in enumerate(draft.sensors):
+            at: KeyPath = ("sensors", index)
+            yield check_sensor_channel(draft, sensor, at)
+            yield check_voltages(draft, sensor, at)
+            yield check_sensitivity(sensor, at)
+            yield check_reach(draft, sensor, messages, at)
+            yield check_dbc_unit(draft, sensor, messages, at)
+    yield check_channel_use(draft)
+    yield check_probe_angles(draft)
+    yield check_alarm_reach(draft, messages)
 
 
 def _names(draft: MachineFile) -> Iterator[Finding]:

@@ -5,16 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
+from daqsvc.settings.packing import LARGEST_SCALE, LEAST_SCALE
 from daqsvc.settings.problems import Finding, choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from cantools.database.can import Message
+    from cantools.database.can import Database, Message
+    from cantools.database.can.signal import Signal
 
     from daqsvc.settings.buses import DbcLayout
     from daqsvc.settings.problems import KeyPath
+
+
+MOST_DBC_BYTES = 4 << 20
+"""A larger DBC file describes more messages than a car has; reading it takes minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +34,7 @@ class DbcMessage:
         length: payload bytes.
         signal_bits: width of each signal in bits, by name.
         signal_units: unit of each signal, by name; empty if the DBC gives none.
+        signal_ranges: least and largest value that each signal can carry, in its unit; none of a float.
         any_priority: whether it is one of SAE J1939, whatever the priority in its id.
         pages: which values of which multiplexers the frames have that hold the layout's signals.
     """
@@ -36,6 +44,7 @@ class DbcMessage:
     length: int
     signal_bits: Mapping[str, int]
     signal_units: Mapping[str, str]
+    signal_ranges: Mapping[str, tuple[float, float]]
     any_priority: bool
     pages: Mapping[str, frozenset[int]]
 
@@ -51,38 +60,9 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
     Returns:
         The message, or None if it cannot be had; and what is wrong.
     """
-    try:
-        from cantools.database import can, load_file  # noqa: PLC0415 - an extra, and slow to import
-        from cantools.database.errors import Error  # noqa: PLC0415
-    except ImportError:
-        return None, [
-            Finding((*at, "dbc"), "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'")
-        ]
-    if not file.is_file():
-        return None, [
-            Finding(
-                (*at, "dbc"),
-                f"there is no file {file}",
-                "correct the path; a relative one starts at the directory of the machine file",
-            )
-        ]
-    try:
-        database = load_file(file)
-    except (OSError, UnicodeError, ValueError, Error) as error:
-        reason = " ".join(str(error).split())
-        return None, [
-            Finding(
-                (*at, "dbc"),
-                f"{file} cannot be read as a DBC file: {reason}",
-                "open it in the tool it came from and export it as DBC again",
-            )
-        ]
-    if not isinstance(database, can.Database):
-        return None, [
-            Finding(
-                (*at, "dbc"), f"{file} describes no CAN messages", "give a DBC file, not a diagnostics one"
-            )
-        ]
+    database = _database(file, at)
+    if isinstance(database, Finding):
+        return None, [database]
     messages = {message.name: message for message in database.messages}
     if layout.message not in messages:
         return None, [
@@ -95,10 +75,50 @@ def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | 
         length=message.length,
         signal_bits={signal.name: signal.length for signal in message.signals},
         signal_units={signal.name: signal.unit or "" for signal in message.signals},
+        signal_ranges={signal.name: _range(signal) for signal in message.signals if not signal.is_float},
         any_priority=message.protocol == "j1939",
         pages=_pages(message, [name for _, name in _asked(layout, at)]),
     )
     return facts, list(_signal_findings(layout, message, at))
+
+
+def _database(file: Path, at: KeyPath) -> Database | Finding:
+    """What the DBC file describes, or why it cannot be had."""
+    here = (*at, "dbc")
+    try:
+        from cantools.database import can, load_string  # noqa: PLC0415 - an extra, and slow to import
+    except ImportError:
+        return Finding(here, "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'")
+    try:
+        data = read_bounded(file, MOST_DBC_BYTES)
+    except UnreadableFileError as error:
+        remedy = error.remedy
+        if isinstance(error.__cause__, FileNotFoundError):
+            return Finding(
+                here,
+                f"there is no file {file}",
+                "correct the path; a relative one starts at the directory of the machine file",
+            )
+        return Finding(here, f"{file} {error}", remedy)
+    again = "open it in the tool it came from and export it as DBC again"
+    try:
+        database = load_string(data.decode("cp1252", "replace"), "dbc")
+    except Exception as error:  # noqa: BLE001 - the parser raises what it likes: of lookups, numbers, recursion
+        reason = shortened(" ".join(str(error).split()) or type(error).__name__, 200)
+        return Finding(here, f"{file} cannot be read as a DBC file: {reason}", again)
+    if not isinstance(database, can.Database):
+        return Finding(here, f"{file} describes no CAN messages", again)
+    return database
+
+
+def _range(signal: Signal) -> tuple[float, float]:
+    """What the raw bits can carry, in the unit of the signal."""
+    bits = signal.length
+    least, largest = (
+        (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1) if signal.is_signed else (0.0, 2.0**bits - 1)
+    )
+    ends = [float(raw * float(signal.scale) + float(signal.offset)) for raw in (least, largest)]
+    return min(ends), max(ends)
 
 
 def _asked(layout: DbcLayout, at: KeyPath) -> list[tuple[KeyPath, str]]:
@@ -147,8 +167,15 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             "is signed or a float; a counter runs from 0 upwards and wraps",
             "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
         )
+    elif counter is not None and counter.scale != 1:
+        yield Finding(
+            (*at, "counter", "signal"),
+            f"has the scale {counter.scale:g} in the DBC file: the raw value is counted, and one count of it "
+            "would then be something else than a frame or a sample",
+            "name a signal that grows by 1; if this one does, write (1,0) in the DBC file",
+        )
     elif counter is not None and counter.maximum is not None:
-        largest, all_ones = (counter.maximum - counter.offset) / counter.scale, 2**counter.length - 1
+        largest, all_ones = float(counter.maximum) - float(counter.offset), 2**counter.length - 1
         if largest != all_ones:
             yield Finding(
                 (*at, "counter", "signal"),
@@ -158,3 +185,34 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
                 "else correct the range in the DBC file",
                 fatal=False,
             )
+    for path, name in asked:
+        signal = signals.get(name)
+        if signal is not None and path[-2] == "signals":
+            yield from _scale(signal, path)
+
+
+def _scale(signal: Signal, at: KeyPath) -> Iterator[Finding]:
+    """Samples can be told apart, and are numbers."""
+    scale, offset = float(signal.scale), float(signal.offset)
+    if scale == 0:
+        yield Finding(
+            at,
+            "has the scale 0 in the DBC file, which would make every sample the same",
+            "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+        )
+    elif not LEAST_SCALE <= abs(scale) <= LARGEST_SCALE or not abs(offset) <= LARGEST_SCALE:
+        yield Finding(
+            at,
+            f"has the scale {scale:g} and the offset {offset:g} in the DBC file, which no quantity has",
+            "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+        )
+    if signal.is_float and signal.length not in {32, 64}:
+        yield Finding(
+            at,
+            f"is a float of {signal.length} bits in the DBC file, and there is none",
+            "correct its length to 32 or 64, or its type (SIG_VALTYPE_), in the DBC file",
+        )
+    elif not 1 <= signal.length <= 64:
+        yield Finding(
+            at, f"has {signal.length} bits in the DBC file", "correct its length there: a number has 1 to 64"
+        )

@@ -157,7 +157,7 @@ def _sensor(sensor: Sensor) -> Sequence[str]:
 
 
 def _sensor_details(sensor: Sensor) -> Iterator[str]:
-    if isinstance(sensor, ProximityProbe):
+    if isinstance(sensor, ProximityProbe) and sensor.gap_ok_v is not None:
         yield f"gap OK {sensor.gap_ok_v[0]:g} to {sensor.gap_ok_v[1]:g} V"
     if isinstance(sensor, ProximityProbe) and sensor.ac_coupled:
         yield "AC-coupled"

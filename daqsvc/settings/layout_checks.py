@@ -355,46 +355,6 @@ def check_channel_use(draft: MachineFile) -> Iterator[Finding]:
                 )
 
 
-def check_voltages(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
-    """What is said in volts has a sensitivity to go with it."""
-    if sensor.sensitivity_mv_per_unit is not None:
-        return
-    if sensor.zero_v != 0:
-        yield Finding(
-            (*at, "zero_v"),
-            "has no effect without sensitivity_mv_per_unit",
-            "add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
-        )
-    if sensor.type == "proximity":
-        yield Finding(
-            (*at, "gap_ok_v"),
-            "cannot be checked: without sensitivity_mv_per_unit the gap voltage is not known",
-            "add sensitivity_mv_per_unit and zero_v, and let the channel carry volts",
-            fatal=False,
-        )
-
-
-def check_dbc_unit(
-    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
-) -> Iterator[Finding]:
-    """The DBC file and the sensor agree on the unit."""
-    layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
-    message = messages.get(sensor.stream)
-    if not isinstance(layout, DbcLayout) or message is None:
-        return
-    wire_unit = sensor.unit if sensor.sensitivity_mv_per_unit is None else "V"
-    for channel in layout.channels:
-        unit = message.signal_units.get(channel.signals[0], "")
-        if channel.name == sensor.channel and unit not in {"", wire_unit}:
-            yield Finding(
-                (*at, "unit"),
-                f'the DBC file gives signal "{channel.signals[0]}" in "{unit}", '
-                f'but this sensor takes it as "{wire_unit}"',
-                "correct unit (or sensitivity_mv_per_unit), or the unit in the DBC file",
-                fatal=False,
-            )
-
-
 def unique(names: list[str], at: KeyPath, what: str) -> Iterator[Finding]:
     """Findings for every name that has been given before in the same array."""
     seen: dict[str, int] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
+from itertools import islice
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +12,13 @@ from pydantic import ValidationError
 
 from daqsvc.settings.checks import check, dbc_layouts
 from daqsvc.settings.dbc import DbcMessage, check_dbc
-from daqsvc.settings.locate import Spot, locate
+from daqsvc.settings.files import UnreadableFileError, read_bounded
+from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
 from daqsvc.settings.words import Words, dotted, is_secret, suggested_key
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 _MASK = '"***"'
 _LONGEST_VALUE = 60
+_MOST_PROBLEMS = 100
+"""Of each kind: whoever has so many has given the wrong file."""
 
 
 def load_machine_file(path: Path) -> MachineFile:
@@ -43,7 +47,15 @@ def load_machine_file(path: Path) -> MachineFile:
     Raises:
         MachineFileError: it cannot be read or used; holds every problem found.
     """
-    return parse_machine_file(_read(path), path)
+    try:
+        text = decoded(read_bounded(path, MOST_BYTES), path)
+    except (UnreadableFileError, TomlTextError) as error:
+        remedy = error.remedy
+        if isinstance(error.__cause__, FileNotFoundError):
+            remedy = "correct the path, or begin with an example: daqsvc example"
+        line = error.line if isinstance(error, TomlTextError) else None
+        raise MachineFileError([Problem(path, line, "", "", str(error), remedy)]) from None
+    return parse_machine_file(text, path)
 
 
 def parse_machine_file(text: str, path: Path) -> MachineFile:
@@ -56,13 +68,11 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     Raises:
         MachineFileError: the text cannot be used; holds every problem found.
     """
-    text = text.removeprefix("\ufeff")
     try:
-        # With its last line ended: else tomllib has no line number for a mistake there.
-        document = tomllib.loads(text if text.endswith("\n") else f"{text}\n")
-    except (ValueError, RecursionError) as error:
-        raise MachineFileError([_syntax_problem(path, text, error)]) from None
-    reading = _Reading(document, locate(text), path)
+        document, spots = parse(text)
+    except TomlTextError as error:
+        raise MachineFileError([Problem(path, error.line, "", "", str(error), error.remedy)]) from None
+    reading = _Reading(document, spots, path)
     draft = reading.validate()
     messages = _read_dbc(draft, path, reading.findings)
     reading.findings += check(draft, messages)
@@ -89,6 +99,11 @@ class _Reading:
         if not errors:
             return MachineFile.model_validate(self._document)
         unknown = [error for error in errors if error["type"] == "extra_forbidden"]
+        more = len(unknown) - _MOST_PROBLEMS
+        if more > 0:
+            self.findings.append(
+                Finding((), f"{more:,} more unknown keys are not listed", "correct these first")
+            )
         self._say(unknown, self._document)
         meant = self._without_unknown_keys([error["loc"] for error in unknown]) if unknown else self._document
         self._say([error for error in _errors(meant) if error["type"] != "extra_forbidden"], meant)
@@ -100,12 +115,12 @@ class _Reading:
         """The document as it was probably meant: misspelt keys put right, other unknown keys left out."""
         meant: dict[str, Any] = _copy(self._document)
         # Deepest first, so that the paths of the rest still lead somewhere.
-        for path in sorted(unknown, key=len, reverse=True):
+        for number, path in enumerate(sorted(unknown, key=len, reverse=True)):
             table = value_at(meant, path[:-1])
             key = str(path[-1])
             section = section_of(declared_at(MachineFile, meant, path[:-1]), table)
             # A secret in the file is refused, never taken for the value of some other key.
-            usable = None if is_secret(path) else section
+            usable = None if is_secret(path) or number >= _MOST_PROBLEMS else section
             better = None if usable is None else suggested_key(usable, table, key)
             value = table.pop(key)
             if better is not None:
@@ -115,7 +130,7 @@ class _Reading:
 
     def _say(self, errors: Iterable[ErrorDetails], document: dict[str, Any]) -> None:
         words = Words(MachineFile, document)
-        for error in errors:
+        for error in islice(errors, _MOST_PROBLEMS):
             path = tuple(step for step in error["loc"] if step != "[key]")
             message, remedy = words.say(error, path)
             self.findings.append(Finding(path, message, remedy))
@@ -174,43 +189,6 @@ def _read_dbc(draft: MachineFile, path: Path, findings: list[Finding]) -> dict[s
         if message is not None:
             messages[name] = message
     return messages
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        message, remedy = (
-            "there is no such file",
-            "correct the path, or copy an example from config/machines/",
-        )
-    except IsADirectoryError:
-        message, remedy = "is a directory", "name a machine file in it, e.g. one that ends in .toml"
-    except PermissionError:
-        message, remedy = "may not be read by this user", f"chmod a+r {path}, or run as a user who may"
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        byte = error.object[error.start]
-        message = f"is not UTF-8: byte {byte:#04x} at offset {error.start}"
-        problem = Problem(path, line, "", "", message, "save the file as UTF-8")
-        raise MachineFileError([problem]) from None
-    except OSError as error:
-        message, remedy = f"cannot be read: {error.strerror or error}", "make the file readable"
-    raise MachineFileError([Problem(path, None, "", "", message, remedy)]) from None
-
-
-def _syntax_problem(path: Path, text: str, error: Exception) -> Problem:
-    if isinstance(error, RecursionError):
-        return Problem(path, None, "", "", "is nested too deeply", "write fewer brackets inside brackets")
-    reason, line = str(error), None
-    place = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", reason)
-    if place is not None:
-        reason = reason[: place.start()]
-        line = int(place[1]) if place[1] else text.rstrip("\n").count("\n") + 1
-        where = f"column {place[2]}" if place[2] else "the end of the file"
-        reason = f"{reason}, at {where}"
-    remedy = "correct the TOML there: text stands in quotes, tables are [name], values are key = value"
-    return Problem(path, line, "", "", f"is not valid TOML: {reason}", remedy)
 
 
 def _shown(path: KeyPath, source: str) -> str:

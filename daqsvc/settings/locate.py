@@ -17,15 +17,16 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.problems import KeyPath
 
-_BLANK = re.compile(r"[ \t]*")
-_BLANK_LINES = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
+# Quantifiers that give nothing back (++, *+): on megabytes of blanks the others take gigabytes.
+_BLANK = re.compile(r"[ \t]*+")
+_BLANK_LINES = re.compile(r"(?:[ \t\r\n]++|#[^\n]*+)*+")
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _SCALAR = re.compile(r"[^,\]}#\r\n]*")  # numbers, booleans and dates (which may hold a space)
 # Each quoted form up to its end; a multi-line string may end in up to two quotes of its own.
 _QUOTED = {
-    '"""': re.compile(r'"""(?:[^\\]|\\.)*?"""(?:""|"|)(?!")', re.DOTALL),
+    '"""': re.compile(r'"""(?:[^\\"]++|\\.|"(?!""))*+"""(?:""|"|)(?!")', re.DOTALL),
     "'''": re.compile(r"'''.*?'''(?:''|'|)(?!')", re.DOTALL),
-    '"': re.compile(r'"(?:[^"\\]|\\.)*"'),
+    '"': re.compile(r'"(?:[^"\\]++|\\.)*+"'),
     "'": re.compile(r"'[^']*'"),
 }
 
@@ -43,22 +44,43 @@ class Spot:
     source: str = ""
 
 
-def locate(text: str) -> Mapping[KeyPath, Spot]:
+class TooMuchError(Exception):
+    """A text with more in it than was asked for.
+
+    Attributes:
+        line: where it becomes too much, from 1.
+        deep: whether its tables and arrays are too deep within each other; else there are too many values.
+    """
+
+    def __init__(self, line: int, *, deep: bool) -> None:
+        super().__init__(line)
+        self.line = line
+        self.deep = deep
+
+
+def locate(text: str, *, most_depth: int = 100, most_values: int = 1_000_000) -> Mapping[KeyPath, Spot]:
     """The place of every key, table and array element of a valid TOML text.
 
     Args:
         text: what `tomllib.loads` accepted.
+        most_depth: longest key path.
+        most_values: keys, tables and array elements, at most.
 
     Returns:
         For each key path its spot: of a value the line of its key (of an array element, of the element),
         of a table the line where it is first mentioned. The empty path stands for the whole, at line 1.
+
+    Raises:
+        TooMuchError: the text goes beyond these limits.
     """
-    return _Scanner(text.replace("\r\n", "\n")).scan()
+    return _Scanner(text.replace("\r\n", "\n"), most_depth, most_values).scan()
 
 
 class _Scanner:
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, most_depth: int, most_values: int) -> None:
         self._text = text
+        self._most_depth = most_depth
+        self._most_values = most_values
         self._position = 0
         self._line_starts = [0, *(match.end() for match in re.finditer("\n", text))]
         self._spots: dict[KeyPath, Spot] = {(): Spot(1)}
@@ -85,14 +107,20 @@ class _Scanner:
         path: KeyPath = ()
         for key in keys[:-1]:
             path = self._last_element((*path, key))
-            self._spots.setdefault(path, Spot(line))
+            self._note(path, line)
         path = (*path, keys[-1])
-        self._spots.setdefault(path, Spot(line))
+        self._note(path, line)
         if array_of_tables:
             self._table_counts[path] = self._table_counts.get(path, 0) + 1
         path = self._last_element(path)
-        self._spots.setdefault(path, Spot(line))
+        self._note(path, line)
         return path
+
+    def _note(self, path: KeyPath, line: int) -> None:
+        """Keep the line where a table or value is first mentioned."""
+        self._spots.setdefault(path, Spot(line))
+        if len(path) > self._most_depth or len(self._spots) > self._most_values:
+            raise TooMuchError(line, deep=len(path) > self._most_depth)
 
     def _last_element(self, path: KeyPath) -> KeyPath:
         """The table that a header means by ``path``: of an array of tables, the latest one."""
@@ -104,7 +132,7 @@ class _Scanner:
         path = table
         for key in self._keys():
             path = (*path, key)
-            self._spots.setdefault(path, Spot(line))
+            self._note(path, line)
         self._take("=")
         self._spots[path] = Spot(line, self._value(path))
 
@@ -143,6 +171,7 @@ class _Scanner:
         while not self._take("]"):
             line = self._line()
             element = (*path, index)
+            self._note(element, line)
             self._spots[element] = Spot(line, self._value(element))
             index += 1
             self._skip(_BLANK_LINES)

@@ -7,7 +7,9 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import Name, Positive, Section
+from daqsvc.settings.addresses import DevicePath, Host  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, WaitMs
 
 MAX_REGISTERS = 125
 """Registers that a request can read (Modbus Application Protocol 1.1b3, 6.3)."""
@@ -21,6 +23,7 @@ Address = Annotated[int, Field(ge=0, le=65_535)]
 UnitAddress = Annotated[int, Field(ge=0, le=255)]
 Table = Literal["holding", "input"]
 CountBits = Literal[16, 32]
+BitNumber = Annotated[int, Field(ge=0, le=64)]
 
 _REGISTERS: dict[RegisterType, int] = {
     "int16": 1,
@@ -32,16 +35,6 @@ _REGISTERS: dict[RegisterType, int] = {
     "float32": 2,
     "float64": 4,
 }
-
-
-def _not_zero(scale: float) -> float:
-    if scale == 0:
-        raise PydanticCustomError(
-            "zero_scale",
-            "would make every sample the same",
-            {"remedy": "write what one count of the raw value is worth, e.g. 0.01"},
-        )
-    return scale
 
 
 def _power_of_two(depth: int) -> int:
@@ -67,9 +60,7 @@ class _ModbusBus(Section):
     """What all Modbus lines have."""
 
     driver: Annotated[Literal["modbus"], Field(description="which driver reads the bus", examples=["modbus"])]
-    timeout_ms: Annotated[Positive, Field(le=60_000)] = Field(
-        default=500.0, description="how long a unit may take to answer"
-    )
+    timeout_ms: WaitMs = Field(default=500.0, description="how long a unit may take to answer")
     demote_after: Annotated[int, Field(ge=1, le=30)] = Field(
         default=3,
         description="requests without reply, in a row, after which a unit or a request is set aside",
@@ -78,7 +69,7 @@ class _ModbusBus(Section):
         default=10.0,
         description="how long at first, before one request probes whether it is back; doubles up to 60 s",
     )
-    writes: Annotated[tuple[Writable, ...], Field(strict=False)] = Field(
+    writes: Annotated[tuple[Writable, ...], Field(strict=False, max_length=1024)] = Field(
         default=(), description="registers that may be written; nothing else ever is"
     )
     start: Literal["error", "retry", "ignore"] = Field(
@@ -101,7 +92,7 @@ class ModbusTcpBus(_ModbusBus):
     transport: Annotated[
         Literal["tcp"], Field(description='"tcp", or "rtu" for a serial port', examples=["tcp"])
     ]
-    host: Annotated[str, Field(min_length=1, description="the server", examples=["192.0.2.10"])]
+    host: Annotated[Host, Field(description="the server", examples=["192.0.2.10"])]
     tcp_port: Annotated[int, Field(ge=1, le=65_535)] = 502
 
     @property
@@ -116,11 +107,11 @@ class ModbusRtuBus(_ModbusBus):
     kind: ClassVar[str] = "a Modbus RTU bus"
 
     transport: Annotated[Literal["rtu"], Field(description="a serial port", examples=["rtu"])]
-    serial_port: Annotated[str, Field(min_length=1, description="its device file", examples=["/dev/ttyUSB0"])]
+    serial_port: Annotated[DevicePath, Field(description="its device file", examples=["/dev/ttyUSB0"])]
     baud: Annotated[int, Field(ge=300, le=4_000_000, description="bit/s", examples=[19_200])]
     parity: Literal["none", "even", "odd"] = "even"
     stop_bits: Literal[1, 2] = 1
-    quiet_ms: Annotated[Positive, Field(le=60_000)] | None = Field(
+    quiet_ms: WaitMs | None = Field(
         default=None,
         description="silence after a request without reply, at least timeout_ms; that longer after opening",
     )
@@ -140,11 +131,11 @@ class _Quantity(Section):
     order: Order = Field(
         default="ABCD", description="of bytes and words: ABCD is big-endian, CDAB has its words exchanged"
     )
-    bits: Annotated[tuple[int, int], Field(strict=False)] | None = Field(
+    bits: Annotated[tuple[BitNumber, BitNumber], Field(strict=False)] | None = Field(
         default=None, description="lowest bit and number of bits, for a part of an unsigned number"
     )
-    scale: Annotated[float, AfterValidator(_not_zero)] = Field(default=1.0, description="worth of one count")
-    offset: float = Field(default=0.0, description="wire value of the raw value 0")
+    scale: Scale = Field(default=1.0, description="worth of one count")
+    offset: Quantity = Field(default=0.0, description="wire value of the raw value 0")
 
     @property
     def registers(self) -> int:
@@ -180,11 +171,12 @@ class _Sampled(_ModbusLayout):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x", place = 0, type = "int16", scale = 0.0005 }]'],
         ),
     ]
-    poll_ms: Annotated[Positive, Field(le=60_000)] | None = Field(
+    poll_ms: WaitMs | None = Field(
         default=None, description="how often to look for more; by rate and room in the device unless given"
     )
 
@@ -211,6 +203,7 @@ class RegistersLayout(_ModbusLayout):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels",
             examples=['[{ name = "velocity", address = 0, type = "uint16", scale = 0.01 }]'],
         ),
@@ -222,7 +215,8 @@ class RegistersLayout(_ModbusLayout):
         default=MAX_REGISTERS, description="registers in a request, at most"
     )
     forbidden: Annotated[
-        tuple[Annotated[tuple[Address, Address], Field(strict=False)], ...], Field(strict=False)
+        tuple[Annotated[tuple[Address, Address], Field(strict=False)], ...],
+        Field(strict=False, max_length=1024),
     ] = Field(default=(), description="first and last register of ranges that must never be read")
 
     @property
@@ -300,7 +294,7 @@ class BlockTrigger(Section):
 
     address: Annotated[Address, Field(description="holding register to write", examples=[98])]
     value: Annotated[int, Field(ge=0, le=65_535)] = 1
-    every_s: Annotated[Positive, Field(le=86_400)] = Field(
+    every_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
         default=60.0, description="how long to wait for a block before it is written again"
     )
 

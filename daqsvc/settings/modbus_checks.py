@@ -14,6 +14,7 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
+from daqsvc.settings.modbus_overlaps import check_channel_overlaps
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
             (*path, "unit"), "is no address of a unit on a serial line", "take 1 to 247, as set in the unit"
         )
     yield from _check_bits(layout, path)
+    yield from check_channel_overlaps(layout, path)
     yield from _check_room(layout, path)
     yield from _check_writes(bus, stream.bus, layout, path)
 

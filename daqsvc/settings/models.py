@@ -35,7 +35,7 @@ from daqsvc.settings.mqtt import Mqtt
 from daqsvc.settings.packing import Channel, Counter
 from daqsvc.settings.pipeline import ROTOR_BANK, Levels, Mode, Pipeline, RotorBank
 from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS, RotorSynchronous
-from daqsvc.settings.section import AngleDeg, DampingRatio, Name, Positive, Section
+from daqsvc.settings.section import AngleDeg, DampingRatio, Line, Name, PositionUm, Section
 from daqsvc.settings.sensors import (
     Accelerometer,
     Keyphasor,
@@ -95,32 +95,49 @@ __all__ = [
 ]
 
 
+MOST_ENTRIES = 4096
+"""Sensors, and alarms, of a machine."""
+
+
 class Rotor(Section):
     """The Laval rotor behind its detectors."""
 
     natural_frequency_hz: Annotated[
-        Positive, Field(description="undamped natural frequency, omega_s / 2 pi", examples=[10.0])
+        float,
+        Field(
+            ge=0.01,
+            le=10_000,
+            description="undamped natural frequency, omega_s / 2 pi",
+            examples=[10.0],
+        ),
     ]
     damping_ratio: Annotated[DampingRatio, Field(description="zeta of the healthy rotor", examples=[0.18])]
-    eccentricity_um: Positive | None = Field(
+    eccentricity_um: Annotated[float, Field(ge=1e-3, le=10_000)] | None = Field(
         default=None, description="mass eccentricity epsilon; for the model bank", examples=[10.0]
     )
     heavy_spot_deg: AngleDeg = Field(default=0.0, description="angle of the heavy spot against the keyphasor")
     clearance_um: Annotated[
-        Positive, Field(description="radial clearance c, the characteristic length", examples=[100.0])
+        float,
+        Field(
+            ge=0.1,
+            le=100_000,
+            description="radial clearance c, the characteristic length",
+            examples=[100.0],
+        ),
     ]
     static_sag_um: Annotated[
-        float, Field(ge=0, description="sag of the shaft under gravity, towards -y", examples=[10.0])
+        float,
+        Field(ge=0, le=100_000, description="sag of the shaft under gravity, towards -y", examples=[10.0]),
     ]
-    contact_stiffness: Positive | None = Field(
+    contact_stiffness: Annotated[float, Field(ge=1e-3, le=1e6)] | None = Field(
         default=None,
         description="K* = K_beta / (M c omega_s^2), dimensionless; for the model bank",
         examples=[30.0],
     )
-    contact_radius_um: Positive = Field(
+    contact_radius_um: Annotated[float, Field(ge=1, le=1e7)] = Field(
         default=25_000.0, description="radius of the surface that rubs; sets how fast it slides"
     )
-    static_load_x_um: float = Field(
+    static_load_x_um: PositionUm = Field(
         default=0.0, description="sag of the healthy shaft under its static load, towards +x"
     )
 
@@ -139,7 +156,7 @@ class Machine(Section):
     """The machine that is watched."""
 
     name: Annotated[Name, Field(description="name of the machine", examples=["laval-rig"])]
-    description: str = Field(default="", description="what a person should know about it")
+    description: Line = Field(default="", description="what a person should know about it")
     speed_rpm: Annotated[
         float,
         AfterValidator(_turning),
@@ -179,11 +196,19 @@ class MachineFile(Section):
     site: Annotated[Name, Field(description="where the box stands; part of every topic", examples=["lab"])]
     box: Annotated[Name, Field(description="name of this box; part of every topic", examples=["edge-1"])]
     machine: Annotated[Machine, Field(description="the machine that is watched")]
-    buses: Annotated[dict[Name, Bus], Field(min_length=1, description="the buses, by name")]
-    streams: Annotated[dict[Name, Stream], Field(min_length=1, description="the streams of samples, by name")]
-    sensors: Annotated[tuple[Sensor, ...], Field(strict=False, min_length=1, description="the sensors")]
+    buses: Annotated[dict[Name, Bus], Field(min_length=1, max_length=64, description="the buses, by name")]
+    streams: Annotated[
+        dict[Name, Stream],
+        Field(min_length=1, max_length=1024, description="the streams of samples, by name"),
+    ]
+    sensors: Annotated[
+        tuple[Sensor, ...],
+        Field(strict=False, min_length=1, max_length=MOST_ENTRIES, description="the sensors"),
+    ]
     pipeline: Pipeline = Field(default=Pipeline(), description="what is computed")
-    alarms: Annotated[tuple[Alarm, ...], Field(strict=False)] = Field(default=(), description="the alarms")
+    alarms: Annotated[tuple[Alarm, ...], Field(strict=False, max_length=MOST_ENTRIES)] = Field(
+        default=(), description="the alarms"
+    )
     alarm_handling: AlarmHandling = Field(default=AlarmHandling(), description="what holds for all alarms")
     mqtt: Mqtt | None = Field(default=None, description="the broker; none is configured if absent")
     store: Store | None = Field(default=None, description="the journal's place")

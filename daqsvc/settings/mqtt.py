@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
 from daqsvc.settings.broker_url import BrokerUrl, host_of, is_tls, port_of
-from daqsvc.settings.section import Name, Positive, Section
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import ClientId, Name, Section, Text
 from daqsvc.settings.sparkplug import Sparkplug  # noqa: TC001 - pydantic reads the annotations
 
 Command: TypeAlias = Literal["acknowledge", "reset", "shelve", "unshelve", "bypass", "unbypass"]
 """What may be asked of an alarm."""
-
-_File = Annotated[Path, Field(strict=False)]
 
 
 class MqttCommands(Section):
     """What may be asked of alarms over the broker; who may ask is the broker's access list."""
 
     enabled: bool = Field(default=False, description="says that commands are taken from the broker")
-    allow: Annotated[tuple[Command, ...], Field(strict=False)] = Field(
+    allow: Annotated[tuple[Command, ...], Field(strict=False, max_length=16)] = Field(
         default=("acknowledge",),
         description="what may be asked: acknowledge, reset, shelve, unshelve, bypass, unbypass",
     )
-    max_age_s: Annotated[Positive, Field(le=3600)] = Field(
+    max_age_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
         default=60.0, description="how old a command may be when it arrives"
     )
     max_bytes: Annotated[int, Field(ge=256, le=65_536)] = Field(
@@ -39,7 +37,7 @@ class HomeAssistant(Section):
     enabled: bool = Field(
         default=True, description="false takes away what has been told to Home Assistant before"
     )
-    prefix: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
+    prefix: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=256)] = Field(
         default="homeassistant", description="its discovery prefix"
     )
 
@@ -55,23 +53,21 @@ class Mqtt(Section):
         BrokerUrl, Field(description="address of the broker", examples=["mqtts://broker.example:8883"])
     ]
     insecure: bool = Field(default=False, description="says that mqtt:// without TLS is meant")
-    client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
+    client_id: ClientId | None = Field(
         default=None, description="how the broker knows this box; daqsvc-<site>:<box> if absent"
     )
-    username: Annotated[str, Field(min_length=1)] | None = Field(
-        default=None, description="user at the broker"
-    )
-    password_file: _File | None = Field(default=None, description="file whose first line is the password")
+    username: Text | None = Field(default=None, description="user at the broker")
+    password_file: FilePath | None = Field(default=None, description="file whose first line is the password")
     password_credential: Name | None = Field(
         default=None, description="systemd credential (LoadCredential=) in place of password_file"
     )
-    ca_file: _File | None = Field(
+    ca_file: FilePath | None = Field(
         default=None, description="certificates (PEM) to trust in place of the system's"
     )
-    cert_file: _File | None = Field(
+    cert_file: FilePath | None = Field(
         default=None, description="certificate (PEM) that the box shows to the broker"
     )
-    key_file: _File | None = Field(
+    key_file: FilePath | None = Field(
         default=None, description="its private key (PEM), if not in cert_file; not encrypted"
     )
     key_credential: Name | None = Field(
@@ -83,10 +79,10 @@ class Mqtt(Section):
     protocol: Literal["auto", "5", "3.1.1"] = Field(
         default="auto", description="MQTT version; auto asks for 5 and takes 3.1.1 if that is refused"
     )
-    topic_root: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$")] = Field(
-        default="daqsvc", description="first part of every topic"
+    topic_root: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=256)] = (
+        Field(default="daqsvc", description="first part of every topic")
     )
-    telemetry_expiry_s: Annotated[Positive, Field(le=86_400)] = Field(
+    telemetry_expiry_s: Annotated[float, Field(ge=1, le=86_400)] = Field(
         default=600.0, description="how long diagnoses and status are worth being delivered late"
     )
     commands: MqttCommands = Field(default=MqttCommands(), description="commands that come over the broker")

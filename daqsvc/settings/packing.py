@@ -8,9 +8,11 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import Name, Section
+from daqsvc.settings.section import MOST, Name, Quantity, Section
 
 CRC_BYTES = 2
+LEAST_SCALE = 1 / MOST
+LARGEST_SCALE = MOST
 VALID_RAW = "least and largest raw value that is a measurement; any other says that there is none"
 
 RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
@@ -30,7 +32,7 @@ _RAW_BYTES: dict[RawType, int] = {
 }
 
 
-def not_zero(scale: float) -> float:
+def _not_zero(scale: float) -> float:
     """A scale that tells samples apart.
 
     Raises:
@@ -42,7 +44,20 @@ def not_zero(scale: float) -> float:
             "would make every sample the same",
             {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
         )
+    if not LEAST_SCALE <= abs(scale) <= LARGEST_SCALE:
+        raise PydanticCustomError(
+            "scale_size",
+            "is what no count of a raw value is worth",
+            {"remedy": "write what one count of the raw value is worth, e.g. 0.0005"},
+        )
     return scale
+
+
+Scale = Annotated[float, Field(ge=-LARGEST_SCALE, le=LARGEST_SCALE), AfterValidator(_not_zero)]
+"""What one count of a raw value is worth."""
+
+RawLimit = Annotated[float, Field(ge=-3.4028235e38, le=3.4028235e38)]
+"""A raw value: at most what a float of 32 bits carries."""
 
 
 def _ordered_raw(limits: tuple[float, float]) -> tuple[float, float]:
@@ -56,7 +71,7 @@ def _ordered_raw(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 ValidRaw = Annotated[
-    tuple[float, float],
+    tuple[RawLimit, RawLimit],
     AfterValidator(_ordered_raw),
     Field(strict=False),
 ]
@@ -87,10 +102,8 @@ class Channel(Section):
 
     name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
     type: Annotated[RawType, Field(description="the raw type of a sample", examples=["int16"])]
-    scale: Annotated[
-        float, AfterValidator(not_zero), Field(description="worth of one count", examples=[0.0005])
-    ]
-    offset: float = Field(default=0.0, description="wire value of the raw value 0")
+    scale: Annotated[Scale, Field(description="worth of one count", examples=[0.0005])]
+    offset: Quantity = Field(default=0.0, description="wire value of the raw value 0")
     valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW, examples=["[-32767, 32767]"])
 
     @property

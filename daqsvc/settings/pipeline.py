@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 from daqsvc.settings.alignment import Alignment  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.bearing import Bearing  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.rotor import RotorSynchronous  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.section import DampingRatio, Name, NotNegative, Positive, Section
+from daqsvc.settings.section import DampingRatio, Name, Nats, PositionUm, Section
 
 Severity = Literal["normal", "alert", "danger"]
 
@@ -31,11 +31,14 @@ def _ordered_band(band_hz: tuple[float, float]) -> tuple[float, float]:
     return band_hz
 
 
+BandHz = Annotated[float, Field(ge=0.001, le=5_000_000)]
+
+
 class Levels(Section):
     """RMS, peak, crest factor and velocity RMS of every vibration sensor, window by window."""
 
-    window_s: Annotated[Positive, Field(le=600)] = Field(default=0.5, description="length of a window")
-    velocity_band_hz: Annotated[tuple[float, float], AfterValidator(_ordered_band), Field(strict=False)] = (
+    window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(default=0.5, description="length of a window")
+    velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
         Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
     )
 
@@ -49,9 +52,13 @@ class Mode(Section):
     damping_ratio: DampingRatio | None = Field(
         default=None, description="the rotor's damping in it; that of [machine.rotor] if absent"
     )
-    unbalance_ratio: NotNegative = Field(default=1.0, description="eccentricity over the healthy one")
-    stiffness_ratio: Positive = Field(default=1.0, description="stiffness of the shaft over the healthy one")
-    static_load_um: Annotated[tuple[float, float], Field(strict=False)] = Field(
+    unbalance_ratio: Annotated[float, Field(ge=0, le=1000)] = Field(
+        default=1.0, description="eccentricity over the healthy one"
+    )
+    stiffness_ratio: Annotated[float, Field(ge=0.01, le=100)] = Field(
+        default=1.0, description="stiffness of the shaft over the healthy one"
+    )
+    static_load_um: Annotated[tuple[PositionUm, PositionUm], Field(strict=False)] = Field(
         default=(0.0, 0.0), description="additional sag towards +x and +y, of the healthy shaft"
     )
     rub: bool = Field(default=False, description="whether the rotor can touch the stator in it")
@@ -69,6 +76,10 @@ class Mode(Section):
         return tuple(["damping_ratio", *told] if self.damping_ratio is not None else told)
 
 
+ProcessNoise = Annotated[float, Field(ge=1e-12, le=1e6)]
+Threshold = Annotated[float, Field(ge=0.1, le=1_000_000)]
+
+
 class RotorBank(Section):
     """One observer per mode, and the rule that decides between them."""
 
@@ -77,24 +88,29 @@ class RotorBank(Section):
         Field(strict=False, description="the two proximity probes", examples=['["probe-x", "probe-y"]']),
     ]
     keyphasor: Annotated[Name, Field(description="the keyphasor", examples=["keyphasor"])]
-    noise_um: Annotated[Positive, Field(description="standard deviation of the sensor noise", examples=[2.0])]
-    process_noise: Positive = Field(default=1e-4, description="PSD q of the linear observers, normalised")
-    rub_process_noise: Positive = Field(default=0.1, description="PSD q3 of the rub observer, normalised")
+    noise_um: Annotated[
+        float,
+        Field(ge=1e-3, le=10_000, description="standard deviation of the sensor noise", examples=[2.0]),
+    ]
+    process_noise: ProcessNoise = Field(default=1e-4, description="PSD q of the linear observers, normalised")
+    rub_process_noise: ProcessNoise = Field(default=0.1, description="PSD q3 of the rub observer, normalised")
     rule: Literal["cusum", "paper"] = Field(
         default="cusum", description="cusum raises alarms; paper shows probabilities only"
     )
-    threshold_nats: Positive = Field(default=16.0, description="evidence that declares a worse mode")
-    back_threshold_nats: Positive = Field(default=25.0, description="evidence that declares a healthier mode")
-    false_alarms_per_1000_rev: Positive | None = Field(
+    threshold_nats: Threshold = Field(default=16.0, description="evidence that declares a worse mode")
+    back_threshold_nats: Threshold = Field(
+        default=25.0, description="evidence that declares a healthier mode"
+    )
+    false_alarms_per_1000_rev: Annotated[float, Field(ge=1e-9, le=10_000)] | None = Field(
         default=None, description="accepted on a healthy machine, in place of threshold_nats"
     )
-    mtbf_hours: Positive | None = Field(
+    mtbf_hours: Annotated[float, Field(ge=1e-3, le=1e9)] | None = Field(
         default=None, description="mean time between failures, in place of back_threshold_nats"
     )
-    identity_nats: Positive = Field(
+    identity_nats: Nats = Field(
         default=3.0, description="lead over the other candidates that names the fault"
     )
-    settle_revolutions: Annotated[NotNegative, Field(le=1000)] = Field(
+    settle_revolutions: Annotated[float, Field(ge=0, le=1000)] = Field(
         default=0.0, description="how long a departure waits for its name; some 4 for many kinds of faults"
     )
     calibrate_revolutions: Annotated[int, Field(ge=0, le=100_000)] = Field(
@@ -106,6 +122,7 @@ class RotorBank(Section):
         Field(
             strict=False,
             min_length=2,
+            max_length=64,
             description="the modes, healthy first",
             examples=['[{ name = "N", damping_ratio = 0.18, severity = "normal" }, ...]'],
         ),
@@ -120,7 +137,7 @@ class RotorBank(Section):
 class Pipeline(Section):
     """The detectors, and how much of the past they can reach."""
 
-    ring_s: Annotated[Positive, Field(le=3600)] = Field(
+    ring_s: Annotated[float, Field(ge=0.01, le=3600)] = Field(
         default=30.0, description="length of each stream's ring"
     )
     alignment: Alignment | None = Field(

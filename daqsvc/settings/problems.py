@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from difflib import get_close_matches
+from itertools import islice
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
@@ -12,6 +13,10 @@ if TYPE_CHECKING:
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 """A place in the file: keys, and 0-based positions in arrays, e.g. ``("sensors", 0, "name")``."""
+
+
+_MOST_LISTED = 30
+_MOST_COMPARED = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +83,6 @@ def choice(wanted: str, known: Iterable[str]) -> str:
     names = sorted(known)
     if not names:
         return "there is none to choose from; define one first"
-    close = get_close_matches(wanted, names, n=1)
-    listed = ", ".join(names)
+    close = get_close_matches(wanted, islice(names, _MOST_COMPARED), n=1)
+    listed = ", ".join(names[:_MOST_LISTED]) + (", ..." if len(names) > _MOST_LISTED else "")
     return f'did you mean "{close[0]}"? There are: {listed}' if close else f"take one of: {listed}"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from daqsvc.settings.section import Name, Section
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, Text
 
 TABLES = frozenset({".npz", ".csv"})
 """Endings of the files that hold a table of samples; any other is a CAN log."""
@@ -20,18 +21,16 @@ class ReplayBus(Section):
 
     driver: Annotated[Literal["replay"], Field(description="which driver plays it", examples=["replay"])]
     file: Annotated[
-        Path,
+        FilePath,
         Field(
-            strict=False,
             description="a CAN log (.log, .asc, .blf, .trc; .gz behind it if zipped) or a table of samples "
             "(.npz, .csv), relative to the machine file",
             examples=["run-up.blf"],
         ),
     ]
     channel: Annotated[
-        str | None,
+        Text | None,
         Field(
-            min_length=1,
             description="which channel of a CAN log that holds several, as the log calls it; the first one "
             "in it if left out",
             examples=["can0", "1"],
@@ -74,15 +73,14 @@ class TableColumn(Section):
 
     name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
     column: Annotated[
-        str,
+        Text,
         Field(
-            min_length=1,
             description="its column: a name in the first line of a CSV file, or an array of an NPZ file",
             examples=["probe_x_v"],
         ),
     ]
-    scale: float = Field(default=1.0, description="wire value of the value 1")
-    offset: float = Field(default=0.0, description="wire value of the value 0")
+    scale: Scale = Field(default=1.0, description="wire value of the value 1")
+    offset: Quantity = Field(default=0.0, description="wire value of the value 0")
 
 
 class TableLayout(Section):
@@ -95,6 +93,7 @@ class TableLayout(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x", column = "probe_x_v" }]'],
         ),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - pydantic reads the annotations
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from daqsvc.settings.section import Name, NotNegative, Section
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import Name, Section
 
 ROTOR_SYNCHRONOUS = "rotor-synchronous"
 """Name of the calibrated rotor as a detector."""
@@ -34,7 +34,7 @@ class RotorSynchronous(Section):
         default=50,
         description="first revolutions, which are the healthy state without calibration; kept over restarts",
     )
-    calibration: Annotated[Path, Field(strict=False)] | None = Field(
+    calibration: FilePath | None = Field(
         default=None,
         description="file of daqsvc calibrate: the rotor, and the healthy state in place of the first "
         "revolutions unless it holds a run-up only",
@@ -48,7 +48,7 @@ class RotorSynchronous(Section):
     damping_tolerance_percent: Percent = Field(
         default=20.0, description="how far off machine.rotor.damping_ratio may be"
     )
-    probe_drift_um: NotNegative = Field(
+    probe_drift_um: Annotated[float, Field(ge=0, le=100_000)] = Field(
         default=0.0, description="change of the mean position that is the probes' own, with temperature"
     )
 

@@ -35,9 +35,18 @@ def value_at(document: Any, path: KeyPath) -> Any:
     return value
 
 
+_field_types: dict[int, Any] = {}
+_adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}
+"""Both by the identity of what they belong to, fields and types of the models, which live as long as this."""
+
+
 def field_type(field: FieldInfo) -> Any:
     """The type of a field with its annotations, as it was declared."""
-    return Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    known = _field_types.get(id(field))
+    if known is None:
+        known = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+        _field_types[id(field)] = known
+    return known
 
 
 def section_of(declared: Any, value: object) -> type[Section] | None:
@@ -100,10 +109,8 @@ def valid_part(section: type[Section], table: Mapping[str, Any]) -> Section:
 
 
 def _valid_value(declared: Any, value: Any) -> Any:
-    # A section brings its configuration along; for any other type it must be said.
-    config = None if _is_section(_bare(declared)) else _STRICT
     try:
-        return TypeAdapter(declared, config=config).validate_python(value)
+        return _adapter(declared).validate_python(value)
     except ValidationError as error:
         if any(not item["loc"] and not only_follows(item, value) for item in error.errors()):
             raise  # the whole is wrong, not something in it
@@ -117,6 +124,16 @@ def _valid_value(declared: Any, value: Any) -> Any:
             if container is tuple and isinstance(value, list):
                 return tuple(_valid_value(element, item) for item in value)
         raise
+
+
+def _adapter(declared: Any) -> TypeAdapter[Any]:
+    """What validates a value of that type; to make one takes longer than to use it."""
+    known = _adapters.get(id(declared))
+    if known is None:
+        # A section brings its configuration along; for any other type it must be said.
+        config = None if _is_section(_bare(declared)) else _STRICT
+        known = _adapters[id(declared)] = (declared, TypeAdapter(declared, config=config))
+    return known[1]
 
 
 def _is_section(bare: Any) -> TypeGuard[type[Section]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError, core_schema
 
 if TYPE_CHECKING:
@@ -13,11 +13,42 @@ if TYPE_CHECKING:
 
     from pydantic import GetCoreSchemaHandler
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=64)]
-"""A name that can stand in an MQTT topic, a file name and a log line as it is."""
+Name = Annotated[str, Field(pattern=r"^\.*[A-Za-z0-9_-][A-Za-z0-9_.-]*$", max_length=64)]
+"""A name that can stand in an MQTT topic, a file name and a log line as it is; not ``.`` or ``..``."""
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+
+def _printable(text: str) -> str:
+    if not text.isprintable():
+        raise PydanticCustomError(
+            "text_not_printable",
+            "holds what cannot be printed",
+            {"remedy": "take out line ends, tabs and control characters"},
+        )
+    return text
+
+
+Line = Annotated[str, Field(max_length=256), AfterValidator(_printable)]
+"""A text on one line of a terminal."""
+Text = Annotated[str, Field(min_length=1, max_length=256), AfterValidator(_printable)]
+"""A line that is not empty."""
+ClientId = Annotated[str, Field(min_length=1, max_length=128), AfterValidator(_printable)]
+
+# Every number has bounds on both sides: what no machine, sensor or device can have is a slip of the pen.
+MOST_CHANNELS = 1024
+"""Of a stream; a frame or a line has room for fewer."""
+MOST = 1e12
+"""The largest size of a value in whichever unit a channel or a sensor has."""
+
+Quantity = Annotated[float, Field(ge=-MOST, le=MOST)]
+"""A value in the unit of a channel, a sensor or a signal."""
+
+Volts = Annotated[float, Field(ge=-1000, le=1000)]
+DelayS = Annotated[float, Field(ge=0, le=604_800)]
+"""Up to a week."""
+WaitMs = Annotated[float, Field(ge=1, le=60_000)]
+PositionUm = Annotated[float, Field(ge=-100_000, le=100_000)]
+"""Of a shaft in its bearing, or a part of that."""
+Nats = Annotated[float, Field(ge=0, le=1_000_000)]
 AngleDeg = Annotated[float, Field(ge=-360, le=360)]
 DampingRatio = Annotated[float, Field(ge=0, le=2)]
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import AngleDeg, Kinds, Name, NotNegative, Section
+from daqsvc.settings.section import MOST, AngleDeg, Kinds, Line, Name, Quantity, Section, Volts
 
 
 def _not_zero(sensitivity_mv_per_unit: float) -> float:
@@ -20,6 +20,12 @@ def _not_zero(sensitivity_mv_per_unit: float) -> float:
                 "remedy": "copy the figure from the sensor's calibration sheet, or leave it out if the "
                 "channel already carries the physical unit"
             },
+        )
+    if abs(sensitivity_mv_per_unit) < 1 / MOST:
+        raise PydanticCustomError(
+            "small_sensitivity",
+            "is what no sensor has",
+            {"remedy": "copy the figure from the sensor's calibration sheet, in mV per unit"},
         )
     return sensitivity_mv_per_unit
 
@@ -54,10 +60,12 @@ class BaseSensor(Section):
     name: Annotated[Name, Field(description="name of the sensor", examples=["probe-x"])]
     stream: Annotated[Name, Field(description="the stream it is in", examples=["shaft"])]
     channel: Annotated[Name, Field(description="its channel in that stream", examples=["x"])]
-    sensitivity_mv_per_unit: Annotated[float, AfterValidator(_not_zero)] | None = Field(
-        default=None, description="mV per unit; absent if the channel already carries the physical unit"
+    sensitivity_mv_per_unit: Annotated[float, Field(ge=-MOST, le=MOST), AfterValidator(_not_zero)] | None = (
+        Field(
+            default=None, description="mV per unit; absent if the channel already carries the physical unit"
+        )
     )
-    zero_v: float = Field(default=0.0, description="voltage that stands for 0 in the physical unit")
+    zero_v: Volts = Field(default=0.0, description="voltage that stands for 0 in the physical unit")
 
     @property
     def gain(self) -> float:
@@ -77,15 +85,11 @@ class ProximityProbe(BaseSensor):
 
     type: Literal["proximity"]
     unit: Annotated[Literal["um", "mm", "mil"], Field(description="unit of the position", examples=["um"])]
-    gap_ok_v: Annotated[
-        tuple[float, float],
-        AfterValidator(_ordered),
-        Field(
-            strict=False,
-            description="OK limits of the mean gap voltage, in V",
-            examples=["[-18.0, -2.0]"],
-        ),
-    ]
+    gap_ok_v: Annotated[tuple[Volts, Volts], AfterValidator(_ordered), Field(strict=False)] | None = Field(
+        default=None,
+        description="OK limits of the mean gap voltage, in V; needed where that is known",
+        examples=["[-18.0, -2.0]"],
+    )
     angle_deg: AngleDeg | None = Field(default=None, description="where it points, from +x against the clock")
     ac_coupled: bool = Field(
         default=False, description="says that it shows motion only, not the static position of the shaft"
@@ -118,8 +122,10 @@ class Keyphasor(BaseSensor):
 
     type: Literal["keyphasor"]
     unit: Annotated[Literal["V"], Field(description="unit of the pulse", examples=["V"])]
-    threshold_v: Annotated[float, Field(description="level that a pulse crosses, in V", examples=[-6.0])]
-    hysteresis_v: NotNegative = Field(default=0.5, description="how far back before the next crossing counts")
+    threshold_v: Annotated[Volts, Field(description="level that a pulse crosses, in V", examples=[-6.0])]
+    hysteresis_v: Annotated[float, Field(ge=0, le=1000)] = Field(
+        default=0.5, description="how far back before the next crossing counts"
+    )
     edge: Literal["rising", "falling"] = Field(default="rising", description="the edge that marks angle zero")
 
 
@@ -134,10 +140,12 @@ class TrendValue(BaseSensor):
         AfterValidator(_printable),
         Field(min_length=1, max_length=16, description="unit of the value", examples=["mm/s"]),
     ]
-    ok_between: Annotated[tuple[float, float], AfterValidator(_ordered), Field(strict=False)] | None = Field(
-        default=None,
-        description="OK limits, in its unit: beyond them the sensor is not believed",
-        examples=["[-40.0, 125.0]"],
+    ok_between: Annotated[tuple[Quantity, Quantity], AfterValidator(_ordered), Field(strict=False)] | None = (
+        Field(
+            default=None,
+            description="OK limits, in its unit: beyond them the sensor is not believed",
+            examples=["[-40.0, 125.0]"],
+        )
     )
 
 
@@ -148,7 +156,7 @@ class _UntypedSensor(BaseSensor, extra="ignore"):
         Literal["proximity", "accelerometer", "velocity", "keyphasor", "trend"],
         Field(description="what kind of sensor it is", examples=["proximity"]),
     ]
-    unit: Annotated[str, Field(description="unit of the samples", examples=["um"])]
+    unit: Annotated[Line, Field(description="unit of the samples", examples=["um"])]
 
 
 _KINDS: dict[str, type[BaseSensor]] = {

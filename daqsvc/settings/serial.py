@@ -7,27 +7,18 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.addresses import DevicePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.packing import (
     CRC_BYTES,
     Channel,
     Counter,
+    Scale,
     StartPolicy,
-    not_zero,
 )
-from daqsvc.settings.section import Name, Section
+from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section
 
 LONGEST_PAYLOAD = 4096
 LONGEST_SYNC_WORD = 8
-
-
-def _device_path(path: str) -> str:
-    if not path.startswith("/"):
-        raise PydanticCustomError(
-            "device_path",
-            "is not the whole path of a port",
-            {"remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}"},
-        )
-    return path
 
 
 def _sync_word(text: str) -> str:
@@ -45,7 +36,7 @@ def _sync_word(text: str) -> str:
 
 
 def _separator(text: str) -> str:
-    if not text.isascii() or text.isalnum() or text in "+-.*\r\n":
+    if not text.isascii() or text.isalnum() or text in "+-.*\r\n\0":
         raise PydanticCustomError(
             "separator",
             "cannot stand between numbers",
@@ -69,8 +60,7 @@ class SerialBus(Section):
 
     driver: Annotated[Literal["serial"], Field(description="which driver reads the bus", examples=["serial"])]
     port: Annotated[
-        str,
-        AfterValidator(_device_path),
+        DevicePath,
         Field(
             description="path of the port; those below /dev/serial/by-id stay the same when it is re-plugged",
             examples=["/dev/serial/by-id/usb-FTDI_FT232R_A1B2C3D4-if00-port0"],
@@ -135,7 +125,11 @@ class SyncBus(_BinaryBus):
     sync_word: Annotated[
         str,
         AfterValidator(_sync_word),
-        Field(description="the bytes that each frame begins with, in hexadecimal", examples=["a55a"]),
+        Field(
+            max_length=64,
+            description="the bytes that each frame begins with, in hexadecimal",
+            examples=["a55a"],
+        ),
     ]
 
     @property
@@ -197,6 +191,7 @@ class SerialLayout(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
         ),
@@ -240,8 +235,8 @@ class LineChannel(Section):
     """One quantity of a line: wire value = value * scale + offset, as for a channel of a frame."""
 
     name: Annotated[Name, Field(description="name of the channel, and of its column", examples=["x"])]
-    scale: Annotated[float, AfterValidator(not_zero)] = Field(default=1.0, description="wire value of a 1")
-    offset: float = Field(default=0.0, description="wire value of a 0")
+    scale: Scale = Field(default=1.0, description="wire value of a 1")
+    offset: Quantity = Field(default=0.0, description="wire value of a 0")
 
 
 class LineLayout(Section):
@@ -254,6 +249,7 @@ class LineLayout(Section):
         Field(
             strict=False,
             min_length=2,
+            max_length=MOST_CHANNELS,
             description="names of the columns; those named nowhere else are left out",
             examples=['["seq", "x", "y"]'],
         ),
@@ -275,6 +271,7 @@ class LineLayout(Section):
         Field(
             strict=False,
             min_length=1,
+            max_length=MOST_CHANNELS,
             description="the channels of each sample",
             examples=['[{ name = "x" }]'],
         ),

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from daqsvc.settings.broker_url import BrokerUrl  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.section import Name, Section
+from daqsvc.settings.section import ClientId, Name, Section
 
 
 class Sparkplug(Section):
@@ -19,12 +19,12 @@ class Sparkplug(Section):
     group: Name | None = Field(default=None, description="Sparkplug group id; the site if absent")
     edge_node: Name | None = Field(default=None, description="edge node id; the box if absent")
     device: Name | None = Field(default=None, description="device id; the machine's name if absent")
-    client_id: Annotated[str, Field(min_length=1, max_length=128)] | None = Field(
+    client_id: ClientId | None = Field(
         default=None, description="MQTT client id; that of [mqtt] with :sparkplug if absent"
     )
     primary_host: Name | None = Field(
         default=None, description="host application to wait for; waits for nobody if absent"
     )
-    servers: Annotated[tuple[BrokerUrl, ...], Field(strict=False)] = Field(
+    servers: Annotated[tuple[BrokerUrl, ...], Field(strict=False, max_length=16)] = Field(
         default=(), description="brokers to walk through, one at a time; that of [mqtt] if empty"
     )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - pydantic needs it at run time
 from typing import Annotated
 
 from pydantic import Field
 
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import Section
 
 
@@ -18,18 +18,18 @@ class Store(Section):
     """
 
     directory: Annotated[
-        Path, Field(strict=False, description="directory of the journal", examples=["/var/lib/daqsvc"])
+        FilePath, Field(description="directory of the journal", examples=["/var/lib/daqsvc"])
     ]
     alarms_max_mb: Annotated[int, Field(ge=1, le=100_000)] = Field(
         default=256, description="size of the journal from which on its oldest, sent messages are deleted"
     )
-    alarms_keep_days: Annotated[float, Field(gt=0, le=36_500)] = Field(
+    alarms_keep_days: Annotated[float, Field(ge=0.001, le=36_500)] = Field(
         default=90.0, description="age from which on sent messages of the journal are deleted"
     )
     telemetry_max_mb: Annotated[int, Field(ge=1, le=100_000)] = Field(
         default=64, description="telemetry that waits for the broker; beyond that, the oldest is dropped"
     )
-    telemetry_max_age_s: Annotated[float, Field(gt=0, le=3.2e9)] = Field(
+    telemetry_max_age_s: Annotated[float, Field(ge=1, le=3.2e9)] = Field(
         default=86_400.0, description="age from which on telemetry is dropped"
     )
     reserve_mb: Annotated[int, Field(ge=0, le=100_000)] = Field(

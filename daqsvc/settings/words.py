@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _TRUE_WORDS = {"1", "on", "true", "y", "yes"}
 _FALSE_WORDS = {"0", "off", "false", "n", "no"}
+_MOST_IN_A_ROW = 4
+"""Values that belong together, e.g. the two ends of a range; whatever may be longer is a list."""
 _SECRET = re.compile(r"pass|secret|token|credential", re.IGNORECASE)
 
 
@@ -199,7 +201,10 @@ class Words:
         return f"must have at least {number}", self._add(path)
 
     def _too_long(self, path: KeyPath, context: Mapping[str, Any]) -> tuple[str, str]:
-        return f"must have {context['max_length']} values", self._write_example(path)
+        most = context["max_length"]
+        if most > _MOST_IN_A_ROW:
+            return f"has more than {most:,} entries", "leave some out, or watch the rest with another service"
+        return f"must have {most} values", self._write_example(path)
 
     def _tuple_type(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:
         field = self._field(path)

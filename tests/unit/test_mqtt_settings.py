@@ -50,7 +50,7 @@ def test_what_does_not_fit_is_named(addition, key, message, remedy):
     ("line", "key", "message"),
     [
         ('allow = ["reboot"]', "mqtt.commands.allow[0]", "acknowledge"),
-        ("max_age_s = 0", "mqtt.commands.max_age_s", "greater than 0"),
+        ("max_age_s = 0", "mqtt.commands.max_age_s", "0.1 or more"),
         ("max_bytes = 10", "mqtt.commands.max_bytes", "256 or more"),
     ],
 )

@@ -44,8 +44,8 @@ def test_every_limit_reaches_the_outbox_in_its_unit():
     [
         ("alarms_max_mb", "0", "1 or more"),
         ("alarms_max_mb", "1.5", "whole number"),
-        ("alarms_keep_days", "0", "greater than 0"),
-        ("telemetry_max_age_s", "-1", "greater than 0"),
+        ("alarms_keep_days", "0", "0.001 or more"),
+        ("telemetry_max_age_s", "-1", "1 or more"),
         ("reserve_mb", "-1", "0 or more"),
     ],
 )

@@ -225,10 +225,10 @@ def test_secrets_and_options_are_not_described():
 
 
 def test_warnings_come_last_in_the_description():
-    text = variant('unit = "g"', 'unit = "m/s2"')
-    described = describe(parse_machine_file(text, TRIAXIAL))
+    text, _ = changed(LAVAL, ("zero_v = -10.0 ", ""))
+    described = describe(parse_machine_file(text, LAVAL))
     assert described.split("\n\n")[-1].startswith("Warnings: 1\n")
-    assert "correct unit" in described.replace("\n    ", " ")
+    assert "add the gap voltage with the shaft centred" in described.replace("\n    ", " ")
 
 
 @pytest.mark.parametrize(

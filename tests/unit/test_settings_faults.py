@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ ONE_VALUE = [
         "must be a number",
         "rate_hz = 640",
     ),
-    ("rate_hz = 640.0", "rate_hz = -1", "streams.shaft.rate_hz", "-1", "greater than 0", "rate_hz = 640.0"),
+    ("rate_hz = 640.0", "rate_hz = -1", "streams.shaft.rate_hz", "-1", "0.0001 or more", "rate_hz = 640.0"),
     ("rate_hz = 640.0", "rate_hz = 1e99", "streams.shaft.rate_hz", "1e99", "10,000,000 or less", "rate_hz ="),
     ("rate_hz = 640.0", "rate_hz = inf", "streams.shaft.rate_hz", "inf", "finite", "write rate_hz"),
     ("rate_hz = 640.0", "rate_hz = [1]", "streams.shaft.rate_hz", "[1]", "must be a number", "640.0"),
@@ -332,8 +333,9 @@ def test_a_password_in_an_address_that_is_none():
         ("a = 1\na = 2\n", 2, "overwrite"),
         ("a = 1\na = 2", 2, "overwrite a value, at column 6"),
         ("a = 1\nb = [1,\n", 2, "end of the file"),
-        ("a = " + "[" * 100_000, None, "nested too deeply"),
-        ("a = " + "9" * 5000, None, "not valid TOML"),
+        ("a = " + "[" * 100_000, 1, "nested too deeply"),
+        ("a = 1\nb = " + "9" * 5000, 2, "hundreds of digits"),
+        ("a = 1\nb = " + "9" * 40, 2, "b is too large for a whole number"),
     ],
 )
 def test_broken_toml(text, line, words):
@@ -355,14 +357,16 @@ def test_files_that_cannot_be_read(tmp_path):
     latin = tmp_path / "latin.toml"
     latin.write_bytes('# fine\nsite = "Köln"\n'.encode("latin-1"))
     assert problem_of(latin).line == 2
-    assert "not UTF-8: byte 0xf6" in problem_of(latin).message
+    assert "not UTF-8: byte 0xf6 at column 10" in problem_of(latin).message
+    latin.write_bytes(LAVAL.read_text(encoding="utf-8").encode("utf-16"))
+    assert "looks like UTF-16" in problem_of(latin).message
 
 
 def test_a_file_of_another_user(tmp_path, monkeypatch):
-    def refused(_):
+    def refused(*_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refused)
+    monkeypatch.setattr(os, "open", refused)
     with pytest.raises(MachineFileError, match="may not be read by this user"):
         load_machine_file(tmp_path / "x.toml")
 

@@ -299,7 +299,6 @@ WARNINGS = [
         "mqtt.ca_file",
         "no certificates",
     ),
-    (TRIAXIAL, [('unit = "g"', 'unit = "m/s2"')], "sensors[0].unit", 'signal "AccelX" in "g"'),
 ]
 
 

@@ -1,0 +1,73 @@
+"""Where a device is: hosts and device files, in the form that the drivers take."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from typing import Annotated, TypeAlias
+
+from pydantic import AfterValidator
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Text
+
+_LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
+_LONGEST_HOST = 253
+"""Characters of a host name, and 63 of each of its labels (RFC 1035)."""
+_SCHEME = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]*://")
+_PORT = re.compile(r":(\d{1,5})$")
+
+
+def _host(text: str) -> str:
+    host = text.removeprefix("[").removesuffix("]")
+    if host == text and is_host(text):
+        return text
+    # What is left of a URL that was meant: without scheme, path and port.
+    rest = _SCHEME.sub("", text).split("/")[0]
+    port = _PORT.search(rest)
+    if port is not None:
+        rest = rest[: port.start()]
+    rest = rest.removeprefix("[").removesuffix("]")
+    also = f" and tcp_port = {port[1]}" if port is not None else ""
+    example = rest if is_host(rest) else "192.0.2.10"
+    raise PydanticCustomError(
+        "host",
+        "is no name or address of a host" if _SCHEME.match(text) is None else "is a URL, not a host",
+        {"remedy": f'write host = "{example}"{also}'},
+    )
+
+
+def is_host(text: str) -> bool:
+    """Whether a text is an IP address, or can be a host's name."""
+    try:
+        ipaddress.ip_address(text.partition("%")[0])
+    except ValueError:
+        try:
+            text = text.encode("idna").decode("ascii")
+        except UnicodeError:
+            return False
+        labels = text.removesuffix(".").split(".")
+        # Names all of numbers are addresses that are none, e.g. 192.168.1.
+        return (
+            len(text) <= _LONGEST_HOST
+            and all(_LABEL.fullmatch(label) for label in labels)
+            and not labels[-1].isdigit()
+        )
+    return True
+
+
+def _device_path(path: str) -> str:
+    if not path.startswith("/"):
+        raise PydanticCustomError(
+            "device_path",
+            "is not the whole path of a port",
+            {"remedy": f"write it from the root, e.g. /dev/serial/by-id/... or /dev/{path or 'ttyS0'}"},
+        )
+    return path
+
+
+Host: TypeAlias = Annotated[Text, AfterValidator(_host)]
+"""Name or address of a host, without scheme and port."""
+
+DevicePath: TypeAlias = Annotated[Text, AfterValidator(_device_path)]
+"""The whole path of a device file."""

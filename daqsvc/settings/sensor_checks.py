@@ -1,0 +1,292 @@
+"""Whether what is said of a sensor can be true: unit, sensitivity, voltages, and what its channel carries."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.settings.alarms import SetpointAlarm
+from daqsvc.settings.buses import DbcLayout
+from daqsvc.settings.channel_ranges import wire_range
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.sensors import Keyphasor, ProximityProbe, TrendValue
+from daqsvc.settings.units import factor_between, same_unit, unit_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daqsvc.settings.channel_ranges import WireRange
+    from daqsvc.settings.dbc import DbcMessage
+    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.problems import KeyPath
+
+_ALONG_ONE_LINE_DEG = 1.0
+_COARSE_V = 0.5
+"""No device resolves the voltage of a sensor so coarsely."""
+
+
+class _Usual(NamedTuple):
+    """Sensitivities in mV per unit: beyond the outer ones none is built, beyond the inner ones few are."""
+
+    least: float
+    few_below: float
+    few_above: float
+    most: float
+    example: float
+
+
+_USUAL = {
+    # Eddy-current probes have 4 to 16 mV/um, 7.87 (200 mV/mil) by API 670; capacitive ones up to some 200.
+    "um": _Usual(0.05, 0.5, 100.0, 2_000.0, 7.87),
+    "mm": _Usual(50.0, 500.0, 100e3, 2e6, 7870.0),
+    "mil": _Usual(1.3, 13.0, 2_500.0, 50e3, 200.0),
+    # Accelerometers for machines have 10 to 1000 mV/g, those for shocks 0.05, those for earthquakes 10,000.
+    "g": _Usual(0.02, 0.5, 2_000.0, 100e3, 100.0),
+    "m/s2": _Usual(0.002, 0.05, 200.0, 10e3, 10.2),
+    # Velocity sensors have 4 (100 mV per in/s) to some 30.
+    "mm/s": _Usual(0.01, 0.5, 200.0, 10e3, 4.0),
+}
+
+
+def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """What is said in volts has a sensitivity to go with it, and a healthy probe lies within its limits."""
+    probe = sensor if isinstance(sensor, ProximityProbe) else None
+    if sensor.sensitivity_mv_per_unit is None:
+        if sensor.zero_v != 0:
+            yield Finding(
+                (*at, "zero_v"),
+                "has no effect without sensitivity_mv_per_unit",
+                "add sensitivity_mv_per_unit, or remove zero_v if the channel carries the physical unit",
+            )
+        if probe is not None and probe.gap_ok_v is not None:
+            yield Finding(
+                (*at, "gap_ok_v"),
+                "cannot be checked: without sensitivity_mv_per_unit the gap voltage is not known",
+                "add sensitivity_mv_per_unit and zero_v, and let the channel carry volts; or remove it",
+                fatal=False,
+            )
+        return
+    if probe is None:
+        return
+    if probe.gap_ok_v is None:
+        if not probe.ac_coupled:
+            yield Finding(
+                (*at, "gap_ok_v"),
+                "is missing: OK limits of the mean gap voltage, in V",
+                f'add gap_ok_v = [-18.0, -2.0] to the entry "{probe.name}" of sensors, as its manual has it',
+            )
+        return
+    low_v, high_v = probe.gap_ok_v
+    if low_v <= probe.zero_v <= high_v:
+        return
+    if "zero_v" in probe.model_fields_set:
+        yield Finding(
+            (*at, "zero_v"),
+            f"lies outside gap_ok_v, {low_v:g} to {high_v:g} V: the probe would not be believed where the "
+            "shaft belongs",
+            "write the gap voltage with the shaft centred, with its sign, e.g. zero_v = "
+            f"{(low_v + high_v) / 2:g}; or correct gap_ok_v",
+        )
+    elif _of_a_rotor(draft, probe.name):
+        yield Finding(
+            at,
+            "has no zero_v: its position counts from 0 V, far from where the shaft is",
+            f"add the gap voltage with the shaft centred, e.g. zero_v = {(low_v + high_v) / 2:g}",
+            fatal=False,
+        )
+
+
+def _of_a_rotor(draft: MachineFile, name: str) -> bool:
+    detectors = (draft.pipeline.rotor_bank, draft.pipeline.rotor_synchronous)
+    return any(detector is not None and name in detector.probes for detector in detectors)
+
+
+def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """The sensitivity is one that sensors of this unit have."""
+    given, usual = sensor.sensitivity_mv_per_unit, _USUAL.get(sensor.unit)
+    if given is None or usual is None or isinstance(sensor, TrendValue):
+        return
+    size = abs(given)
+    if usual.few_below <= size <= usual.few_above:
+        return
+    built = usual.least <= size <= usual.most
+    meant = [
+        f"{unit_text} are sensitivity_mv_per_unit = {value:.4g}"
+        for value, unit_text in (
+            (given * 1000.0, f"{given:g} V/{sensor.unit}"),
+            *(
+                (given * (factor_between(sensor.unit, other) or math.nan), f"{given:g} mV/{other}")
+                for other in _USUAL
+                if other != sensor.unit
+            ),
+        )
+        if usual.few_below <= abs(value) <= usual.few_above
+    ]
+    yield Finding(
+        (*at, "sensitivity_mv_per_unit"),
+        f"{given:g} mV/{sensor.unit} is what {'hardly any' if built else 'no'} sensor has; usual is some "
+        f"{usual.example:g}",
+        "; ".join(meant) or f"write it in mV per {sensor.unit}, from the sensor's calibration sheet",
+        fatal=not built,
+    )
+
+
+def check_probe_angles(draft: MachineFile) -> Iterator[Finding]:
+    """The only two probes of a machine do not look along one line; those of a rotor have their own check."""
+    probes = [
+        (index, sensor, sensor.angle_deg)
+        for index, sensor in enumerate(draft.sensors)
+        if isinstance(sensor, ProximityProbe) and sensor.angle_deg is not None
+    ]
+    if len(probes) != 2:
+        return
+    (_, first, one_deg), (index, second, other_deg) = probes
+    if _of_a_rotor(draft, first.name) or _of_a_rotor(draft, second.name):
+        return
+    apart_deg = abs(math.degrees(math.asin(math.sin(math.radians(other_deg - one_deg)))))
+    if apart_deg < _ALONG_ONE_LINE_DEG:
+        yield Finding(
+            ("sensors", index, "angle_deg"),
+            f'points along one line with "{first.name}" ({one_deg:g} deg): the two see one direction of the '
+            "motion only",
+            "correct it, unless the two probes are at different bearings",
+            fatal=False,
+        )
+
+
+def check_dbc_unit(
+    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
+) -> Iterator[Finding]:
+    """The DBC file and the sensor agree on the unit."""
+    layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
+    message = messages.get(sensor.stream)
+    if not isinstance(layout, DbcLayout) or message is None:
+        return
+    wire_unit = sensor.unit if sensor.sensitivity_mv_per_unit is None else "V"
+    signals = next((channel.signals for channel in layout.channels if channel.name == sensor.channel), ())
+    for signal in signals:
+        unit = message.signal_units.get(signal, "")
+        if unit == "" or same_unit(unit, wire_unit):
+            continue
+        factor = factor_between(unit, wire_unit)
+        said = f'the DBC file gives signal "{signal}" in "{unit}", but this sensor takes it as "{wire_unit}"'
+        known = unit_of(unit) is not None and unit_of(wire_unit) is not None
+        yield Finding(
+            (*at, "unit"),
+            said if factor is None else f"{said}: wrong by a factor of {max(factor, 1 / factor):.4g}",
+            _unit_remedy(sensor, unit, factor),
+            fatal=known,
+        )
+        return
+
+
+def _unit_remedy(sensor: Sensor, unit: str, factor: float | None) -> str:
+    meant = unit_of(unit)
+    if sensor.sensitivity_mv_per_unit is None and meant is not None and meant.quantity == "voltage":
+        return "add sensitivity_mv_per_unit, if the channel carries a voltage; or correct the DBC file"
+    if sensor.sensitivity_mv_per_unit is not None and factor is not None:
+        return f"give the signal in V in the DBC file: multiply its scale and offset there by {factor:g}"
+    if sensor.sensitivity_mv_per_unit is not None:
+        return "remove sensitivity_mv_per_unit if the device sends the physical unit; or correct the DBC file"
+    if meant is not None and factor is not None:
+        return f'write unit = "{meant.name}" if sensors of this type have it, or correct the DBC file'
+    return "correct unit (or sensitivity_mv_per_unit), or the unit in the DBC file"
+
+
+def check_reach(
+    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
+) -> Iterator[Finding]:
+    """The limits of a sensor lie within what its channel can carry."""
+    wire = wire_range(draft, sensor, messages)
+    if wire is None:
+        return
+    low, high = wire.low, wire.high
+    remedy = "correct it, or the scale of the channel"
+    volts = sensor.sensitivity_mv_per_unit is not None and not isinstance(sensor, Keyphasor)
+    if volts and wire.step >= _COARSE_V:
+        yield Finding(
+            (*at, "channel"),
+            f"is taken in volts, and one count of it would be {wire.step:g} V",
+            f"write scale = {wire.step / 1000:g} in the layout if the device counts mV",
+        )
+    if isinstance(sensor, ProximityProbe) and sensor.sensitivity_mv_per_unit is not None:
+        limits = sensor.gap_ok_v
+        if limits is not None and (limits[1] < low or high < limits[0]):
+            yield Finding(
+                (*at, "gap_ok_v"), f"is never met: the channel carries {low:g} to {high:g} V", remedy
+            )
+        elif not low <= sensor.zero_v <= high:
+            yield Finding(
+                (*at, "zero_v"), f"is never measured: the channel carries {low:g} to {high:g} V", remedy
+            )
+    elif isinstance(sensor, TrendValue) and sensor.ok_between is not None:
+        least, largest = _in_units(sensor, wire)
+        if sensor.ok_between[1] < least or largest < sensor.ok_between[0]:
+            yield Finding(
+                (*at, "ok_between"),
+                f"is never met: the channel carries {least:g} to {largest:g} {sensor.unit}",
+                remedy,
+            )
+    elif isinstance(sensor, Keyphasor):
+        least, largest = _in_units(sensor, wire)
+        if not least < sensor.threshold_v < largest:
+            yield Finding(
+                (*at, "threshold_v"),
+                f"is never crossed: the channel carries {least:g} to {largest:g} V",
+                remedy,
+            )
+
+
+def _in_units(sensor: Sensor, wire: WireRange) -> tuple[float, float]:
+    """What the channel can carry, in the unit of the sensor."""
+    a, b = (end * sensor.gain + sensor.shift for end in (wire.low, wire.high))
+    return min(a, b), max(a, b)
+
+
+def check_alarm_reach(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
+    """Setpoints lie within what the channels can carry."""
+    sensors = {sensor.name: sensor for sensor in draft.sensors}
+    for index, alarm in enumerate(draft.alarms):
+        with suppress(UnusableValueError):
+            if not isinstance(alarm, SetpointAlarm):
+                continue
+            for name in alarm.watched:
+                with suppress(UnusableValueError):
+                    sensor = sensors.get(name)
+                    reach = None if sensor is None else _reach(draft, sensor, messages, alarm.measure)
+                    if sensor is None or reach is None:
+                        continue
+                    for key, value in alarm.setpoints.items():
+                        if not reach[0] <= value <= reach[1]:
+                            unit = "V" if alarm.measure == "gap_voltage" else sensor.unit
+                            yield Finding(
+                                ("alarms", index, key),
+                                f'is never reached: the channel of "{name}" carries {_range(reach, unit)}',
+                                "correct it, or scale and sensitivity of the channel and its sensor",
+                            )
+
+
+def _range(reach: tuple[float, float], unit: str) -> str:
+    return (
+        f"{reach[1]:.4g} {unit} at most"
+        if math.isinf(reach[0])
+        else f"{reach[0]:.4g} to {reach[1]:.4g} {unit}"
+    )
+
+
+def _reach(
+    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], measure: str
+) -> tuple[float, float] | None:
+    """Least and largest value that a measure of a sensor can have; None if that is not known."""
+    wire = wire_range(draft, sensor, messages)
+    if wire is None:
+        return None
+    if measure == "gap_voltage":
+        return wire.low, wire.high
+    low, high = _in_units(sensor, wire)
+    if measure == "value":
+        return low, high
+    # From the mean to the farthest sample, where the mean may lie at one end.
+    return (-math.inf, high - low) if measure in {"rms", "peak", "peak_to_peak"} else None

@@ -1,0 +1,53 @@
+"""Units are told by what they mean, however they are spelt, and by the factor they differ."""
+
+from __future__ import annotations
+
+import pytest
+
+from daqsvc.settings.units import factor_between, same_unit, unit_of
+
+
+@pytest.mark.parametrize(
+    ("name", "spellings"),
+    [
+        ("m/s2", ["m/s2", "m/s^2", "m/s/s", "m/s²", "m / s^2", "m/sec^2", "m·s⁻²", "ms-2", "M/S2", "m/s**2"]),
+        ("g", ["g", "G", "gn", "g rms", "g(rms)", "gravity"]),
+        ("mm/s", ["mm/s", "mm/sec", "mm·s^-1", "mm/s RMS", "mm/s_rms"]),
+        ("um", ["um", "µm", "μm", "micron", "Microns", "micrometre", "um p-p", "µm pk-pk"]),
+        ("mil", ["mil", "mils", "mils pp", "thou"]),
+        ("degC", ["degC", "°C", "℃", "deg C", "C", "Celsius"]),
+        ("mV", ["mV", "MV", "millivolt"]),
+        ("V", ["V", "volt", "Volts", "VDC"]),
+        ("in/s", ["in/s", "ips", "in/sec"]),
+        ("rpm", ["rpm", "RPM", "1/min", "min^-1", "r/min"]),
+    ],
+)
+def test_a_unit_however_it_is_spelt(name, spellings):
+    assert {spelling: unit_of(spelling).name for spelling in spellings} == dict.fromkeys(spellings, name)
+    assert all(same_unit(one, other) for one in spellings for other in spellings)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "factor"),
+    [
+        ("g", "m/s²", 9.80665),
+        ("mV", "V", 1e-3),
+        ("mil", "µm", 25.4),
+        ("ips", "mm/s", 25.4),
+        ("Hz", "rpm", 60.0),
+        ("°C", "degC", 1.0),
+        ("°C", "K", None),
+        ("g", "um", None),
+        ("furlong", "um", None),
+    ],
+)
+def test_what_one_unit_is_of_another(one, other, factor):
+    assert factor_between(one, other) == (None if factor is None else pytest.approx(factor))
+
+
+def test_units_that_are_not_known_are_the_same_only_as_texts():
+    assert unit_of("furlong") is None
+    assert unit_of("") is None
+    assert same_unit("furlong", " furlong ")
+    assert not same_unit("furlong", "fathom")
+    assert not same_unit("furlong", "m")
