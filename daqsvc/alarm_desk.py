@@ -18,7 +18,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.states import AlarmState, Level, RefusedError
-from daqsvc.audit import AuditError, AuditLog
+from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 TICK_NS = NS_PER_S
+REFUSED_TICKS = 60
+"""Refused commands that are only counted are written down so often."""
 DISK_TICKS = 10
 """The disk fills slowly, and asking it may take long."""
 COMMIT_S = 5.0
@@ -110,7 +112,8 @@ class AlarmDesk:
         self.identity = identity
         self.manager = AlarmManager(identity, rules, clock, handling=handling)
         self.outbox = Outbox(store / "outbox.sqlite", clock, limits)
-        self.audit = AuditLog(store / "audit.jsonl", clock)
+        self.audit = AuditLog(store / "audit.jsonl", clock, limits.audit_max_bytes)
+        self._refusals = Refusals(clock)
         self.commands = CommandCounters()
         self.publisher = (
             None
@@ -171,6 +174,8 @@ class AlarmDesk:
         for tick in itertools.count():
             if tick % DISK_TICKS == 0:
                 await self._look_at_disk()
+            if tick % REFUSED_TICKS == 0:
+                await self._tell_refused()
             self.tick()
             await self._clock.sleep_ns(TICK_NS)
 
@@ -234,8 +239,8 @@ class AlarmDesk:
     async def settle(self, timeout_s: float) -> None:
         """Take no more commands, and wait until what is under way is on disk, at most so long."""
         self._stopping = True
-        if self._under_way:
-            await asyncio.wait(set(self._under_way), timeout=timeout_s)
+        telling = asyncio.create_task(self._tell_refused(), name="refused commands")
+        await asyncio.wait({telling, *self._under_way}, timeout=timeout_s)
 
     async def stop(self, deadline_s: float) -> None:
         """Hand over to the broker what is left, and end `run`; see `MqttPublisher.stop`."""
@@ -251,8 +256,14 @@ class AlarmDesk:
             async with self._one_at_a_time:
                 if self._stopping:
                     return self._refuse(STOPPING)
+                refusal = self.manager.refusal(command) if self._refusals.flooding else None
+                if refusal is not None:
+                    self._refusals.count(command, source, refusal)
+                    return self._refuse(refusal)
                 entry = await self.audit.asked(command, source)
                 outcome = await self._outcome(command)
+                if not outcome.accepted:
+                    self._refusals.written()
                 await self._write_down(entry, command, source, outcome)
                 return outcome
         except AuditError as error:
@@ -286,6 +297,13 @@ class AlarmDesk:
         except AuditError as error:
             self.commands.unanswered_in_log += 1
             logger.error("what came of command %s is not in the log: %s", entry, error)  # noqa: TRY400
+
+    async def _tell_refused(self) -> None:
+        """Write down how many commands were refused in a flood of them."""
+        try:
+            await self.audit.refused(self._refusals)
+        except AuditError as error:
+            logger.error("refused commands that were counted are not in the log yet: %s", error)  # noqa: TRY400
 
     def _vitals(self) -> Vitals:
         outbox, publisher = self.outbox.counters, self.publisher

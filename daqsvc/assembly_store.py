@@ -22,4 +22,5 @@ def outbox_limits(machine: MachineFile) -> OutboxLimits:
         telemetry_max_bytes=given.telemetry_max_mb * MIB,
         telemetry_max_age_ns=round(given.telemetry_max_age_s * NS_PER_S),
         reserve_bytes=given.reserve_mb * MIB,
+        audit_max_bytes=given.audit_max_mb * MIB,
     )

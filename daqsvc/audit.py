@@ -5,8 +5,10 @@ It is one file, ``audit.jsonl``, with one JSON object a line. Every command leav
 ``asked`` that nothing follows is a command under way when the service died: whether it was obeyed, the
 alarm's history tells.
 
-Nothing is ever changed or taken away. The file is opened afresh for each line, so it may be renamed at any
-time, as logrotate does.
+No line is ever changed. The file is opened afresh for each line, so it may be renamed at any time, as
+logrotate does. Once it is large it becomes ``audit-000001.jsonl`` and so on by itself, and when all of them
+exceed a quota the oldest is deleted. Commands that are refused in a flood are counted in one line a minute
+(`Refusals`), so that nobody who is refused can push out what was obeyed.
 """
 
 from __future__ import annotations
@@ -15,10 +17,13 @@ import asyncio
 import json
 import math
 import os
+import re
 import uuid
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from daqsvc.acquisition.clock import iso_utc
+from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,6 +34,15 @@ if TYPE_CHECKING:
 SCHEMA = "daqsvc.audit/1"
 MODE = 0o640
 """Whoever reads the machine's logs may read this one; nobody but the service writes it."""
+QUOTA_BYTES = 32 * 1024 * 1024
+PARTS = 8
+"""Files that make up the quota: the one that is written is at most one part of it."""
+REFUSED_IN_FULL = 30
+REFUSED_EVERY_NS = 30 * NS_PER_S
+"""So many refused commands are written down one by one, and another one for each of these times that pass."""
+SOURCES = 5
+"""Sources that a count of refused commands names; the rest are the others."""
+OTHERS = "others"
 
 
 class AuditError(Exception):
@@ -41,11 +55,14 @@ class AuditLog:
     Args:
         path: the file; it is created when it is needed, its directory must be there.
         clock: for the time of each line.
+        quota_bytes: what it may take of the disk, with its older parts.
     """
 
-    def __init__(self, path: Path, clock: Clock) -> None:
+    def __init__(self, path: Path, clock: Clock, quota_bytes: int = QUOTA_BYTES) -> None:
         self.path = path
         self._clock = clock
+        self._quota_bytes = quota_bytes
+        self._one_at_a_time = asyncio.Lock()
 
     async def asked(self, command: AlarmCommand, source: str) -> str:
         """Write down that a command has come, before it is obeyed.
@@ -80,12 +97,26 @@ class AuditLog:
         line = self._line(entry, what, command, source)
         await self._append(line | {"answer": outcome.reason, "events": list(outcome.events)})
 
-    def _line(
-        self,
-        entry: str,
-        outcome: Literal["asked", "accepted", "refused"],
-        command: AlarmCommand,
-        source: str,
+    async def refused(self, refusals: Refusals) -> None:
+        """Write down how many commands were refused without a line of their own, if any, and forget them.
+
+        Args:
+            refusals: they; kept if the line cannot be written.
+
+        Raises:
+            AuditError: the line is not on disk.
+        """
+        told = refusals.take()
+        if told is None:
+            return
+        try:
+            await self._append(self._stamp(str(uuid.uuid4()), "refused_many") | told.in_json())
+        except AuditError:
+            refusals.put_back(told)
+            raise
+
+    def _stamp(
+        self, entry: str, outcome: Literal["asked", "accepted", "refused", "refused_many"]
     ) -> dict[str, Any]:
         wall_ns = self._clock.wall_ns()
         return {
@@ -95,6 +126,16 @@ class AuditLog:
             "wall_ns": wall_ns,
             "monotonic_ns": self._clock.monotonic_ns(),
             "outcome": outcome,
+        }
+
+    def _line(
+        self,
+        entry: str,
+        outcome: Literal["asked", "accepted", "refused"],
+        command: AlarmCommand,
+        source: str,
+    ) -> dict[str, Any]:
+        return self._stamp(entry, outcome) | {
             "source": source,
             "by": command.by,
             "verb": command.verb.value,
@@ -108,7 +149,8 @@ class AuditLog:
         # ASCII only: no name or reason can smuggle a line separator in.
         text = json.dumps(line, allow_nan=False) + "\n"
         try:
-            await asyncio.to_thread(_append_durably, self.path, text.encode("ascii"))
+            async with self._one_at_a_time:
+                await asyncio.to_thread(_write, self.path, text.encode("ascii"), self._quota_bytes)
         except OSError as error:
             raise AuditError(
                 f"the audit log {self.path} cannot be written: {error.strerror or error}; "
@@ -116,9 +158,133 @@ class AuditLog:
             ) from error
 
 
+@dataclass(slots=True)
+class RefusedMany:
+    """Refused commands that have no lines of their own.
+
+    Attributes:
+        since_ns: when the first of them came, wall clock, ns since the Unix epoch.
+        count: how many they are.
+        sources: how many came from where; of more than `SOURCES` sources the rest are `OTHERS`.
+        verbs: how many asked for what.
+        answer: what the last of them was told.
+    """
+
+    since_ns: int
+    count: int = 0
+    sources: Counter[str] = field(default_factory=Counter)
+    verbs: Counter[str] = field(default_factory=Counter)
+    answer: str = ""
+
+    def in_json(self) -> dict[str, Any]:
+        """As keys of a line of the log."""
+        return {
+            "count": self.count,
+            "since": iso_utc(self.since_ns),
+            "sources": dict(self.sources),
+            "verbs": dict(self.verbs),
+            "answer": self.answer,
+        }
+
+
+class Refusals:
+    """Commands that were refused in a flood of them, counted rather than written down one by one.
+
+    Args:
+        clock: for how fast they come.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._left = REFUSED_IN_FULL
+        self._earned_ns = clock.monotonic_ns()
+        self._many: RefusedMany | None = None
+
+    @property
+    def flooding(self) -> bool:
+        """Whether the next refused command is only counted."""
+        earned, rest_ns = divmod(self._clock.monotonic_ns() - self._earned_ns, REFUSED_EVERY_NS)
+        self._earned_ns = self._clock.monotonic_ns() - rest_ns
+        self._left = min(self._left + earned, REFUSED_IN_FULL)
+        return self._left <= 0
+
+    def written(self) -> None:
+        """One was written down in full."""
+        self._left -= 1
+
+    def count(self, command: AlarmCommand, source: str, reason: str) -> None:
+        """One was refused for ``reason`` without being written down."""
+        many = self._many = self._many or RefusedMany(self._clock.wall_ns())
+        known = source in many.sources or len(many.sources) < SOURCES
+        many.count += 1
+        many.sources[source if known else OTHERS] += 1
+        many.verbs[command.verb.value] += 1
+        many.answer = reason
+
+    def take(self) -> RefusedMany | None:
+        """What has been counted since the last time; None if nothing was."""
+        many, self._many = self._many, None
+        return many
+
+    def put_back(self, earlier: RefusedMany) -> None:
+        """What was taken has not been written: it belongs to the next time."""
+        if (later := self._many) is not None:
+            earlier.count += later.count
+            for source, count in later.sources.items():
+                known = source in earlier.sources or len(earlier.sources) < SOURCES
+                earlier.sources[source if known else OTHERS] += count
+            earlier.verbs += later.verbs
+            earlier.answer = later.answer
+        self._many = earlier
+
+
 def _in_json(number: float | None) -> float | str | None:
     """A number; what JSON has no number for in words, because it has been asked for all the same."""
     return number if number is None or math.isfinite(number) else f"{number}"
+
+
+def _write(path: Path, line: bytes, quota_bytes: int) -> None:
+    """Append a line durably, and put the file aside before if it is one part of the quota; blocks.
+
+    Raises:
+        OSError: the line is not on disk as a whole.
+    """
+    try:
+        full = path.stat(follow_symlinks=False).st_size + len(line) > quota_bytes // PARTS
+    except FileNotFoundError:
+        full = False
+    if full:
+        put_aside(path, quota_bytes)
+    _append_durably(path, line)
+
+
+def put_aside(path: Path, quota_bytes: int) -> None:
+    """Make the file ``path`` the newest of its older parts, and delete the oldest beyond the quota; blocks.
+
+    Wherever this is interrupted, every line is in one file, and the next time goes on. The newest part stays
+    even if it exceeds the quota by itself: a log that was never parted is not to vanish at once.
+
+    Raises:
+        OSError: the file cannot be renamed, or an older part not be deleted.
+    """
+    parts = older_parts(path)
+    newest = 1 + max(parts, default=0)
+    parts[newest] = path.with_name(f"{path.stem}-{newest:06d}{path.suffix}")
+    path.rename(parts[newest])
+    _sync_directory(path.parent)
+    total = sum(part.stat().st_size for part in parts.values())
+    for number in sorted(parts)[:-1]:
+        if total <= quota_bytes - quota_bytes // PARTS:
+            return
+        total -= parts[number].stat().st_size
+        parts[number].unlink()
+
+
+def older_parts(path: Path) -> dict[int, Path]:
+    """The older parts of the log ``path`` by their numbers; the highest is the newest."""
+    named = re.compile(rf"{re.escape(path.stem)}-([0-9]{{6,}}){re.escape(path.suffix)}")
+    found = ((named.fullmatch(one.name), one) for one in path.parent.iterdir())
+    return {int(match[1]): one for match, one in found if match is not None}
 
 
 def _append_durably(path: Path, line: bytes) -> None:
@@ -131,7 +297,7 @@ def _append_durably(path: Path, line: bytes) -> None:
         OSError: the line is not on disk as a whole.
     """
     created = not path.exists()
-    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, MODE)
+    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, MODE)
     try:
         size = os.fstat(descriptor).st_size
         if size and os.pread(descriptor, 1, size - 1) != b"\n":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 from daqsvc.alarms.chatter import ChatterWatch
@@ -79,6 +80,12 @@ class Alarm:
             self._shelved_until_ns,
             self._chatter.chattering,
         )
+
+    def twin(self) -> Alarm:
+        """Another that stands as this one, to see what a command would come to."""
+        made = copy.copy(self)
+        made._holds = set(self._holds)  # noqa: SLF001  its own
+        return made
 
     @property
     def _shown(self) -> AlarmState:

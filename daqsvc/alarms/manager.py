@@ -185,6 +185,14 @@ class AlarmManager:
         self.counters.commands += 1
         return self._tell([event])
 
+    def refusal(self, command: AlarmCommand) -> str | None:
+        """Why `obey` would refuse a command now; None if it would not. Nothing changes by asking."""
+        try:
+            self._obeyed(command, self._named(command.alarm).twin())
+        except RefusedError as refusal:
+            return f"{refusal}"
+        return None
+
     def resume(
         self,
         told: Iterable[AlarmEvent],

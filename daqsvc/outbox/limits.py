@@ -24,6 +24,7 @@ class OutboxLimits:
         telemetry_max_age_ns: age from which on a telemetry message is dropped.
         reserve_bytes: free space that telemetry leaves on the disk to the alarms.
         ballast_bytes: room on the disk that is held for alarms on a full one (see `outbox.ballast`).
+        audit_max_bytes: size of the audit log, with its older parts, from which on the oldest is deleted.
     """
 
     alarms_max_bytes: int = 256 * MIB
@@ -34,3 +35,4 @@ class OutboxLimits:
     telemetry_max_age_ns: int = NS_PER_DAY
     reserve_bytes: int = 64 * MIB
     ballast_bytes: int = 16 * MIB
+    audit_max_bytes: int = 32 * MIB

@@ -35,3 +35,7 @@ class Store(Section):
     reserve_mb: Annotated[int, Field(ge=0, le=100_000)] = Field(
         default=64, description="free space on the disk that telemetry leaves to the alarms"
     )
+    audit_max_mb: Annotated[int, Field(ge=1, le=100_000)] = Field(
+        default=32,
+        description="size of the audit log, from which on its oldest parts are deleted",
+    )

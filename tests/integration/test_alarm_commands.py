@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -209,6 +210,34 @@ async def test_commands_are_obeyed_one_after_the_other_in_the_order_they_came(
         assert all(outcome.accepted for outcome in outcomes)
         assert list(outcomes) == sorted(outcomes, key=lambda outcome: outcome.events)
     assert [line["alarm"] for line in log(tmp_path)] == [name for name in OTHERS for _ in range(2)]
+
+
+async def test_a_flood_of_refused_commands_is_summed_up_and_hides_nothing_that_was_obeyed(
+    tmp_path: Path,
+) -> None:
+    obeyed = []
+    async with desk_in(tmp_path) as desk:
+        for number in range(600):
+            if number % 50 == 0:
+                find(desk, "danger" if number % 100 else "alert", OTHERS[number % 3])
+                command = AlarmCommand(verb=Verb.SHELVE, alarm=RUB, by="ann", duration_s=60.0)
+                assert (await desk.obey(command, "local")).accepted
+                obeyed.append(number)
+            refused = await desk.obey(
+                AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="nobody", by="mallory", reason="x" * 500), "mqtt t"
+            )
+            assert "no alarm is named 'nobody'" in refused.reason
+        assert (desk.commands.accepted, desk.commands.refused) == (len(obeyed), 600)
+        assert desk.manager.counters.events == len(await kinds(desk))
+    told = log(tmp_path)
+    by_outcome = Counter(line["outcome"] for line in told)
+    assert by_outcome["accepted"] == len(obeyed)
+    assert by_outcome["asked"] == by_outcome["accepted"] + by_outcome["refused"]
+    assert by_outcome["refused"] == audit.REFUSED_IN_FULL
+    many = [line for line in told if line["outcome"] == "refused_many"]
+    assert sum(line["count"] for line in many) == 600 - audit.REFUSED_IN_FULL
+    assert many[-1]["sources"] == {"mqtt t": many[-1]["count"]}
+    assert (tmp_path / "audit.jsonl").stat().st_size < 100_000
 
 
 async def test_more_commands_than_can_wait_are_refused(

@@ -30,12 +30,14 @@ def test_every_limit_reaches_the_outbox_in_its_unit():
         "telemetry_max_mb = 3",
         "telemetry_max_age_s = 1.5",
         "reserve_mb = 7",
+        "audit_max_mb = 5",
     ) == OutboxLimits(
         alarms_max_bytes=10 * MIB,
         alarms_keep_ns=NS_PER_DAY // 2,
         telemetry_max_bytes=3 * MIB,
         telemetry_max_age_ns=1_500_000_000,
         reserve_bytes=7 * MIB,
+        audit_max_bytes=5 * MIB,
     )
 
 
@@ -47,6 +49,7 @@ def test_every_limit_reaches_the_outbox_in_its_unit():
         ("alarms_keep_days", "0", "0.001 or more"),
         ("telemetry_max_age_s", "-1", "1 or more"),
         ("reserve_mb", "-1", "0 or more"),
+        ("audit_max_mb", "0", "1 or more"),
     ],
 )
 def test_a_limit_that_is_none_is_refused_by_name(key, value, words):
