@@ -46,6 +46,9 @@ class PickyBroker:
 
     async def _serve(self, reader, writer):
         self._writers.add(writer)
+        await self._rest(reader, writer)
+
+    async def _rest(self, reader, writer):
         with contextlib.suppress(asyncio.IncompleteReadError, OSError):
             while await self._packet(reader, writer):
                 pass

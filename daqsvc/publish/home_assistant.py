@@ -46,6 +46,12 @@ _DIGITS = {
 _DIGITS_OF_A_NUMBER = 3
 """Decimal places of a probability, and of what has no unit or an unknown one."""
 
+MOST_REMOVED = 1000
+"""Entities of an earlier message that are removed at a time."""
+
+_ENTITY = re.compile(r"[!-~]{1,300}")
+_PLATFORM = re.compile(r"[a-z_]{1,40}")
+
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
@@ -108,11 +114,15 @@ class Discovery:
         if not isinstance(entities, dict):
             return {}
         now = self._components()
-        return {
-            name: {"platform": entity["platform"]}
-            for name, entity in entities.items()
-            if name not in now and isinstance(entity, dict) and isinstance(entity.get("platform"), str)
-        }
+        found: dict[str, dict[str, str]] = {}
+        for name, entity in entities.items():
+            platform = entity.get("platform") if isinstance(entity, dict) else None
+            # Whoever may write there may have retained anything: only what a box can have said is repeated.
+            if name in now or not (isinstance(platform, str) and _PLATFORM.fullmatch(platform)):
+                continue
+            if _ENTITY.fullmatch(name) and len(found) < MOST_REMOVED:
+                found[name] = {"platform": platform}
+        return found
 
     @property
     def _id(self) -> str:

@@ -1,0 +1,240 @@
+"""A rogue broker, and a rogue client of an honest one: nothing but counters may move."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import random
+from pathlib import Path
+
+import paho.mqtt.client as paho
+import pytest
+from brokers import Consumer, eventually
+from mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
+from mqtt_publishing import publishing
+from rogue_broker import CONSENT, RogueBroker
+
+from daqsvc.alarms.commands import CommandOutcome, Verb
+from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings
+
+ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
+QUIET = "daqsvc/lab/edge-1/rig/alarms/shaft-vibration-x"
+MOST_GROWTH_MIB = 64
+
+
+class Desk:
+    def __init__(self):
+        self.asked = []
+
+    async def __call__(self, command, source):
+        self.asked.append((command, source))
+        return CommandOutcome(accepted=True)
+
+
+def resident_mib():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@contextlib.contextmanager
+def nothing_but_counters_move(caplog):
+    """No traceback, no complaint of the event loop, no memory that grows without end."""
+    caplog.set_level(logging.INFO)
+    complaints = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _loop, context: complaints.append(context))
+    before_mib = resident_mib()
+    yield
+    assert complaints == []
+    assert [r.getMessage() for r in caplog.records if r.exc_info or "Traceback" in r.getMessage()] == []
+    said = [r.getMessage() for r in caplog.records if r.name == "asyncio"]
+    assert set(said) <= {"socket.send() raised exception."}, "which is the rogue's own"
+    assert max((len(r.getMessage()) for r in caplog.records), default=0) < 2000
+    assert resident_mib() - before_mib < MOST_GROWTH_MIB
+
+
+@contextlib.asynccontextmanager
+async def listening(outbox, port, protocol, desk):
+    """A publisher that takes commands and tells Home Assistant, and comes back at once after each loss."""
+    commands = CommandSettings(("rig",), frozenset(Verb))
+    home = HomeAssistantSettings("rig", alarms=("rotor-fault",))
+    async with publishing(
+        outbox, port, protocol, handler=desk, commands=commands, home_assistant=home
+    ) as publisher:
+        publisher._backoff.next_ns = lambda: 1_000_000
+        yield publisher
+
+
+async def rogue_broker(outbox, caplog, monkeypatch, protocol, packets):
+    monkeypatch.setattr("daqsvc.publish.mqtt.TAKEN_OVER_S", 0.001)
+    monkeypatch.setattr("daqsvc.publish.home_assistant_link.EARLIER_S", 0.01)
+    monkeypatch.setattr("daqsvc.publish.suspects.FIRST_BAR_S", 0.001)
+    monkeypatch.setattr("daqsvc.publish.suspects.LONGEST_BAR_S", 0.001)
+    desk = Desk()
+    with nothing_but_counters_move(caplog):
+        async with (
+            RogueBroker(packets, packets) as broker,
+            listening(outbox, broker.port, protocol, desk) as box,
+        ):
+            while broker.left:
+                await outbox.append(ALARM, lambda _: b"{}", retain=True)
+                box.telemetry("status", b"{}")
+                await asyncio.sleep(0.01)
+            await eventually(lambda: box.counters.connected, "connected to what is an honest broker now")
+            broker.taken.clear()
+            written = outbox.counters.appended
+            await outbox.append(ALARM, lambda _: b"{}", retain=True)
+            box.telemetry("status", b"{}")
+            await eventually(lambda: ALARM in broker.taken, "alarms pass")
+            await eventually(lambda: "daqsvc/lab/edge-1/status" in broker.taken, "and so does telemetry")
+            assert outbox.counters.appended == written + 1
+            assert box.figures()["faults"] == 0
+            figures = box.figures()
+    assert desk.asked == [], "what it sends is far too old to be obeyed"
+    assert broker.connections > packets / 200
+    assert figures["ignored"] > 0
+    assert figures["commands"]["malformed"] > 0
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_rogue_broker_costs_connections_and_nothing_else(outbox, caplog, monkeypatch, protocol):
+    await rogue_broker(outbox, caplog, monkeypatch, protocol, 2000)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_rogue_broker_with_a_lot_of_patience(outbox, caplog, monkeypatch, protocol):
+    await rogue_broker(outbox, caplog, monkeypatch, protocol, 100_000)
+
+
+def rogue_message(dice):
+    """Topic, payload, QoS, retain and properties of a message that an honest broker passes on."""
+    topics = (*TOPICS, f"{COMMANDS}/{'x' * 65_000}")
+    topic = dice.choice(topics) if dice.random() < 0.5 else f"{COMMANDS}/acknowledge"
+    told = paho.Properties(paho.PacketTypes.PUBLISH)
+    if dice.random() < 0.3:
+        told.ResponseTopic = dice.choice(("operators/ada", ALARM, "homeassistant/device/x/config", "x" * 300))
+    if dice.random() < 0.3:
+        told.CorrelationData = dice.randbytes(dice.choice((0, 8, 60_000)))
+    return topic, payload(dice), dice.choice((0, 1)), dice.random() < 0.05, told
+
+
+async def rogue_client(mosquitto, outbox, caplog, protocol, messages):
+    desk = Desk()
+    dice = random.Random(messages)
+    sender = paho.Client(paho.CallbackAPIVersion.VERSION2, "rogue", protocol=paho.MQTTv5)
+    with nothing_but_counters_move(caplog):
+        async with (
+            Consumer(mosquitto.port, QUIET) as live,
+            listening(outbox, mosquitto.port, protocol, desk) as box,
+        ):
+            await eventually(lambda: box.counters.connected, "connected")
+            await asyncio.to_thread(sender.connect, "127.0.0.1", mosquitto.port)
+            sender.loop_start()
+            for number in range(messages):
+                sender.publish(*rogue_message(dice))
+                if number % 50 == 0:
+                    await asyncio.sleep(0.02)
+                    await eventually(lambda: not sender.want_write(), "the broker takes what is sent")
+            arrived = sender.publish(f"{COMMANDS}/acknowledge", b"the last", 1)
+            await eventually(arrived.is_published, "the broker has it all")
+            sender.disconnect()
+            await asyncio.to_thread(sender.loop_stop)
+            await outbox.append(QUIET, lambda _: b"{}", retain=True)
+            await eventually(lambda: live.messages, "alarms pass")
+            figures = box.figures()
+    assert desk.asked == []
+    assert figures["faults"] == 0
+    assert figures["connections"] == 1
+    assert figures["commands"]["malformed"] > 0
+    assert figures["commands"]["stale"] > 0
+
+
+@pytest.mark.mosquitto
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_rogue_client_moves_counters_and_nothing_else(mosquitto, outbox, caplog, protocol):
+    await rogue_client(mosquitto, outbox, caplog, protocol, 2000)
+
+
+@pytest.mark.long
+@pytest.mark.mosquitto
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_rogue_client_with_a_lot_of_patience(mosquitto, outbox, caplog, protocol):
+    await rogue_client(mosquitto, outbox, caplog, protocol, 100_000)
+
+
+FOREIGN = ("notice", "company/notice", "company/site/notice", "daqsvc/lab/edge-2/rig/commands/acknowledge")
+
+
+def message(topic, *, mqtt5, said=b"{}", flags=1):
+    raw = topic.encode()
+    body = len(raw).to_bytes(2, "big") + raw + (b"\x00" if mqtt5 else b"") + said
+    return bytes([0x30 | flags, len(body)]) + body
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+@pytest.mark.parametrize("when", ["before its consent", "with its consent", "afterwards"])
+async def test_messages_that_nobody_subscribed_to_are_ignored_at_every_start(outbox, caplog, protocol, when):
+    """Retained at the broker, or of a session of long ago; aedes and amqtt send them while the box
+    connects."""
+    mqtt5 = protocol == "5"
+    strays = b"".join(message(topic, mqtt5=mqtt5) for topic in FOREIGN)
+
+    class Hasty(RogueBroker):
+        async def _serve(self, reader, writer):
+            write = writer.write
+            ways = {
+                "before its consent": lambda data: write(strays + data),
+                "with its consent": lambda data: write(data + strays),
+                "afterwards": lambda data: (
+                    write(data),
+                    asyncio.get_running_loop().call_later(0.01, write, strays),
+                ),
+            }
+
+            def written(data):
+                (ways[when] if data == CONSENT[mqtt5] else write)(data)
+
+            writer.write = written
+            await super()._serve(reader, writer)
+
+    desk = Desk()
+    with nothing_but_counters_move(caplog):
+        async with Hasty(1, 0) as broker:
+            for start in range(1, 4):
+                async with listening(outbox, broker.port, protocol, desk) as box:
+                    await eventually(lambda b=box: b.counters.ignored == len(FOREIGN), "they are counted")
+                    await outbox.append(ALARM, lambda _: b"{}", retain=True)
+                    await eventually(lambda: outbox.counters.depth == 0, "alarms pass")
+                    assert broker.connections == start
+                    assert box.figures()["faults"] == 0
+            assert not [topic for topic in broker.taken if "response" in topic], "nobody is answered there"
+    assert desk.asked == []
+
+
+@pytest.mark.mosquitto
+@pytest.mark.parametrize("told", DISCOVERIES, ids=range(len(DISCOVERIES)))
+async def test_a_retained_discovery_message_may_say_anything(mosquitto, outbox, caplog, told):
+    topic = "homeassistant/device/daqsvc_2flab_2fedge-1_2frig/config"
+    desk = Desk()
+    sender = paho.Client(paho.CallbackAPIVersion.VERSION2, "rogue")
+    await asyncio.to_thread(sender.connect, "127.0.0.1", mosquitto.port)
+    sender.loop_start()
+    left = sender.publish(topic, json.dumps(told), 1, retain=True)
+    await eventually(left.is_published, "it is retained")
+    sender.disconnect()
+    await asyncio.to_thread(sender.loop_stop)
+    with nothing_but_counters_move(caplog):
+        async with (
+            listening(outbox, mosquitto.port, "5", desk) as box,
+            Consumer(mosquitto.port, topic) as live,
+        ):
+            await eventually(
+                lambda: any("device" in m.payload for m in live.messages), "the box tells its own"
+            )
+            assert box.figures()["faults"] == 0
+            assert box.counters.connections == 1

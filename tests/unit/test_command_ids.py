@@ -1,0 +1,78 @@
+"""Ids of commands: on disk before a command is obeyed, bounded, and read back from whatever is left."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from daqsvc.outbox import command_ids
+from daqsvc.outbox.command_ids import CommandIds
+
+NOW, LATER = 10**18, 10**18 + 60 * 10**9
+
+
+def remember(ids, identifier, *, until_ns=LATER, now_ns=NOW, machine="rig"):
+    return ids.remember(machine, identifier, until_ns=until_ns, now_ns=now_ns)
+
+
+def test_an_id_is_known_until_it_is_too_old_and_after_every_restart(tmp_path):
+    path = tmp_path / "ids"
+    assert remember(CommandIds(path), "a") == "new"
+    ids = CommandIds(path)
+    assert remember(ids, "a") == "known"
+    assert remember(ids, "a", machine="pump") == "new"
+    assert remember(ids, "a", now_ns=LATER, until_ns=LATER + 1) == "new"
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_the_file_stays_small_and_forgets_nothing_that_could_come_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(command_ids, "REMEMBERED", 20)
+    path = tmp_path / "ids"
+    ids = CommandIds(path)
+    for number in range(200):
+        now_ns = NOW + number * 10**9
+        assert remember(ids, f"n{number}", now_ns=now_ns, until_ns=now_ns + 10 * 10**9) == "new"
+    assert path.stat().st_size < 60 * 50
+    ids = CommandIds(path)
+    for number in range(190, 200):
+        assert remember(ids, f"n{number}", now_ns=now_ns) == "known"
+
+
+def test_too_many_at_a_time_are_refused_over_restarts_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(command_ids, "REMEMBERED", 10)
+    path = tmp_path / "ids"
+    for number in range(10):
+        assert remember(CommandIds(path), f"n{number}") == "new"
+    assert remember(CommandIds(path), "n10") == "full"
+    assert remember(CommandIds(path), "n0") == "known"
+    assert remember(CommandIds(path), "n10", now_ns=LATER, until_ns=LATER + 1) == "new"
+
+
+def test_of_a_damaged_file_every_whole_line_counts(tmp_path):
+    path = tmp_path / "ids"
+    for number in range(50):
+        remember(CommandIds(path), f"n{number}")
+    whole = path.read_bytes()
+    dice = random.Random(1)
+    for _ in range(25):
+        spoilt = bytearray(whole)
+        for _ in range(dice.randrange(1, 4)):
+            spoilt[dice.randrange(len(spoilt))] = dice.randrange(256)
+        path.write_bytes(spoilt[: dice.randrange(len(spoilt) + 1)])
+        lines = set(path.read_bytes().split(b"\n"))
+        ids = CommandIds(path)
+        for number, line in enumerate(line for line in whole.split(b"\n") if line):
+            assert remember(ids, f"n{number}") == ("known" if line in lines else "new")
+
+
+@pytest.mark.parametrize("what", ["directory", "link"])
+def test_what_is_no_file_of_ours_is_an_error(tmp_path, what):
+    path = tmp_path / "ids"
+    if what == "directory":
+        path.mkdir()
+    else:
+        (tmp_path / "other").write_text("")
+        path.symlink_to(tmp_path / "other")
+    with pytest.raises(OSError):  # noqa: PT011  whichever it is, the command is refused with its words
+        remember(CommandIds(path), "a")
