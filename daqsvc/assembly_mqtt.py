@@ -6,9 +6,10 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, get_args
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.expected import handling_conditions
-from daqsvc.diagnosis.pipeline import SILENT_PERIODS
+from daqsvc.assembly_streams import patience
 from daqsvc.publish.settings import STALE_S, CommandSettings, HomeAssistantSettings, MqttSettings, Reading
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
@@ -131,7 +132,9 @@ def _readings(machine: MachineFile) -> Iterator[Reading]:
     pipeline = machine.pipeline
     if pipeline.levels is not None:
         for sensor in _measured(machine):
-            yield from _levels(sensor, machine.streams[sensor.stream].rate_hz)
+            rate_hz = machine.streams[sensor.stream].rate_hz
+            silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
+            yield from _levels(sensor, max(STALE_S, math.ceil(silent_s)))
     if pipeline.rotor_bank is not None:
         yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
         for mode in pipeline.rotor_bank.modes:
@@ -153,16 +156,15 @@ def _measured(machine: MachineFile) -> Iterator[Sensor]:
     return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
 
 
-def _levels(sensor: Sensor, rate_hz: float) -> Iterator[Reading]:
+def _levels(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
     detector = f"levels/{sensor.name}"
     if isinstance(sensor, TrendValue):
-        stale_s = max(STALE_S, math.ceil(SILENT_PERIODS / rate_hz))
         yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
         return
-    yield Reading(detector, "statistics", "rms", sensor.unit)
-    yield Reading(detector, "statistics", "peak", sensor.unit)
+    yield Reading(detector, "statistics", "rms", sensor.unit, stale_s)
+    yield Reading(detector, "statistics", "peak", sensor.unit, stale_s)
     if isinstance(sensor, ProximityProbe):
         if sensor.sensitivity_mv_per_unit is not None:
-            yield Reading(detector, "statistics", "gap_voltage", "V")
+            yield Reading(detector, "statistics", "gap_voltage", "V", stale_s)
     else:
-        yield Reading(detector, "statistics", "velocity_rms", "mm/s")
+        yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)

@@ -19,6 +19,7 @@ from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
 from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.assembly_store import outbox_limits
+from daqsvc.assembly_streams import at_once, patience
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
@@ -126,7 +127,7 @@ class Service:
             self._report,
             self.clock,
             settling_ns=settling_ns,
-            rate_hz={grid.name: grid.rate_hz for grid in grids},
+            patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
         )
         self.desk = AlarmDesk(
             self._identity,
@@ -294,6 +295,7 @@ def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> Sa
     wanted = round(machine.pipeline.ring_s * grid.rate_hz)
     # However short a ring is asked for, a detector must find its block in it, and some time to come for it.
     needed = max((4 * d.block for d in detectors if d.stream == grid.name), default=1)
+    needed = max(needed, 2 * at_once(machine, grid.name))
     return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
 
 

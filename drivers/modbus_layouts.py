@@ -171,7 +171,7 @@ class Trigger:
     Attributes:
         address: holding register to write.
         value: what to write.
-        every_ns: how long to wait for a block before it is written again.
+        every_ns: how often to write it.
     """
 
     address: int

@@ -52,9 +52,12 @@ class _Ended(NamedTuple):
 class WaveformReader(PollingReader):
     """Fetches every block that the device takes.
 
-    Blocks stand apart in time: the samples that nobody took in between are told as missing before the
-    block, by the host clock; as lost are counted only those of blocks that the device took and that
-    could not be read whole.
+    Blocks are snapshots: between them nobody samples, and nothing is missing. How long that was is told by
+    the host clock; as lost are counted only those of blocks that the device took and that could not be read
+    whole.
+
+    A trigger is written when it is due, never more often: it may cost a sensor a part of its battery. So it
+    is not written again when its reply is lost, for the device may have heard it.
 
     Nothing in a block tells when it was taken. But the last look at the id that found another one was before
     its end, and the first that found its own was after it: it ended midway, give or take half of that time.
@@ -117,7 +120,6 @@ class WaveformReader(PollingReader):
             self._counters.blocks_torn += 1
             self._lose(1)
             return
-        self._triggered_ns = None
         self._hand_on(rows, ended)
 
     async def _read_block(self, line: ModbusLine, block_id: int) -> bytes | None:
@@ -142,14 +144,14 @@ class WaveformReader(PollingReader):
         await self._clock.sleep_ns(self._layout.poll_ns)
 
     async def _trigger(self, line: ModbusLine) -> None:
-        """Make the device take a block, unless it is at it."""
+        """Make the device take a block, if one is due."""
         trigger = self._layout.trigger
         if trigger is None:
             return
         now_ns = self._clock.monotonic_ns()
         if self._triggered_ns is None or now_ns - self._triggered_ns >= trigger.every_ns:
-            await line.write(self._layout.unit, trigger.address, [trigger.value])
             self._triggered_ns = now_ns
+            await line.write(self._layout.unit, trigger.address, [trigger.value])
 
     async def _id(self, line: ModbusLine) -> int:
         """The id of the block that the device shows, and with a new one when that block ended."""
@@ -215,20 +217,26 @@ class WaveformReader(PollingReader):
             self._stream_counters, self._name, np.ascontiguousarray(self._layout.record.decode(raw))
         )
         span_ns = round(len(samples) * self._period_ns)
-        first, missing = 0, 0
         t_first_ns = ended.t_ns - span_ns
         quality = Quality.GOOD if math.isfinite(ended.error_ns) else Quality.TIME_UNSETTLED
-        if self._end is not None:
-            end_index, end_ns = self._end
-            missing = max(round((t_first_ns - end_ns) / self._period_ns), self._lost_since)
-            first = end_index + missing
-        self._lost_since = 0
-        if missing:
+        end_index, end_ns = self._end or (0, t_first_ns)
+        lost, self._lost_since = self._lost_since, 0
+        pause = max(round((t_first_ns - end_ns) / self._period_ns) - lost, 0)
+        first = end_index + lost + pause
+        if lost:
             quality |= Quality.AFTER_LOSS | Quality.LOSS_ESTIMATED
             self._stream_counters.gaps += 1
         self._end = (first + len(samples), ended.t_ns)
         self._deliver(
             SampleBlock(
-                self._name, first, samples, t_first_ns, self._period_ns, missing, quality, ended.error_ns
+                self._name,
+                first,
+                samples,
+                t_first_ns,
+                self._period_ns,
+                lost,
+                quality,
+                ended.error_ns,
+                pause,
             )
         )

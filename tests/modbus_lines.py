@@ -68,7 +68,7 @@ class Rig:
         """Blocks follow each other by index, but for what they say is missing."""
         blocks = self.blocks[stream]
         for before, block in itertools.pairwise(blocks):
-            assert block.first_index == before.end_index + block.lost_before
+            assert block.first_index == before.end_index + block.gap
         assert sum(len(block.samples) for block in blocks) == self.counters(stream).samples_received
         assert sum(block.lost_before for block in blocks) == self.counters(stream).samples_lost
 

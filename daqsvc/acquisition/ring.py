@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock, Samples
 
 ANCHORS = 4096
+SNAPSHOTS = 1024
+"""Snapshots that a ring remembers the places of."""
 GAPS = 256
 """Gaps that a ring remembers, to tell what a reader has missed from what nobody ever had."""
 
@@ -81,6 +83,7 @@ class SampleRing:
         self._anchor_time = [(0, 0.0)] * ANCHORS
         self._anchors = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=GAPS)
+        self._snapshots: deque[tuple[int, int]] = deque(maxlen=SNAPSHOTS)
         self._order = itertools.count()
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
         self._closed = False
@@ -101,7 +104,7 @@ class SampleRing:
         return 0 if self._end is None else self._end
 
     def write(self, block: SampleBlock) -> None:
-        """Append a block; ``lost_before`` samples before it become rows of NaN.
+        """Append a block; what is lost before it, and a pause, become rows of NaN.
 
         Raises:
             ValueError: the block has other channels, or does not follow the last one.
@@ -113,18 +116,20 @@ class SampleRing:
                 f"the ring {len(self.channels)}"
             )
         if self._end is None:
-            self._end = self._oldest = block.first_index - block.lost_before
-        if block.first_index != self._end + block.lost_before:
+            self._end = self._oldest = block.first_index - block.gap
+        if block.first_index != self._end + block.gap:
             raise ValueError(
                 f"block of {self.stream!r} at index {block.first_index} does not follow {self._end} "
-                f"with {block.lost_before} samples lost between"
+                f"with {block.gap} samples between that are lost or were never taken"
             )
         # Readers on other threads compare with this before and after they copy.
         self._oldest = max(self._oldest, block.end_index - self.capacity)
-        if block.lost_before:
+        if block.gap:
             self._gaps.append((self._end, block.first_index))
-        self._fill(self._end, block.lost_before, None)
+        self._fill(self._end, block.gap, None)
         self._fill(block.first_index, n, block.samples)
+        if block.pause_before is not None:
+            self._snapshots.append((block.first_index, block.end_index))
         self.samples_lost += block.lost_before
         slot = self._anchors % ANCHORS
         self._anchor_index[slot] = block.first_index
@@ -162,6 +167,15 @@ class SampleRing:
         if first < self._oldest:
             raise RingOverrun(self.stream, first, self._oldest)
         return copy
+
+    @property
+    def has_snapshots(self) -> bool:
+        """Whether its blocks are snapshots, each by itself."""
+        return bool(self._snapshots)
+
+    def snapshot_from(self, index: int) -> tuple[int, int] | None:
+        """First and end index of the oldest snapshot that ends behind ``index``; None if there is none."""
+        return next((place for place in self._snapshots if place[1] > index), None)
 
     def lost_between(self, first: int, end: int) -> int:
         """How many of the samples from index ``first`` up to ``end`` are missing, by the last `GAPS` gaps."""
@@ -236,12 +250,14 @@ class Chunk:
         samples: float32 ``[n, channels]``, a private copy.
         skipped: samples between the last chunk and this one that were overwritten before they were read.
         lost: how many of these were missing anyway: an outage that is longer than the ring.
+        snapshot: whether it is one block that was taken by itself.
     """
 
     first_index: int
     samples: Samples
     skipped: int
     lost: int = 0
+    snapshot: bool = False
 
 
 class RingReader:
@@ -267,6 +283,8 @@ class RingReader:
     async def take(self, block: int, most_blocks: int) -> Chunk:
         """Wait for ``block`` samples and read as many whole blocks as there are, up to ``most_blocks``.
 
+        Of a stream of snapshots the next one is read, whatever its length.
+
         Raises:
             RingClosed: the ring was closed with less than a block left.
         """
@@ -275,6 +293,8 @@ class RingReader:
             if not ring.started:
                 await self._first_block()
             self.position = ring.oldest_index
+        if ring.has_snapshots:
+            return await self._take_snapshot(self.position)
         skipped = lost = 0
         while True:
             await ring.wait_for(self.position + block)
@@ -290,6 +310,24 @@ class RingReader:
             self.position += count
             self.samples_skipped += skipped - lost
             return chunk
+
+    async def _take_snapshot(self, position: int) -> Chunk:
+        ring, skipped = self.ring, 0
+        while True:
+            await ring.wait_for(position + 1)
+            place = ring.snapshot_from(position)
+            if place is None:
+                position = self.position = ring.end_index
+                continue
+            first, end = place
+            position = self.position = end
+            try:
+                samples = ring.read(first, end - first)
+            except RingOverrun:
+                skipped += end - first
+                continue
+            self.samples_skipped += skipped
+            return Chunk(first, samples, skipped, snapshot=True)
 
     async def _first_block(self) -> None:
         # Any index will do: the first block starts wherever the device's counter stands.

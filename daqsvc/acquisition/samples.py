@@ -1,4 +1,8 @@
-"""What flows from a driver into the ring: blocks of samples that know their place, time and loss."""
+"""What flows from a driver into the ring: blocks of samples that know their place, time and loss.
+
+Most streams go on from block to block: what lies between two of them is lost. A device that takes a waveform
+now and then sends snapshots: each is complete by itself, and between them nothing is missing.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +46,8 @@ class SampleBlock:
         period_ns: estimated time between samples.
         lost_before: samples known to be missing between the previous block and this one.
         quality: what is known against this block.
+        pause_before: of a snapshot, how many samples long the time was before it in which nobody sampled, by
+            the clock, beside ``lost_before``. None if the stream goes on from block to block.
         t_error_ns: how far ``t_first_ns`` may be off (95th percentile), beside the constant part of the delay
             from the device to the host; infinite if nobody knows.
     """
@@ -54,6 +60,7 @@ class SampleBlock:
     lost_before: int = 0
     quality: Quality = Quality.GOOD
     t_error_ns: float = math.inf
+    pause_before: int | None = None
 
     def __post_init__(self) -> None:
         if self.samples.ndim != 2 or self.samples.dtype != np.float32:
@@ -67,6 +74,13 @@ class SampleBlock:
             )
         if self.lost_before < 0:
             raise ValueError(f"lost_before of {self.stream!r} is {self.lost_before}; it cannot be negative")
+        if self.pause_before is not None and self.pause_before < 0:
+            raise ValueError(f"pause_before of {self.stream!r} is {self.pause_before}; it cannot be negative")
+
+    @property
+    def gap(self) -> int:
+        """Rows between the previous block and this one that hold nothing: lost, or never taken."""
+        return self.lost_before + (self.pause_before or 0)
 
     @property
     def end_index(self) -> int:

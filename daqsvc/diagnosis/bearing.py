@@ -143,6 +143,8 @@ class BearingDetector:
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
+        if window.snapshot:
+            return [self._snapshot(window)]
         if window.first_index != self._end_index:
             self._forget()
         said = []
@@ -178,8 +180,27 @@ class BearingDetector:
             return None
         return self._look(t_ns, last=True)
 
-    def _look(self, t_ns: int, *, last: bool = False) -> Diagnosis:
-        """Judge what is pending."""
+    def _snapshot(self, window: Window) -> Diagnosis:
+        """A look at a block by itself: evidence is not gathered over several, but they must agree as ever."""
+        self._end_index = window.first_index + len(window.samples)
+        for watch in self._watches.values():
+            watch.forget()
+        least = _LEAST_LAST * WINDOW_S
+        if len(window.samples) < least * self._rate_hz:
+            length_s = len(window.samples) / self._rate_hz
+            reason = (
+                f"a block of {self.stream} is {length_s:.3g} s long, and a bearing is judged by {least:g} s "
+                "or more; make the device take longer blocks"
+            )
+            look = Look({}, {}, "missing", reason, None)
+            return self._statement(look, window.first_index, window.t_end_ns, changed=False)
+        # What follows is another block: a row without samples keeps them apart.
+        apart = np.full((1, window.samples.shape[1]), np.nan, np.float32)
+        self._pending = [window.samples]
+        return self._look(window.t_end_ns, apart=apart)
+
+    def _look(self, t_ns: int, *, last: bool = False, apart: NDArray[np.float32] | None = None) -> Diagnosis:
+        """Judge what is pending; ``apart`` keeps it from what follows where that does not go on from it."""
         samples = np.concatenate(self._pending)
         self._pending = []
         first_index = self._end_index - len(samples)
@@ -191,7 +212,8 @@ class BearingDetector:
         self.seen = look
         changed = self._steadfast.look(look.finding, last=last)
         if self.baseline is None:
-            self.baseline = self._learning.take(samples, look.finding, self._speed_rpm)
+            learnt_from = samples if apart is None else np.concatenate((samples, apart))
+            self.baseline = self._learning.take(learnt_from, look.finding, self._speed_rpm)
             if self.baseline is not None:
                 self._watches, self._directions = self._new_watches(), self._new_directions()
                 if self._keep is not None:

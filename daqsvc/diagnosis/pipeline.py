@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.trends import BRIDGED
+from daqsvc.diagnosis.silence import Patience
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -30,11 +30,6 @@ MOST_BLOCKS = 64
 """Blocks in one window at most: a detector that is behind catches up in long strides."""
 
 LOOK_NS = NS_PER_S // 2
-SILENCE_NS = 2 * NS_PER_S
-"""A stream from which nothing has come for so long is silent, ..."""
-
-SILENT_PERIODS = BRIDGED + 1.5
-"""... but not before so many of its sampling periods: a value that is polled once a minute is no silence."""
 
 
 @dataclass(slots=True)
@@ -66,7 +61,7 @@ class Pipeline:
         clock: tells how long a stream has been silent.
         threads: kernels that may run at a time.
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
-        rate_hz: by stream, its sampling rate; whatever is not named is fast.
+        patience: by stream, how long it may be silent; whatever is not named is fast.
     """
 
     def __init__(
@@ -77,17 +72,14 @@ class Pipeline:
         clock: Clock,
         threads: int = 2,
         settling_ns: Mapping[str, int] | None = None,
-        rate_hz: Mapping[str, float] | None = None,
+        patience: Mapping[str, Patience] | None = None,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
         self._readers = {d.name: RingReader(rings[d.stream]) for d in detectors}
         self._rings = rings
         self._settling_ns = settling_ns or {}
-        self._patience_ns = dict.fromkeys(rings, SILENCE_NS) | {
-            name: max(SILENCE_NS, round(SILENT_PERIODS * NS_PER_S / rate))
-            for name, rate in (rate_hz or {}).items()
-        }
+        self._patience = {name: Patience() for name in rings} | dict(patience or {})
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._report = report
         self._clock = clock
@@ -153,9 +145,11 @@ class Pipeline:
                 since_ns = {name: heard_ns + late_ns for name, heard_ns in since_ns.items()}
             for name, ring in self._rings.items():
                 if ring.end_index != ends[name]:
+                    if name not in said:
+                        self._patience[name].heard_after(now_ns - since_ns[name])
                     ends[name], since_ns[name] = ring.end_index, now_ns
                     said.discard(name)
-                elif name not in said and now_ns - since_ns[name] >= self._patience_ns[name]:
+                elif name not in said and now_ns - since_ns[name] >= self._patience[name].ns:
                     said.add(name)
                     self._silent_until_ns[name] = now_ns
                     silence_s = (now_ns - since_ns[name]) / NS_PER_S
@@ -191,7 +185,14 @@ class Pipeline:
 
 def _window(ring: SampleRing, chunk: Chunk) -> Window:
     last = chunk.first_index + len(chunk.samples) - 1
-    return Window(chunk.first_index, chunk.samples, ring.time_of(last), ring.period_at(last), chunk.skipped)
+    return Window(
+        chunk.first_index,
+        chunk.samples,
+        ring.time_of(last),
+        ring.period_at(last),
+        chunk.skipped,
+        chunk.snapshot,
+    )
 
 
 def _process(detector: Detector, window: Window, counters: DetectorCounters) -> Sequence[Diagnosis]:

@@ -295,7 +295,7 @@ class BlockTrigger(Section):
     address: Annotated[Address, Field(description="holding register to write", examples=[98])]
     value: Annotated[int, Field(ge=0, le=65_535)] = 1
     every_s: Annotated[float, Field(ge=0.1, le=86_400)] = Field(
-        default=60.0, description="how long to wait for a block before it is written again"
+        default=60.0, description="how often to write it: each costs a sensor with a battery a part of that"
     )
 
 

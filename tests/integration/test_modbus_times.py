@@ -65,7 +65,7 @@ def waveforms(poll_ns, most_late_ns, seed, every_s, samples=200, rate_hz=2000.0,
 
     simulate(main)
     for before, block in itertools.pairwise(rig.blocks["s"]):
-        assert block.first_index == before.end_index + block.lost_before
+        assert block.first_index == before.end_index + block.gap
     numbers = [int(b.samples[0, 0] + 30_000 * (b.samples[0, 1] - 100)) // samples for b in rig.blocks["s"]]
     return rig, numbers, ended_ns
 

@@ -7,8 +7,9 @@ import contextlib
 
 import numpy as np
 import pytest
-from modbus_lines import Rig, ramp, until
+from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate, until
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality
 from drivers.modbus_layouts import Count, Fifo, Page, Ring, Trend, Trigger, Waveform, sample_record
 from drivers.registers import RegisterField, RegisterRecord, Run
@@ -196,8 +197,8 @@ async def test_waveform_blocks_are_read_whole_and_missed_ones_are_counted(page):
     np.testing.assert_array_equal(second.samples, ramp(600, first=1800))
     assert rig.counters("s").samples_lost == 1200
     assert rig.driver.counters.blocks_missed == 2
-    assert second.first_index == first.end_index + second.lost_before
-    assert second.lost_before >= 1200
+    assert second.first_index == first.end_index + second.gap
+    assert (first.pause_before, second.lost_before) == (0, 1200)
     assert second.quality & Quality.LOSS_ESTIMATED
 
 
@@ -214,15 +215,43 @@ async def test_a_block_that_is_replaced_while_it_is_read_is_dropped_and_counted(
     assert rig.counters("s").samples_lost == 600
 
 
-async def test_a_block_is_triggered_and_waited_for():
-    layout = Waveform(1, "holding", 0, 100, 300, SAMPLE, None, Trigger(95, 1, 60_000_000_000), 1_000_000)
-    async with serving(layout, 20_000.0, writes=[{"unit": 1, "address": 95}]) as (rig, faults, put):
-        put(0, 300)  # before anybody asked for a block
-        async with rig.running():
-            for k in range(1, 4):
-                asked = lambda: sum(pdu[0] == 16 for _, pdu in faults.asked)  # noqa: E731
-                await until(lambda k=k, asked=asked: asked() == k)
-                put(300 * k, 300)
-                await until(lambda k=k: rig.counters("s").samples_received == 300 * k)
-    np.testing.assert_array_equal(rig.samples("s"), ramp(900, first=300))
+@pytest.mark.parametrize("unheard", [False, True], ids=["sound", "replies get lost"])
+def test_a_block_is_triggered_as_often_as_is_asked_for_and_no_more(unheard):
+    every_s, taking_s = 10.0, 0.3
+    layout = Waveform(1, "holding", 0, 100, 300, SAMPLE, None, Trigger(95, 1, round(every_s * NS_PER_S)))
+    rig = Rig(
+        options_of(serial=False, writes=[{"unit": 1, "address": 95}]),
+        {"s": (layout, 1000.0)},
+        clock=LoopClock(),
+    )
+    written_s, units = [], {1: ModbusUnit()}
+    store = store_for(units[1], layout)
+
+    def plan(_unit, pdu):
+        if pdu[0] != 16:
+            return Answer()
+        written_s.append(asyncio.get_running_loop().time())
+        # A reply that is cut off: the device has heard the request.
+        return Answer("truncated" if unheard and len(written_s) % 3 == 2 else "none")
+
+    async def main():
+        async with responding(units, plan, serial=False), rig.running():
+            taken = 0
+            for _ in range(1000):  # 100 s
+                await asyncio.sleep(0.1)
+                if len(written_s) > taken and asyncio.get_running_loop().time() - written_s[-1] >= taking_s:
+                    store.put(300 * taken, encode(SAMPLE, ramp(300, first=300 * taken)))
+                    taken += 1
+
+    simulate(main)
+    assert 8 <= len(written_s) <= 11
+    assert np.diff(written_s).min() >= every_s - 1e-6
+    blocks = rig.blocks["s"]
+    assert len(blocks) >= 8
+    np.testing.assert_array_equal(rig.samples("s"), ramp(300 * len(blocks)))
     assert rig.counters("s").samples_lost == 0
+    rig.check_books("s")
+    # Between them nothing is missing: each is a snapshot, as far from the one before as the clock says.
+    assert all(not block.quality & Quality.AFTER_LOSS and block.lost_before == 0 for block in blocks)
+    apart_s = np.array([block.pause_before for block in blocks[1:]]) / 1000.0
+    assert apart_s == pytest.approx(every_s - taking_s, abs=0.3)

@@ -13,6 +13,7 @@ from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.silence import Patience
 
 if TYPE_CHECKING:
     import pytest
@@ -158,7 +159,7 @@ async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
 async def test_a_stream_that_is_sampled_once_a_minute_is_silent_after_minutes_only() -> None:
     clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
     said: list[Diagnosis] = []
-    pipeline = Pipeline({"s": ring}, [Listener("one", 1)], said.append, clock, rate_hz={"s": 1 / 60})
+    pipeline = Pipeline({"s": ring}, [Listener("one", 1)], said.append, clock, patience={"s": Patience(60e9)})
     running = asyncio.create_task(pipeline.run())
     await asyncio.sleep(0.005)
     silent_at = []

@@ -19,6 +19,7 @@ from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.diagnosis.level_statements import Limits
 from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.silence import Patience
 from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus import ModbusDriver
@@ -60,7 +61,7 @@ class Oil:
         channel = TrendChannel("oil", 0, "degC", [Limits("value", 80.0, None)])
         detector = TrendDetector("rig", "trend", RATE_HZ, [channel])
         self._pipeline = Pipeline(
-            {"trend": ring}, [detector], self._take, LoopClock(), rate_hz={"trend": RATE_HZ}
+            {"trend": ring}, [detector], self._take, LoopClock(), patience={"trend": Patience(1e9 / RATE_HZ)}
         )
         self._pipeline._pool = AtOnce()
         self._manager = AlarmManager(RIG, [HOT], LoopClock())

@@ -1,0 +1,137 @@
+"""Blocks that were taken by themselves: each is a window of its own, and nothing between them is missing."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+from alarm_rig import AlarmRig
+
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.acquisition.ring import RingReader, SampleRing
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.manager import LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.levels import LevelChannel, LevelDetector
+from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.silence import SILENT_PERIODS, UNKNOWN_NS, Patience
+from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
+
+RATE_HZ = 3200.0
+PERIOD_NS = 1e9 / RATE_HZ
+SAMPLES = 1024
+EVERY = 6400
+SECOND_NS = 1_000_000_000
+
+
+def snapshot(k, amplitude=1.0, *, lost=0, samples=SAMPLES):
+    """The k-th of blocks of .32 s every 2 s, in m/s2: a 1X of 50 Hz."""
+    first = k * EVERY
+    t = np.arange(first, first + samples) / RATE_HZ
+    values = (amplitude * np.sqrt(2.0) * np.sin(2 * np.pi * 50.0 * t)).astype(np.float32).reshape(-1, 1)
+    pause = (EVERY - SAMPLES if k else 0) - lost
+    return SampleBlock("s", first, values, round(first * PERIOD_NS), PERIOD_NS, lost, pause_before=pause)
+
+
+async def test_each_snapshot_is_read_by_itself_whatever_block_a_detector_asks_for():
+    ring = SampleRing("s", ("x",), 96_000)
+    reader = RingReader(ring)
+    chunks = []
+
+    async def follow():
+        while len(chunks) < 4:
+            chunks.append(await reader.take(1600, 64))
+
+    following = asyncio.create_task(follow())
+    for k in range(4):
+        ring.write(snapshot(k, lost=SAMPLES if k == 3 else 0))
+        await asyncio.sleep(0)
+    await following
+    assert [chunk.first_index for chunk in chunks] == [0, EVERY, 2 * EVERY, 3 * EVERY]
+    for k, chunk in enumerate(chunks):
+        np.testing.assert_array_equal(chunk.samples, snapshot(k).samples)
+    assert all(chunk.snapshot and not chunk.skipped for chunk in chunks)
+    assert (ring.samples_lost, reader.samples_skipped, reader.behind) == (SAMPLES, 0, 0)
+
+
+async def test_a_reader_that_is_too_slow_misses_whole_snapshots_and_is_told_how_many_samples():
+    ring = SampleRing("s", ("x",), EVERY + SAMPLES)
+    ring.write(snapshot(0))
+    reader = RingReader(ring)
+    reader.position = 0
+    for k in range(1, 5):
+        ring.write(snapshot(k))
+    chunk = await reader.take(1600, 64)
+    assert (chunk.first_index, chunk.skipped) == (3 * EVERY, 3 * SAMPLES)
+    assert reader.samples_skipped == 3 * SAMPLES
+    assert (await reader.take(1600, 64)).first_index == 4 * EVERY
+
+
+def test_a_snapshot_is_measured_whole_whatever_its_length():
+    levels = LevelDetector("m", "s", RATE_HZ, [LevelChannel("a", 0, "m/s2")], window_s=0.5)
+    trends = TrendDetector("m", "s", RATE_HZ, [TrendChannel("t", 0, "m/s2")], window_s=0.1)
+    for samples in (SAMPLES, 5 * SAMPLES, 160):
+        values = snapshot(1, samples=samples).samples
+        window = Window(EVERY, values, 10**9, PERIOD_NS, snapshot=True)
+        (level,) = levels.process(window)
+        (trend,) = trends.process(window)
+        assert (level.quality, level.end_index - level.first_index) == ("good", samples)
+        assert level.statistics["rms"] == pytest.approx(1.0, rel=0.02)
+        # The band begins at 10 Hz: in .05 s not all of 50 Hz lies within it.
+        tolerance = 0.02 if samples >= SAMPLES else 0.2
+        velocity = 1000.0 / (2 * np.pi * 50.0)
+        assert level.statistics["velocity_rms"] == pytest.approx(velocity, rel=tolerance)
+        assert trend.statistics["value"] == pytest.approx(float(values.mean()), abs=1e-5)
+
+
+async def wait(clock, seconds):
+    for _ in range(round(2 * seconds)):
+        clock.advance_to(clock.monotonic_ns() + SECOND_NS // 2)
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+
+async def test_snapshots_raise_no_alarm_of_quality_and_the_time_between_them_is_no_silence():
+    clock = DrivenClock()
+    ring = SampleRing("s", ("x",), 96_000)
+    detector = LevelDetector("rig", "s", RATE_HZ, [LevelChannel("a", 0, "m/s2")], window_s=0.5)
+    rig = AlarmRig(LevelRule("high", "a", "velocity_rms", Setpoint(alert=4.5)))
+    said = []
+    pipeline = Pipeline(
+        {"s": ring},
+        [detector],
+        lambda diagnosis: said.append((diagnosis, rig.manager.take(diagnosis))),
+        clock,
+        patience={"s": Patience(snapshots=True, every_ns=2 * SECOND_NS)},
+    )
+    running = asyncio.create_task(pipeline.run())
+    for k in range(40):
+        ring.write(snapshot(k, 2.0 if 10 <= k < 20 else 1.0))
+        while len(said) <= k:
+            await asyncio.sleep(0.001)
+        await wait(clock, 2)
+    assert {diagnosis.quality for diagnosis, _ in said} == {"good"}
+    assert [(event.alarm, event.kind.value) for _, events in said for event in events] == [
+        ("high", "raised"),
+        ("high", "returned"),
+    ]
+    assert len(said) == 40
+    await wait(clock, 8)
+    silent, _ = said[-1]
+    assert (len(said), silent.quality) == (41, "missing")
+    ring.close()
+    await running
+
+
+def test_how_often_a_device_takes_blocks_by_itself_is_seen():
+    patience = Patience(snapshots=True)
+    assert patience.ns == round(SILENT_PERIODS * UNKNOWN_NS)
+    for seconds in (5, 600, 580):
+        patience.heard_after(seconds * SECOND_NS)
+    assert patience.ns == round(SILENT_PERIODS * 600 * SECOND_NS)
+    asked = Patience(snapshots=True, every_ns=60 * SECOND_NS)
+    asked.heard_after(2 * SECOND_NS)
+    assert asked.ns == round(SILENT_PERIODS * 60 * SECOND_NS)
+    assert Patience(1e9 / 10).ns == 2 * SECOND_NS
