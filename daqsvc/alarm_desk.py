@@ -8,6 +8,7 @@ samples or detectors, so it can be tried by itself.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 from collections import Counter
@@ -30,7 +31,7 @@ from daqsvc.publish.topics import Topics
 from daqsvc.self_check import SelfCheck, Vitals, conditions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -136,6 +137,12 @@ class AlarmDesk:
         self._topic_of: dict[tuple[str, str], str] = {}
         self._untold: dict[tuple[str, str], AlarmEvent] = {}
         """By alarm, its newest event if the outbox has refused that."""
+        self._speakers: Mapping[str, Sequence[str]] = {}
+        self._knows_journal = True
+        """Whether the alarms have taken over what the journal knew when the service ended."""
+        self._is_in_step = True
+        self._catching_up = False
+        self._damage_seen = 0
         self._one_at_a_time = asyncio.Lock()
         self._commands_waiting = 0
         self._stopping = False
@@ -154,13 +161,74 @@ class AlarmDesk:
         Args:
             speakers: the detectors that will make statements, with the sensors that these rest on.
         """
+        self._speakers = speakers
+        if self.outbox.counters.shut:
+            latest = await self.outbox.glimpse()
+            self._knows_journal, self._is_in_step = latest is not None, False
+            self._take_over(recall(latest or (), self.topics))
+            return
         told = recall(await self.outbox.latest(), self.topics)
-        for event in self.manager.resume(told, speakers, self._conditions):
+        self._take_over(told)
+        self._damage_seen = self._damage()
+        if self._damage_seen:
+            self._confirm(self._forget(told))
+
+    def _take_over(self, told: Sequence[AlarmEvent]) -> None:
+        for event in told:
+            self._newest[event.identity.machine, event.alarm] = event
+        for event in self.manager.resume(told, self._speakers, self._conditions):
             self._post(event)
-        if self.outbox.counters.quarantined or self.outbox.counters.vanished:
-            # The broker still shows how the forgotten alarms stood.
-            for event in self.manager.begin_anew(told, FORGOTTEN):
-                self._post(event)
+
+    def _damage(self) -> int:
+        return self.outbox.counters.quarantined + self.outbox.counters.vanished
+
+    def _forget(self, told: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
+        """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood."""
+        return [self._post(event) for event in self.manager.begin_anew(told, FORGOTTEN)]
+
+    def _confirm(self, committed: Sequence[asyncio.Future[int]]) -> None:
+        """Once these are on disk, the damage need not be told again after a restart."""
+
+        async def confirm() -> None:
+            outcomes = await asyncio.gather(*committed, return_exceptions=True)
+            if not any(isinstance(outcome, BaseException) for outcome in outcomes):
+                with contextlib.suppress(OutboxError):  # it is being closed; then it is told once more
+                    self.outbox.damage_is_told()
+
+        self._watch(asyncio.create_task(confirm(), name="damage is told"))
+
+    def _falls_out_of_step(self) -> bool:
+        """Whether the journal was opened late, or replaced, and has not been brought into step since."""
+        counters = self.outbox.counters
+        if counters.shut or counters.waiting or self._catching_up:
+            return False
+        return not self._is_in_step or self._damage() > self._damage_seen
+
+    async def _catch_up(self) -> None:
+        """Bring journal and alarms into step again.
+
+        What the alarms have done since counts. An alarm that has done nothing takes over what the journal
+        says, if that could not be asked before; the journal is told what it has forgotten.
+        """
+        damage = self._damage()
+        before = dict(self._newest)
+        try:
+            told = recall(await self.outbox.latest(), self.topics)
+        finally:
+            self._catching_up = False
+        if not self._knows_journal:
+            self._knows_journal = True
+            self._take_over([e for e in told if (e.identity.machine, e.alarm) not in self._newest])
+        stands = {(event.identity.machine, event.alarm): _moment(event) for event in told}
+        committed = [
+            self._submit(event)
+            for alarm, event in before.items()
+            if self._newest[alarm] is event and stands.get(alarm) != _moment(event)
+        ]
+        if damage > self._damage_seen:
+            committed += self._forget([*told, *self._newest.values()])
+        self._is_in_step, self._damage_seen = True, damage
+        self._confirm(committed)
 
     async def run(self) -> None:
         """Publish until `stop`; returns at once without a broker."""
@@ -185,6 +253,9 @@ class AlarmDesk:
             # Once the disk takes events again, it must know how each alarm stands by now.
             for event in list(self._untold.values()):
                 self._submit(event)
+        if self._falls_out_of_step():
+            self._catching_up = True
+            self._watch(asyncio.create_task(self._catch_up(), name="journal and alarms in step"))
         for event in self.manager.tick():
             self._post(event)
         for condition in self._self_check.look(self._vitals()):
@@ -318,6 +389,7 @@ class AlarmDesk:
             waiting=outbox.waiting,
             write_errors=outbox.write_errors,
             lost=outbox.refused + outbox.lost,
+            shut=bool(outbox.shut),
             damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
@@ -375,6 +447,11 @@ class AlarmDesk:
     def _watch(self, work: asyncio.Future[Any]) -> None:
         self._under_way.add(work)
         work.add_done_callback(self._under_way.discard)
+
+
+def _moment(event: AlarmEvent) -> tuple[object, ...]:
+    """What tells an event from others of its alarm, in memory and read back alike."""
+    return event.t_ns, event.wall_ns, event.kind, event.to_state, event.to_level
 
 
 def _sequences(committed: Sequence[asyncio.Future[int]]) -> list[int]:

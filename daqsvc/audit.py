@@ -14,10 +14,12 @@ exceed a quota the oldest is deleted. Commands that are refused in a flood are c
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import math
 import os
 import re
+import stat
 import uuid
 from collections import Counter
 from dataclasses import dataclass, field
@@ -297,8 +299,16 @@ def _append_durably(path: Path, line: bytes) -> None:
         OSError: the line is not on disk as a whole.
     """
     created = not path.exists()
-    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, MODE)
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
+        descriptor = os.open(path, flags, MODE)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(error.errno, "it is a symbolic link, which is not followed") from error
+        raise
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
         size = os.fstat(descriptor).st_size
         if size and os.pread(descriptor, 1, size - 1) != b"\n":
             line = b"\n" + line

@@ -96,6 +96,7 @@ class Vitals:
         unwritten: commands so far that were refused because the audit log could not be written.
         buses: how each bus stands, by name.
         refused: by topic, why the broker will not take messages; None without a broker.
+        shut: whether the journal cannot be opened so far.
     """
 
     now_ns: int
@@ -113,6 +114,7 @@ class Vitals:
     unwritten: int
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
     refused: Mapping[str, str] | None = None
+    shut: bool = False
 
 
 def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProxyType({})) -> list[str]:
@@ -229,7 +231,7 @@ class SelfCheck:
     def _journal(self, vitals: Vitals) -> Condition:
         failed = vitals.write_errors > self._write_errors
         self._write_errors = vitals.write_errors
-        self._unwritable = vitals.waiting > 0 and (failed or self._unwritable)
+        self._unwritable = vitals.shut or (vitals.waiting > 0 and (failed or self._unwritable))
         if self._lost.goes_on(vitals.lost, vitals.now_ns):
             sentence = f"{vitals.lost} alarm events are lost: the journal in {self._store} cannot be written"
             return Condition("store/journal", Level.DANGER, sentence)

@@ -6,7 +6,7 @@ import logging
 import os
 from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import free_bytes, restrict
+from daqsvc.outbox.files import create, free_bytes, restrict
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +38,7 @@ class Ballast:
                 return
             if free_bytes(self._path.parent) < self._reserve_bytes + 2 * self._size:
                 return
-            with self._path.open("wb") as file:
-                restrict(self._path)
+            with os.fdopen(create(self._path, os.O_WRONLY), "wb") as file:
                 os.posix_fallocate(file.fileno(), 0, self._size)
         except OSError as error:
             log.info("outbox ballast %s cannot be taken: %s", self._path, error)

@@ -49,10 +49,11 @@ class OutboxCounters:
         write_errors: transactions that failed and were tried again.
         read_errors: reads that failed and were tried again.
         quarantined: corrupt files set aside.
-        vanished: numbers that had been given to messages on disk which the file no longer knew when it
-            was opened: it was damaged, or is an older copy.
+        vanished: messages on disk, at least, which the file no longer knew when it was opened: it was
+            damaged, deleted, or is an older copy.
         refused: messages refused because too many waited in memory for a disk that cannot be written.
         lost: messages that never reached the disk because the outbox was closed while it could not write.
+        shut: 1 until the journal can be opened, else 0.
         telemetry: what became of telemetry.
     """
 
@@ -66,4 +67,5 @@ class OutboxCounters:
     vanished: int = 0
     refused: int = 0
     lost: int = 0
+    shut: int = 0
     telemetry: TelemetryCounters = field(default_factory=TelemetryCounters)

@@ -36,6 +36,9 @@ ASIDE_KEPT = 3
 MODE = 0o640
 """Most that the files of a store allow, whatever the umask: alarms are nobody's business but the group's."""
 
+NEW_MODE, NEW_DIRECTORY_MODE, PARENT_MODE = 0o600, 0o700, 0o755
+"""What new files, the store and directories above it allow at most, whatever the umask."""
+
 _DAMAGED = {
     sqlite3.SQLITE_CORRUPT,
     sqlite3.SQLITE_NOTADB,
@@ -49,6 +52,18 @@ _DAMAGED = {
 
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 
+_MAY_PASS = {
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+}
+
+_MAY_PASS_TOO = _NO_ROOM | {errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE}
+
 NS_PER_MS = 1_000_000
 
 
@@ -58,7 +73,7 @@ def restrict(path: Path) -> None:
     By name: closing a handle of a database would undo this process's locks on it.
     """
     try:
-        status = path.stat()
+        status = path.lstat()
         if stat.S_ISREG(status.st_mode) and stat.S_IMODE(status.st_mode) & ~MODE:
             path.chmod(status.st_mode & MODE)
     except FileNotFoundError:
@@ -78,23 +93,59 @@ def sync_directory(directory: Path) -> None:
 
 def make_directory(directory: Path) -> None:
     """Create ``directory`` and what is missing above it, durably."""
+    _make_directory(directory, NEW_DIRECTORY_MODE)
+
+
+def _make_directory(directory: Path, mode: int) -> None:
     if directory.is_dir():
         return
-    make_directory(directory.parent)
-    directory.mkdir(exist_ok=True)
+    _make_directory(directory.parent, PARENT_MODE)
+    directory.mkdir(mode, exist_ok=True)
     sync_directory(directory.parent)
+
+
+def create(path: Path, flags: int = os.O_RDWR) -> int:
+    """Open a file that only its owner may read, made if need be; never through a symbolic link.
+
+    Returns:
+        Its descriptor.
+    """
+    return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, NEW_MODE)
+
+
+def read_whole(path: Path, most: int) -> bytes:
+    """The first ``most`` bytes of a file; never through a symbolic link, and never waiting for a pipe."""
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+        return file.read(most)
 
 
 def replace_durably(path: Path, content: bytes) -> None:
     """Give ``path`` a new content: after a power cut it has either the old or the new one, whole."""
     draft = path.with_name(path.name + ".new")
-    with draft.open("wb") as file:
-        restrict(draft)
+    draft.unlink(missing_ok=True)
+    with os.fdopen(create(draft, os.O_WRONLY | os.O_EXCL), "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
     draft.replace(path)
     sync_directory(path.parent)
+
+
+def overwrite_durably(descriptor: int, content: bytes) -> None:
+    """Write over the beginning of a file, in place: that takes no room on a full disk."""
+    written = os.pwrite(descriptor, content, 0)
+    if written < len(content):
+        raise OSError(errno.EIO, f"only {written} of {len(content)} bytes were written")
+    os.fsync(descriptor)
+
+
+def sync_file(path: Path) -> None:
+    """Have the content of a file survive a power cut."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def take_possession(path: Path) -> BinaryIO:
@@ -108,7 +159,7 @@ def take_possession(path: Path) -> BinaryIO:
     Raises:
         OutboxError: another process has it.
     """
-    lock = path.open("ab")
+    lock = os.fdopen(_lock_file(path), "rb")
     try:
         restrict(path)
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -123,22 +174,33 @@ def take_possession(path: Path) -> BinaryIO:
     return lock
 
 
-def connect(path: Path | str, *, synchronous: str, wal_pages: int = WAL_PAGES) -> sqlite3.Connection:
+def _lock_file(path: Path) -> int:
+    """The lock file; one that is there can be locked on a disk that takes no writes, too."""
+    try:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return create(path)
+
+
+def connect(
+    path: Path | str, *, synchronous: str, wal_pages: int = WAL_PAGES, thorough: bool = False
+) -> sqlite3.Connection:
     """A connection for one writer, the file checked.
 
     Args:
         path: the database; ``":memory:"`` for one without a file.
         synchronous: ``"FULL"`` to have each commit on the disk, ``"OFF"`` to leave it to the system.
         wal_pages: pages in the write-ahead log from which on they are moved to the database.
+        thorough: have indices and tables compared as well.
 
     Raises:
         sqlite3.Error: the file is corrupt (see `is_corrupt`) or cannot be used.
         OSError: it cannot be made.
     """
     if isinstance(path, Path):
-        if not path.exists():
+        if not os.path.lexists(path):
             # SQLite would ask the umask; the files beside a database get the mode of the database.
-            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, MODE))
+            os.close(create(path))
         for suffix in SIDE_FILES:
             restrict(path.with_name(path.name + suffix))
     connection = sqlite3.connect(path, isolation_level=None, timeout=5.0)
@@ -149,15 +211,21 @@ def connect(path: Path | str, *, synchronous: str, wal_pages: int = WAL_PAGES) -
         connection.execute(f"PRAGMA synchronous = {synchronous}")
         connection.execute(f"PRAGMA wal_autocheckpoint = {wal_pages}")
         connection.execute(f"PRAGMA journal_size_limit = {WAL_MAX_BYTES}")
-        _check(connection)
+        check(connection, thorough=thorough)
     except BaseException:
         connection.close()
         raise
     return connection
 
 
-def _check(connection: sqlite3.Connection) -> None:
-    verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+def check(connection: sqlite3.Connection, *, thorough: bool = False) -> None:
+    """See whether a database is sound.
+
+    Raises:
+        sqlite3.DatabaseError: it is not, see `is_corrupt`.
+    """
+    how = "integrity_check" if thorough else "quick_check"
+    verdict = connection.execute(f"PRAGMA {how}(1)").fetchone()[0]
     if verdict != "ok":
         raise corruption(str(verdict))
 
@@ -215,7 +283,14 @@ def is_corrupt(error: Exception) -> bool:
     All statements of the outbox are constants, so one that a file does not understand, or whose constraints
     it violates, tells of damage as well. So does one whose message Python cannot decode.
     """
+    if isinstance(error, sqlite3.OperationalError) and f"{error}".startswith("Could not decode"):
+        return True  # Python's own words for text that is none
     return isinstance(error, UnicodeDecodeError) or _primary_code(error) in _DAMAGED
+
+
+def may_pass(error: Exception) -> bool:
+    """Whether an error says that the disk is full, takes no writes or fails, rather than what to correct."""
+    return _primary_code(error) in _MAY_PASS or getattr(error, "errno", None) in _MAY_PASS_TOO
 
 
 def is_full(error: Exception) -> bool:

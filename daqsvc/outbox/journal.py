@@ -12,18 +12,22 @@ from daqsvc.outbox.files import (
     FileError,
     connect,
     corruption,
+    free_bytes,
     is_corrupt,
     is_full,
     make_directory,
+    may_pass,
     pragma,
-    set_aside,
     sync_directory,
     take_possession,
     used_bytes,
 )
-from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
-from daqsvc.outbox.salvage import readable
-from daqsvc.outbox.sequence import SequenceMark
+from daqsvc.outbox.messages import OutboxAwayError, OutboxError, OutboxMessage, checksum, is_sound
+from daqsvc.outbox.reading import opened_to_read
+from daqsvc.outbox.renewal import Damage, Renewal
+from daqsvc.outbox.safety import refuse_link, refuse_unsafe
+from daqsvc.outbox.salvage import LARGEST, readable
+from daqsvc.outbox.sequence import SequenceMark, place_of
 from daqsvc.outbox.tables import (
     FILL_LATEST,
     SCHEMA_VERSION,
@@ -57,6 +61,15 @@ INSERT INTO messages (sequence, topic, payload, retain, wall_ns, checksum) VALUE
 
 _IS_LATEST = "SELECT sequence FROM latest"
 
+_TRUE_LATEST = "SELECT topic, max(sequence) FROM messages WHERE retain GROUP BY topic"
+_ODD_LATEST = f"""
+SELECT topic FROM (SELECT topic, sequence FROM latest EXCEPT {_TRUE_LATEST})
+UNION ALL SELECT topic FROM ({_TRUE_LATEST} EXCEPT SELECT topic, sequence FROM latest)
+"""  # noqa: S608  constants only
+
+SHORT_BYTES = 1024 * 1024
+"""Below this, what SQLite calls an I/O error comes of a full disk."""
+
 
 class Journal:
     """Messages by sequence number, sent or not; how the numbers go on is told in `outbox.sequence`.
@@ -72,13 +85,19 @@ class Journal:
         self.quarantined = 0
         self.vanished = 0
         self._mark = SequenceMark(path.with_name(path.name + ".sequence"))
+        self._renewal = Renewal(path)
         self._wall_ns = wall_ns
         self._limits = limits
         self._ballast = Ballast(
             path.with_name(path.name + ".ballast"), limits.ballast_bytes, limits.reserve_bytes
         )
         self._connection: sqlite3.Connection | None = None
+        self._view: contextlib.ExitStack | None = None
+        self._viewed: sqlite3.Connection | None = None
+        self._may_view = False
+        self._has_failed = False
         self._lock: BinaryIO | None = None
+        self._is_ready = False
         self._next = 0
         self._sent_since_trim = 0
 
@@ -87,44 +106,102 @@ class Journal:
         """The highest number used so far."""
         return self._next - 1
 
+    @property
+    def is_held(self) -> bool:
+        """Whether other processes are kept out."""
+        return self._lock is not None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether `open` has succeeded."""
+        return self._is_ready
+
     def hold(self) -> None:
         """Create the directory and keep other processes out of it, until `close`.
 
         Raises:
-            OutboxError: the directory cannot be used, or another process uses it.
+            OutboxError: the directory cannot be used, or another process uses it, or others may write there.
         """
+        if self._lock is not None:
+            return
         try:
             make_directory(self.path.parent)
+            refuse_unsafe(self.path.parent)
             self._lock = take_possession(self.path.with_name(self.path.name + ".lock"))
         except OSError as error:
             raise self._unusable(error) from error
 
     def open(self) -> None:
-        """Open or create the file; a corrupt one is set aside.
+        """Open or create the file; a corrupt one is set aside. What a crash has cut off there is finished.
 
         Raises:
-            OutboxError: the directory or file cannot be used.
+            OutboxError: the directory or file cannot be used; an `OutboxAwayError` if that may pass.
         """
-        if self._lock is None:
-            self.hold()
+        if self._is_ready:
+            return
+        self.hold()
         try:
-            self._mark.read()
-            try:
-                self._connect()
-            except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-                if not is_corrupt(error):
-                    raise
-                self.quarantine(error)
-            self._tidy()
-            self._ballast.take()
+            self._open()
         except FileError as error:
+            self._disconnect()
+            self._may_view = self._mark.ended or self.is_short_of_room(error)
             raise self._unusable(error) from error
+        self._is_ready = True
+
+    def _open(self) -> None:
+        assert self._lock is not None  # noqa: S101 - `hold` has it
+        self._close_view()
+        self._mark.read(place_of(self._lock))
+        aside = self._renewal.finish()
+        if aside is not None:
+            log.warning("outbox %s: the saving of what was left of %s is finished", self.path, aside)
+        untold = self._renewal.untold()
+        self.quarantined, self.vanished = untold.quarantined, untold.vanished
+        try:
+            self._connect()
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            if not is_corrupt(error):
+                raise
+            self.quarantine(error)
+        self._adopt()
+        self._prove()
+        self._tidy()
+        self._ballast.take()
 
     def _unusable(self, error: Exception) -> OutboxError:
-        return OutboxError(
+        kind = OutboxAwayError if may_pass(error) else OutboxError
+        return kind(
             f"cannot open the outbox {self.path}: {error}; "
             f"give the service a directory that it may write in, with space left"
         )
+
+    def _adopt(self) -> None:
+        """Take over what an earlier version has set aside and was cut off before it could save it."""
+        connection = self._open_connection()
+        if connection.execute("SELECT 1 FROM messages LIMIT 1").fetchone():
+            return
+        for aside in self._renewal.aside()[:1]:
+            rows = list(readable(aside))
+            if not rows:
+                return
+            with _transaction(connection):
+                connection.executemany("INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+                connection.execute(FILL_LATEST)
+            self._next = max(self._next, max(row[0] for row in rows) + 1)
+            self.quarantined += 1
+            self._renewal.remember(Damage(self.quarantined, self.vanished))
+            log.warning("outbox %s: %d messages were saved from %s", self.path, len(rows), aside)
+
+    def _prove(self) -> None:
+        """Have all that can be read in the database itself, synced: only then may it be published.
+
+        The log may hold what a system that was failing never wrote: it is read back from memory.
+        """
+        try:
+            self._open_connection().execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        except sqlite3.Error as error:
+            if not is_full(error):
+                raise
 
     def _tidy(self) -> None:
         """Trim, and have the file itself tell where the numbers go on; on a full disk, both can wait."""
@@ -143,32 +220,49 @@ class Journal:
             log.warning("outbox %s: %s; the journal is not trimmed", self.path, error)
 
     def quarantine(self, error: Exception) -> None:
-        """Set a corrupt file aside and begin a new one with what can still be read of it.
+        """Set a corrupt file aside and go on with a new one that has what can still be read of it.
+
+        See `outbox.renewal`: whatever fails, and wherever a crash comes, nothing readable is lost.
 
         Raises:
-            sqlite3.Error: the new file cannot be written.
-            OSError: the corrupt one cannot be set aside.
+            sqlite3.Error: the new file cannot be written; the corrupt one is as it was.
+            OSError: likewise, or it cannot be set aside.
         """
-        if self._connection is not None:
-            with contextlib.suppress(sqlite3.Error):  # it is given up anyway
-                self._connection.close()
-            self._connection = None
-        aside = None
-        if self.path.exists():
-            aside = set_aside(self.path, self._wall_ns())
-            self.quarantined += 1
-            log.error(
-                "outbox %s is corrupt (%s); set aside as %s, starting a new one", self.path, error, aside
-            )
+        self._disconnect()
+        if not self.path.exists():
+            self._connect()
+            self._tidy()
+            return
+        begun = self._next or LARGEST
+        # A new file's numbers begin above all that the old one may have forgotten.
+        self._next = max(self._next, self._mark.first_free(None, self._wall_ns()))
+        count = self._renewal.save(self.path, begun, self._mark.used, self._wall_ns())
+        aside = self._renewal.replace(Damage(self.quarantined + 1, self.vanished))
+        self.quarantined += 1
+        log.error(
+            "outbox %s is corrupt (%s); set aside as %s, going on with the %d messages that can be read",
+            self.path,
+            error,
+            aside,
+            count,
+        )
         self._connect()
-        if aside is not None:
-            self._salvage(aside)
         self._tidy()
 
+    def damage_is_told(self) -> None:
+        """The alarms have told what has befallen the journal: a crash need not have it told again."""
+        try:
+            self._renewal.is_told()
+        except OSError as error:
+            log.info("outbox %s: its damage will be told again: %s", self.path, error)
+
     def _connect(self) -> None:
-        connection = connect(self.path, synchronous="FULL")
+        is_new = not self.path.exists()
+        refuse_link(self.path)
+        connection = connect(self.path, synchronous="FULL", thorough=True)
         try:
             stored = self._prepare(connection)
+            _compare(connection)
             sync_directory(self.path.parent)
         except BaseException:
             connection.close()
@@ -177,16 +271,23 @@ class Journal:
         gone = self._mark.vanished(stored)
         if gone:
             self.vanished += gone
+            self._renewal.remember(Damage(self.quarantined, self.vanished))
             log.error(
-                "outbox %s ends with message %d, but numbers up to %d were used: up to %d messages are "
-                "gone from the disk; it was damaged, or is an older copy",
+                "outbox %s %s, but numbers up to %d were used: %d messages are gone from the disk; it was "
+                "damaged, deleted, or is an older copy",
                 self.path,
-                stored,
-                (stored or 0) + gone,
+                "is not there" if is_new else f"ends with message {stored or 0}",
+                self._mark.used,
                 gone,
             )
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
-        self._mark.begin(self.last_sequence)
+        self._mark.begin(self._next)
+
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            connection, self._connection = self._connection, None
+            with contextlib.suppress(sqlite3.Error):  # it is given up anyway
+                connection.close()
 
     def _prepare(self, connection: sqlite3.Connection) -> int | None:
         """Bring the tables up to date; the highest number that the file knows, None if it is new."""
@@ -203,21 +304,14 @@ class Journal:
         if version < SCHEMA_VERSION:
             bring_up_to_date(connection, version, self._wall_ns())
         used = connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'messages'").fetchone()
+        last: int | None = connection.execute("SELECT max(sequence) FROM messages").fetchone()[0]
         if used is None:
-            return None
-        if not (isinstance(used[0], int) and self._mark.can_be_used(used[0])):
+            return last
+        if not (isinstance(used[0], int) and used[0] < LARGEST):
             raise corruption(f"it ends with message {used[0]}, which was never given")
-        return used[0]
-
-    def _salvage(self, aside: Path) -> None:
-        connection = self._open_connection()
-        with _transaction(connection):
-            connection.executemany(
-                "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", readable(aside, self._next)
-            )
-            connection.execute(FILL_LATEST)
-        count = connection.execute("SELECT count(*) FROM messages").fetchone()[0]
-        log.warning("outbox %s: %d messages were saved from the corrupt file", self.path, count)
+        if not self._mark.can_be_used(used[0]) and used[0] != last:
+            raise corruption(f"it ends with message {used[0]}, which was never given")
+        return max(used[0], last or 0)
 
     def commit(self, drafts: Sequence[Draft], sent: Iterable[int]) -> tuple[list[int | Exception], int]:
         """Write drafts and mark others as sent, in one durable transaction.
@@ -251,7 +345,7 @@ class Journal:
             sequence += 1
         if rows:
             self._mark.advance(sequence - 1)
-        with _transaction(connection):
+        with self._committed(connection):
             connection.executemany(_INSERT, rows)
             connection.executemany("INSERT OR REPLACE INTO latest VALUES (?, ?)", latest.items())
             marked = connection.executemany(
@@ -268,8 +362,28 @@ class Journal:
             self._tend(connection)
         return outcomes, max(marked, 0)
 
+    @contextlib.contextmanager
+    def _committed(self, connection: sqlite3.Connection) -> Iterator[None]:
+        """A transaction; what cannot be committed must not be read, not even on this connection."""
+        try:
+            with _transaction(connection):
+                yield
+        except BaseException:
+            self._has_failed = True
+            if connection.in_transaction:
+                self._disconnect()
+            raise
+        self._has_failed = False
+
+    def is_short_of_room(self, error: Exception) -> bool:
+        """Whether an error comes of a full disk, also if SQLite has other words for it."""
+        try:
+            return is_full(error) or (may_pass(error) and free_bytes(self.path.parent) < SHORT_BYTES)
+        except OSError:
+            return False
+
     def make_room(self) -> bool:
-        """Make room on a full disk: throw the ballast off, or delete messages that the broker has.
+        """Make room on a full disk: the ballast, old corrupt files, then messages that the broker has.
 
         Returns:
             Whether there was something to gain.
@@ -280,8 +394,13 @@ class Journal:
         if self._ballast.throw_off():
             log.warning("outbox %s: the disk is full; the room that was held for this is in use", self.path)
             return True
+        if self._renewal.forget_aside(1):
+            log.warning("outbox %s: the disk is full; older corrupt files are deleted", self.path)
+            return True
+        if not self._is_ready:
+            return False
         connection = self._open_connection()
-        with _transaction(connection):
+        with self._committed(connection):
             deleted = connection.execute(
                 f"""
                 DELETE FROM messages WHERE sequence IN
@@ -315,18 +434,26 @@ class Journal:
         return count
 
     def close(self) -> None:
-        """Close the file."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        """Close the file; whatever the disk does, nothing is raised."""
+        self._close_view()
+        is_whole = self._connection is not None and self._is_ready and not self._has_failed
+        self._disconnect()
+        self._is_ready = False
+        if is_whole:
             try:
                 self._mark.settle(self._next - 1)
             except OSError as error:
-                log.warning("outbox mark of %s cannot be written: %s; numbers may jump", self.path, error)
-            self._mark.close()
+                log.warning("outbox mark of %s cannot be written: %s; numbers will jump", self.path, error)
+        self._mark.close()
         if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+            lock, self._lock = self._lock, None
+            with contextlib.suppress(OSError):  # the system takes the lock back, whatever it says
+                lock.close()
+
+    def _close_view(self) -> None:
+        if self._view is not None:
+            view, self._view, self._viewed = self._view, None, None
+            view.close()
 
     def _open_connection(self) -> sqlite3.Connection:
         if self._connection is None:
@@ -337,8 +464,24 @@ class Journal:
             raise OutboxError(f"outbox {self.path} cannot be opened again")
         return self._connection
 
+    def _reading(self) -> sqlite3.Connection:
+        """The journal; before it can be opened, a look at it that needs no room on the disk.
+
+        Raises:
+            sqlite3.Error: it cannot be looked at, or may say what the disk never got (see `_prove`).
+            OSError: likewise.
+        """
+        if self._is_ready or self._connection is not None or self._lock is None:
+            return self._open_connection()
+        if not self._may_view:
+            raise sqlite3.OperationalError(f"outbox {self.path} is not open yet")
+        if self._viewed is None:
+            self._view = contextlib.ExitStack()
+            self._viewed = self._view.enter_context(opened_to_read(self.path))
+        return self._viewed
+
     def _select(self, where: str, *parameters: int) -> list[OutboxMessage]:
-        rows = self._open_connection().execute(
+        rows = self._reading().execute(
             f"SELECT sequence, topic, payload, retain, checksum FROM messages {where}",  # noqa: S608  constants only
             parameters,
         )
@@ -398,3 +541,14 @@ def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
         if connection.in_transaction:
             connection.execute("ROLLBACK")
         raise
+
+
+def _compare(connection: sqlite3.Connection) -> None:
+    """See that the latest state of each topic is the one that it should be.
+
+    Raises:
+        sqlite3.DatabaseError: it is not; a flipped bit there would have an alarm forgotten.
+    """
+    odd = connection.execute(_ODD_LATEST).fetchone()
+    if odd is not None:
+        raise corruption(f"the latest state of {odd[0]} is another")

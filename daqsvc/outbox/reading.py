@@ -20,6 +20,7 @@ from urllib.parse import quote
 
 from daqsvc.outbox.files import FileError, pragma
 from daqsvc.outbox.messages import OutboxError, is_sound
+from daqsvc.outbox.safety import refuse_link
 from daqsvc.outbox.tables import SCHEMA_VERSION
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def _read(path: Path, history: int, topic: str | None) -> JournalView:
 
 
 def _read_once(path: Path, history: int, topic: str | None) -> JournalView:
-    with _opened(path) as connection:
+    with opened_to_read(path) as connection:
         connection.execute("BEGIN")  # all that follows tells of one moment
         return _view(path, connection, history, topic)
 
@@ -153,7 +154,7 @@ def _sound(rows: Iterable[tuple[int, str, bytes, int, int, int, int | None]]) ->
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+def opened_to_read(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that leaves no trace.
 
     A service that runs, or was killed, leaves a write-ahead log and its index beside the journal: these are
@@ -191,6 +192,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 def _check_readable(path: Path) -> None:
     """Raise what SQLite would not tell apart, without a handle: closing one undoes this process's locks."""
+    refuse_link(path)
     path.stat()
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

@@ -3,14 +3,19 @@
 Consumers drop a message whose number they have seen, so a number that is used twice loses an alarm. The
 journal itself knows its highest number, but it can forget: a new file takes the place of a corrupt one; a
 write-ahead log with a flipped bit ends, for SQLite, before that bit; a disk that lies about its cache loses
-in a power cut what it had confirmed. So a side file of one line tells, apart from the database:
+in a power cut what it had confirmed. So two side files of one line each tell, apart from the database:
 
 - the *ceiling*, ahead of every number in use and durable before one is used;
-- the highest number *used*, without a sync: exact after a crash of the program, not after one of the system;
-- which *boot* of the system that was.
+- the highest number *used* and the *first* one of this run, without a sync: a lower bound after a crash;
+- which *boot* of the system that was, and in which *place*: a copy of the store is in another one;
+- whether the run has *ended* properly.
 
-Numbers go on without a gap after a proper end and after kill -9. They jump to the ceiling after a power cut
-and to the wall clock in ms, far above what was counted up from an earlier start, for a new file.
+They are written one after the other, in place, so that a torn or a damaged one never leaves none, and a full
+disk stops neither.
+
+Numbers go on without a gap after a proper end. They go on above the ceiling after any other end, above the
+wall clock in ms as well after another boot, in a copy, or for a new file, and far ahead when a side file is
+damaged or missing.
 """
 
 from __future__ import annotations
@@ -18,59 +23,103 @@ from __future__ import annotations
 import logging
 import os
 import zlib
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import NS_PER_MS, replace_durably
+from daqsvc.outbox.files import NS_PER_MS, overwrite_durably, read_whole, replace_durably, restrict
+
+if TYPE_CHECKING:
+    from typing import BinaryIO
 
 log = logging.getLogger(__name__)
 
 STEP = 1024
-"""How far the ceiling is ahead: one sync of the side file for so many numbers."""
+"""How far the ceiling is ahead: one sync of the side files for so many numbers."""
+
+LEAP = 10_000_000
+"""How far numbers jump where nobody knows any more what was used: hours of the worst flood of alarms."""
 
 UNKNOWN_BOOT = "-"
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _DIGITS = 20
+_LONGEST = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What a side file tells; see the top of this module."""
+
+    ceiling: int
+    used: int
+    first: int
+    boot: str
+    place: str
+    ended: bool
+
+    def line(self) -> bytes:
+        """As it is written; of one length for one boot and place, so that it can be written in place."""
+        figures = " ".join(f"{number:0{_DIGITS}d}" for number in (self.ceiling, self.used, self.first))
+        told = f"{figures} {self.boot} {self.place} {'ended' if self.ended else 'going'}".encode()
+        return b"%b %08x\n" % (told, zlib.crc32(told))
+
+
+_NOTHING = _Told(0, 0, 0, "", "", ended=True)
 
 
 class SequenceMark:
-    """The side file.
+    """The side files.
 
     Args:
-        path: where it is.
+        path: where the first one is; its twin stands beside it.
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._ceiling = 0
-        self._used = 0
-        self._boot = ""
-        self._this_boot = ""
-        self._file: int | None = None
+        self._sides = (_Side(path), _Side(path.with_name(path.name + ".twin")))
+        self._told = _NOTHING
+        self._here = _NOTHING
+        self._damaged = False
+        self._first = 0
         self._noted = True
 
-    def read(self) -> None:
-        """Read what the side file tells; without one, nothing is known.
+    def read(self, place: str) -> None:
+        """Read what the side files tell; without one, nothing is known.
 
-        Raises:
-            OSError: it cannot be read.
+        Args:
+            place: where the store is by now, see `place_of`.
         """
         self.close()
-        self._ceiling, self._used, self._boot = 0, 0, ""
-        self._this_boot = boot_id()
-        try:
-            line = self._path.read_bytes()
-        except FileNotFoundError:
-            return
-        told = line.split()
-        if len(told) != 4 or _hexadecimal(told[3]) != zlib.crc32(line[: line.rindex(b" ")]):
+        self._here = replace(_NOTHING, boot=boot_id(), place=place)
+        found = [side.read() for side in self._sides]
+        sound = [told for told in found if told is not None]
+        # An earlier version wrote the first one alone, and said nothing of the place.
+        is_earlier = [told is not None and not told.place for told in found] == [True, False]
+        self._damaged = 0 < len(sound) < len(found) and not is_earlier
+        self._damaged |= any(
+            side.is_there and told is None for side, told in zip(self._sides, found, strict=True)
+        )
+        if self._damaged:
             log.warning(
-                "outbox mark %s is damaged; sequence numbers go on from the wall clock, or from the journal "
-                "if that is ahead",
-                self._path,
+                "outbox mark %s or its twin is damaged or missing: sequence numbers jump ahead",
+                self._sides[0].path,
             )
-            return
-        self._ceiling, self._used, self._boot = int(told[0]), int(told[1]), told[2].decode("ascii")
+        newest = max(sound, key=lambda told: (told.ceiling, told.used), default=_NOTHING)
+        self._told = replace(
+            newest,
+            used=max((told.used for told in sound), default=0),
+            ended=newest.ended and all(told.ceiling == newest.ceiling for told in sound),
+        )
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run that wrote last came to a proper end, or this system has booted since."""
+        return self._told.ended or self._told.boot != self._here.boot
+
+    @property
+    def used(self) -> int:
+        """The highest number that is known to have been used."""
+        return self._told.used
 
     def first_free(self, stored: int | None, wall_ns: int) -> int:
         """The number to go on with.
@@ -79,47 +128,55 @@ class SequenceMark:
             stored: the highest number that the journal knows; None for a new file.
             wall_ns: the wall clock, ns since the Unix epoch.
         """
-        started = wall_ns // NS_PER_MS
-        if stored is None or not self._ceiling:
-            # Without a mark nobody knows what the journal may have forgotten: only the clock has gone on.
-            return max(stored or 0, self._ceiling, started) + 1
-        return max(stored, self._used if self._is_exact() else self._ceiling) + 1
+        known = max(stored or 0, self._told.ceiling, self._told.used)
+        clock = max(known, wall_ns // NS_PER_MS)
+        if self._damaged or (stored is not None and not self._told.ceiling):
+            return clock + LEAP + 1
+        is_same = (self._told.boot, self._told.place) == (self._here.boot, self._here.place)
+        if stored is None or not is_same or self._here.boot == UNKNOWN_BOOT:
+            return clock + 1
+        return known + 1
 
     def vanished(self, stored: int | None) -> int:
-        """How many numbers were used that the journal does not know, as far as that can be told."""
-        if not self._is_exact():
-            return 0
-        # A new file's numbers start at the wall clock: how many of the old one are gone cannot be told.
-        return max(self._used - stored, 0) if stored is not None else 0
+        """How many messages the journal knew and does not know any more, at least.
 
-    def begin(self, last: int) -> None:
-        """Take all numbers up to ``last`` for used; durable with the next `advance`."""
-        self._used = max(self._used, last)
+        Args:
+            stored: the highest number that it knows; None for a new file.
+        """
+        if not self._told.used:
+            return 0
+        return max(self._told.used - max(stored or 0, self._told.first - 1), 0)
+
+    def begin(self, first: int) -> None:
+        """All numbers below ``first`` are taken for used; durable with the next `advance`."""
+        self._first = first
+        here = self._here
+        ceiling = max(self._told.ceiling, first - 1)
+        self._told = replace(self._told, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
 
     def can_be_used(self, number: int) -> bool:
-        """Whether ``number`` may have been given, as far as the side file tells."""
-        return not self._ceiling or 0 <= number <= self._ceiling
+        """Whether ``number`` may have been given, as far as the side files tell."""
+        return not self._told.ceiling or self._damaged or 0 <= number <= self._told.ceiling
 
     def advance(self, last: int) -> None:
         """Have the ceiling above ``last`` before that number is used.
 
         Raises:
-            OSError: the side file cannot be written; no number may be used.
+            OSError: neither side file can be written; no number may be used.
         """
-        if last >= self._ceiling or self._file is None:
-            self._write(max(last + STEP, self._ceiling), self._used)
+        if last >= self._told.ceiling or not any(side.is_open for side in self._sides):
+            self._write(replace(self._told, ceiling=max(last + STEP, self._told.ceiling)))
 
     def note(self, used: int) -> None:
         """Tell that numbers up to ``used`` are in the journal."""
-        self._used = used
-        if self._file is None:
-            return
+        first = self._first if self._told.used < self._first else self._told.first
+        self._told = replace(self._told, used=used, first=first)
         try:
-            os.pwrite(self._file, self._line(), 0)
+            self._sides[0].note(self._told.line())
         except OSError as error:
             # The message is on disk. Only the watch over a journal that forgets is poorer by this.
             if self._noted:
-                log.warning("outbox mark %s cannot be written: %s", self._path, error)
+                log.warning("outbox mark %s cannot be written: %s", self._sides[0].path, error)
             self._noted = False
         else:
             self._noted = True
@@ -128,35 +185,107 @@ class SequenceMark:
         """Tell, durably, that ``last`` is the highest number in use and will stay so for now.
 
         Raises:
-            OSError: the side file cannot be written.
+            OSError: a side file cannot be written; the next run goes on above the ceiling.
         """
-        self._write(last, last)
+        self._write(replace(self._told, ceiling=last, ended=True), both=True)
 
     def close(self) -> None:
-        """Close the side file as it is."""
-        if self._file is not None:
-            os.close(self._file)
-            self._file = None
+        """Close the side files as they are."""
+        for side in self._sides:
+            side.close()
 
-    def _is_exact(self) -> bool:
-        properly_ended = self._used == self._ceiling
-        return properly_ended or self._boot == self._this_boot != UNKNOWN_BOOT
+    def _write(self, told: _Told, *, both: bool = False) -> None:
+        """Write the side files; one of them at least, or ``both``."""
+        errors: list[OSError] = []
+        for side in self._sides:
+            try:
+                side.write(told.line())
+            except OSError as error:
+                errors.append(error)
+        if errors and (both or len(errors) == len(self._sides)):
+            raise errors[0]
+        for failure in errors:
+            log.warning("one of the outbox marks %s cannot be written: %s", self._sides[0].path, failure)
+        self._told = told
 
-    def _write(self, ceiling: int, used: int) -> None:
-        before = self._ceiling, self._used, self._boot
-        self._ceiling, self._used, self._boot = ceiling, used, self._this_boot
+
+class _Side:
+    """One side file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.is_there = False
+        self._file: int | None = None
+        self._size = 0
+
+    @property
+    def is_open(self) -> bool:
+        return self._file is not None
+
+    def read(self) -> _Told | None:
+        """What it tells; None if it is not there or damaged."""
+        self._size, self.is_there = 0, False
+        restrict(self.path)
         try:
-            replace_durably(self._path, self._line())
-        except OSError:
-            self._ceiling, self._used, self._boot = before
-            raise
-        self.close()
-        self._file = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)
+            line = read_whole(self.path, _LONGEST)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            log.warning("outbox mark %s cannot be read: %s", self.path, error)
+            line = b""
+        self._size, self.is_there = len(line), True
+        return _understood(line)
 
-    def _line(self) -> bytes:
-        """The content of the side file; of one length for one boot, so that it can be written in place."""
-        told = f"{self._ceiling:0{_DIGITS}d} {self._used:0{_DIGITS}d} {self._boot}".encode()
-        return b"%b %08x\n" % (told, zlib.crc32(told))
+    def write(self, line: bytes) -> None:
+        """Have it tell ``line``, durably."""
+        if self._file is not None and not os.fstat(self._file).st_nlink:
+            self.close()  # somebody has deleted it
+        if self._file is None and self._size == len(line):
+            self._file = _opened(self.path)
+        if self._file is not None:
+            overwrite_durably(self._file, line)
+            return
+        replace_durably(self.path, line)
+        self._file = _opened(self.path)
+        self._size = len(line)
+
+    def note(self, line: bytes) -> None:
+        """Have it tell ``line``, sooner or later."""
+        if self._file is not None:
+            os.pwrite(self._file, line, 0)
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            try:
+                os.close(file)
+            except OSError as error:
+                log.warning("outbox mark %s cannot be closed: %s", self.path, error)
+
+
+def _opened(path: Path) -> int | None:
+    try:
+        return os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+
+
+def _understood(line: bytes) -> _Told | None:
+    told = line.split()
+    if len(told) not in {4, 7} or _hexadecimal(told[-1]) != zlib.crc32(line[: line.rindex(b" ")]):
+        return None
+    try:
+        words = [word.decode("ascii") for word in told[:-1]]
+        if (
+            len(words) == 3
+        ):  # of an earlier version, which had ended properly if it used all up to its ceiling
+            ceiling, used = int(words[0]), int(words[1])
+            return _Told(ceiling, used, 0, words[2], "", ended=ceiling == used)
+        ceiling, used, first = (int(word) for word in words[:3])
+    except ValueError:
+        return None
+    return _Told(ceiling, used, first, words[3], words[4], ended=words[5] == "ended")
 
 
 def _hexadecimal(text: bytes) -> int | None:
@@ -173,3 +302,13 @@ def boot_id() -> str:
         return _BOOT_ID.read_text(encoding="ascii").strip() or UNKNOWN_BOOT
     except OSError:
         return UNKNOWN_BOOT
+
+
+def place_of(lock: BinaryIO) -> str:
+    """What tells a store from its copies: the lock file's inode and the time when that was last changed.
+
+    The lock file is never written. No program can copy the time, so that a copy, also one that is put back
+    in the place of the original, has another.
+    """
+    status = os.fstat(lock.fileno())
+    return f"{status.st_ino:016x}-{status.st_ctime_ns:016x}"

@@ -16,6 +16,7 @@ from daqsvc.outbox.dead_letters import DeadLetters
 from daqsvc.outbox.journal import Journal
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import Draft, OutboxError, OutboxMessage, TelemetryMessage, new_series
+from daqsvc.outbox.reading import read_journal
 from daqsvc.outbox.telemetry import Telemetry
 from daqsvc.outbox.writer import Batch, JournalWriter, fail, succeed
 
@@ -74,6 +75,7 @@ class Outbox:
         self._limits = OutboxLimits() if limits is None else limits
         self._journal = Journal(path, clock.wall_ns, self._limits)
         self._telemetry = Telemetry(telemetry_path(path), clock, self._limits, self.counters.telemetry)
+        self._telemetry.file.is_ours = lambda: self._journal.is_held
         self._books = _Books(self.counters, self._journal)
         self._writer = JournalWriter(self._journal, self._books, self._telemetry.file.give_way)
         self._ended: asyncio.Future[None] | None = None
@@ -81,14 +83,32 @@ class Outbox:
     async def open(self) -> None:
         """Open the files, check them, and start their writers.
 
+        A disk that is full, takes no writes or fails is no reason not to start: messages wait in memory
+        until the journal can be opened; `OutboxCounters.shut` says so.
+
         Raises:
-            OutboxError: the directory or the alarms' file cannot be used.
+            OutboxError: the directory or the alarms' file cannot be used, and that will not pass by itself.
         """
         opened, self._ended = self._writer.start()
-        self.counters.depth = await opened
-        self.counters.quarantined = self._journal.quarantined
-        self.counters.vanished = self._journal.vanished
+        unsent = await opened
+        if unsent is None:
+            self.counters.shut = 1
+        else:
+            self._books.opened(unsent)
         self._telemetry.start()
+
+    async def glimpse(self) -> list[OutboxMessage] | None:
+        """`latest` of a journal that cannot be opened for now; None if it cannot even be looked at."""
+        try:
+            view = await asyncio.to_thread(read_journal, self.directory, history=0)
+        except OutboxError as error:
+            log.error("what the alarms were cannot be read yet: %s", error)  # noqa: TRY400
+            return None
+        return [OutboxMessage(e.sequence, e.topic, e.payload, e.retain) for e in view.latest]
+
+    def damage_is_told(self) -> None:
+        """What has befallen the journal is told: it need not be told again after a restart."""
+        self._put(Batch(reads=[(self._journal.damage_is_told, asyncio.get_running_loop().create_future())]))
 
     async def append(self, topic: str, payload_of_sequence: Callable[[int], bytes], *, retain: bool) -> int:
         """Append a message and wait until it is on disk.
@@ -285,6 +305,15 @@ class _Books:
             self._counters.waiting -= 1
             self._counters.lost += 1
             fail(done, error)
+
+    def opened(self, unsent: int) -> None:
+        """See `Reports.opened`."""
+        self._counters.shut = 0
+        self._counters.depth = unsent
+        self._counters.quarantined = self._journal.quarantined
+        self._counters.vanished = self._journal.vanished
+        self.last_sequence = self._journal.last_sequence
+        self._arrived.set()
 
     def replaced(self, unsent: int) -> None:
         """See `Reports.replaced`."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from daqsvc.outbox.messages import checksum
+
 if TYPE_CHECKING:
     import sqlite3
 
@@ -33,9 +35,10 @@ CREATE TABLE latest (topic TEXT PRIMARY KEY, sequence INTEGER NOT NULL) WITHOUT 
 _FROM_1_TO_2 = f"""
 ALTER TABLE messages ADD COLUMN wall_ns INTEGER NOT NULL DEFAULT 0;
 ALTER TABLE messages ADD COLUMN checksum INTEGER;
+UPDATE messages SET checksum = checksum_of(sequence, topic, payload);
 DROP INDEX retained;
 {_SCHEMA_2}
-"""
+"""  # noqa: S608  constants only
 
 FILL_LATEST = """
 INSERT INTO latest SELECT topic, max(sequence) FROM messages WHERE retain GROUP BY topic
@@ -61,6 +64,7 @@ def bring_up_to_date(connection: sqlite3.Connection, version: int, wall_ns: int)
     Raises:
         sqlite3.Error: the file is as it was.
     """
+    connection.create_function("checksum_of", 3, checksum, deterministic=True)
     statements = _SCHEMA + _SCHEMA_2 if version == 0 else f"{_FROM_1_TO_2} {FILL_LATEST};"
     connection.executescript(
         f"""

@@ -27,7 +27,7 @@ from daqsvc.outbox.files import (
 from daqsvc.outbox.messages import TelemetryMessage, checksum, is_sound
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -91,6 +91,8 @@ class TelemetryFile:
         self._limits = limits
         self._counters = counters
         self._connection: sqlite3.Connection | None = None
+        self.is_ours: Callable[[], bool] = lambda: True
+        """Whether other processes are kept out of the store; else the file is left alone."""
         self._next = 1
         self._retry_at_s = 0.0
         self._reported = ""
@@ -219,6 +221,8 @@ class TelemetryFile:
         return bool(self._counters.in_memory)
 
     def _open_file(self) -> None:
+        if not self.is_ours():
+            raise sqlite3.OperationalError("the store cannot be used yet")
         if free_bytes(self._path.parent) < self._limits.reserve_bytes + SMALLEST_BYTES:
             raise sqlite3.OperationalError("the disk is nearly full")
         try:
@@ -277,7 +281,8 @@ class TelemetryFile:
         newest = self._newest()
         self.close()
         with contextlib.suppress(OSError):  # it is the disk that fails; the log below tells
-            delete(self._path)
+            if self.is_ours():
+                delete(self._path)
         self._connection = connect(":memory:", synchronous="OFF")
         _create(self._connection)
         self._connection.executemany(_INSERT, newest)

@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
-from daqsvc.outbox.files import FileError, is_corrupt, is_full
-from daqsvc.outbox.messages import Draft, OutboxError
+from daqsvc.outbox.files import FileError, is_corrupt
+from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -109,6 +109,9 @@ class Reports(Protocol):
     def failed(self, failure: Failure) -> None:
         """A turn failed and will be tried again."""
 
+    def opened(self, unsent: int) -> None:
+        """A journal that could not be opened at first is open; it has so many unsent messages."""
+
     def replaced(self, unsent: int) -> None:
         """A corrupt file was set aside; so many unsent messages are in the new one."""
 
@@ -136,14 +139,15 @@ class JournalWriter:
         self._closing = threading.Event()
         self._crowd = Crowd()
 
-    def start(self) -> tuple[asyncio.Future[int], asyncio.Future[None]]:
+    def start(self) -> tuple[asyncio.Future[int | None], asyncio.Future[None]]:
         """Start the thread.
 
         Returns:
-            What becomes the number of unsent messages or an `OutboxError`; and what is done at the end.
+            What becomes the number of unsent messages, None if the disk cannot be used for now, or an
+            `OutboxError`; and what is done at the end.
         """
         loop = asyncio.get_running_loop()
-        opened: asyncio.Future[int] = loop.create_future()
+        opened: asyncio.Future[int | None] = loop.create_future()
         ended: asyncio.Future[None] = loop.create_future()
         threading.Thread(
             target=self._run, args=(loop, opened, ended), name="outbox-writer", daemon=True
@@ -167,7 +171,7 @@ class JournalWriter:
     # On the thread.
 
     def _run(
-        self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int], ended: asyncio.Future[None]
+        self, loop: asyncio.AbstractEventLoop, opened: asyncio.Future[int | None], ended: asyncio.Future[None]
     ) -> None:
         def post(function: Callable[..., object], *args: object) -> None:
             # A loop that is closed already has nobody left who would wait for the answer.
@@ -177,10 +181,7 @@ class JournalWriter:
         batch = Batch()
         try:
             try:
-                self._journal.hold()
-                self._make_way()
-                self._journal.open()
-                unsent = self._journal.unsent()
+                unsent = self._begin(post)
             except (OutboxError, *FileError) as error:
                 post(fail, opened, error)
                 return
@@ -196,12 +197,35 @@ class JournalWriter:
             self._journal.close()
             post(succeed, ended, None)
 
+    def _begin(self, post: _Post) -> int | None:
+        """Open the journal; the number of unsent messages, or None if it cannot be opened for now.
+
+        Raises:
+            OutboxError: it cannot be opened, and that will not pass by itself.
+        """
+        while True:
+            try:
+                self._journal.hold()
+                self._make_way()
+                self._journal.open()
+                return self._journal.unsent()
+            except OutboxAwayError as error:
+                if not self._recover(_cause(error), post, give_up=False):
+                    return None
+
+    def _open(self, post: _Post) -> None:
+        """Open the journal as soon as that can be done."""
+        if self._journal.is_ready:
+            return
+        self._journal.open()
+        post(self._reports.opened, self._journal.unsent())
+
     def _serve(self, batch: Batch, post: _Post) -> None:
         retry_s = RETRY_FIRST_S
         reported: Exception | None = None
         failed_reads = 0
         while True:
-            self._gather(batch, wait=reported is None)
+            self._gather(batch, wait=reported is None and self._journal.is_ready)
             failure = self._perform(batch, post)
             error = failure.write or failure.read
             if error is None:
@@ -216,13 +240,14 @@ class JournalWriter:
             if self._closing.is_set():
                 self._abandon(batch, error, post)
                 return
-            failed_reads = 0 if failure.read is None else failed_reads + 1
+            has_failed_to_read = failure.read is not None and self._journal.is_ready
+            failed_reads = failed_reads + 1 if has_failed_to_read else 0
             if reported is None:
                 reported = error
                 log.error(
                     "outbox %s cannot be %s: %s; messages wait in memory until it can",
                     self._journal.path,
-                    "written" if failure.write else "read",
+                    ("written" if self._journal.is_ready else "opened") if failure.write else "read",
                     error,
                 )
             if not self._recover(error, post, give_up=failed_reads >= READ_FAILURES_MAX):
@@ -248,17 +273,18 @@ class JournalWriter:
         """Commit, then read, even if the former failed. What is done is taken out of the batch."""
         failure = Failure()
         try:
+            self._open(post)
             while batch.drafts or batch.sent:
                 self._commit(batch, post)
-        except FileError as error:
-            failure.write = error
+        except (OutboxError, *FileError) as error:
+            failure.write = _cause(error)
         try:
             while batch.reads:
                 query, answer = batch.reads[0]
                 post(succeed, answer, query())
                 batch.reads.pop(0)
-        except FileError as error:
-            failure.read = error
+        except (OutboxError, *FileError) as error:
+            failure.read = _cause(error)
         return failure
 
     def _commit(self, batch: Batch, post: _Post) -> None:
@@ -276,15 +302,20 @@ class JournalWriter:
         the broker has makes room.
         """
         try:
-            if give_up or is_corrupt(error):
+            if self._journal.is_ready and (give_up or is_corrupt(error)):
                 self._journal.quarantine(error)
                 post(self._reports.replaced, self._journal.unsent())
                 return True
-            if is_full(error):
+            if self._journal.is_short_of_room(error):
                 return self._journal.make_room()
         except FileError as again:
-            if not is_full(again):
+            if not self._journal.is_short_of_room(again):
                 log.error("outbox %s cannot be recovered: %s", self._journal.path, again)  # noqa: TRY400
+                return False
+            try:
+                return self._journal.make_room()
+            except FileError:
+                return False  # there is none: it waits
         return False
 
     def _abandon(self, batch: Batch, error: BaseException, post: _Post) -> None:
@@ -296,6 +327,11 @@ class JournalWriter:
             post(fail, answer, failure)
         if batch.drafts:
             log.error("outbox %s lost %d messages: %s", self._journal.path, len(batch.drafts), error)
+
+
+def _cause(error: Exception) -> Exception:
+    """What the system or SQLite says, rather than what is made of it for a person."""
+    return error.__cause__ if isinstance(error.__cause__, Exception) else error
 
 
 def succeed(future: asyncio.Future[_T], result: _T) -> None:

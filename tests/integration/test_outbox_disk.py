@@ -30,7 +30,9 @@ def disk(tmp_path):
     directory = tmp_path / "disk"
     directory.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "none", directory], check=False, capture_output=True
+        ["mount", "-t", "tmpfs", "-o", "size=8m,mode=700", "none", directory],
+        check=False,
+        capture_output=True,
     )
     if mounted.returncode:
         pytest.skip("this machine lets no test mount a file system")

@@ -1,0 +1,125 @@
+"""Whose a store is: what others may write is not used, as sshd does not use keys that others may write.
+
+The service may run as root, and SQLite opens whatever stands under the names of its files. So nobody but the
+service's own user and root may be able to put something there.
+"""
+
+from __future__ import annotations
+
+import os
+import pwd
+import stat
+from pathlib import Path
+
+from daqsvc.outbox.messages import OutboxError
+
+JOURNAL, BESIDE = "outbox", ("audit.jsonl", "control.sock")
+"""How the names of the files begin that nobody else may have put there."""
+
+_MOST_LINKS = 40
+"""Symbolic links in one path, as the kernel has it."""
+
+
+def refuse_unsafe(store: Path) -> None:
+    """Make sure that nobody else can put files into a store.
+
+    Args:
+        store: its directory, which exists.
+
+    Raises:
+        OutboxError: somebody can, or has; the text says who and what to do.
+        OSError: it cannot be looked at.
+    """
+    _refuse_path(store)
+    for entry in os.scandir(store):
+        status = entry.stat(follow_symlinks=False)
+        if entry.name.startswith(JOURNAL):
+            _refuse_file(Path(entry.path), status)
+        elif entry.name.startswith(BESIDE) and status.st_uid not in _trusted():
+            raise OutboxError(_belongs(entry.path, status.st_uid, Path(entry.path)))
+
+
+def refuse_link(path: Path) -> None:
+    """Make sure that a file is none of another place or kind, if it is there at all.
+
+    Raises:
+        OutboxError: it is; the text says what to do.
+        OSError: it cannot be looked at.
+    """
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        return
+    _refuse_file(path, status)
+
+
+def _refuse_path(store: Path) -> None:
+    """Look at each directory on the way to the store, and at each symbolic link."""
+    at = Path(store.absolute().anchor)
+    waiting = list(reversed(store.absolute().parts[1:]))
+    links = 0
+    while True:
+        status = at.lstat()
+        if stat.S_ISLNK(status.st_mode):
+            links += 1
+            if status.st_uid not in _trusted() or links > _MOST_LINKS:
+                raise OutboxError(
+                    f"the store {store} is behind {at}, a symbolic link of {_user(status.st_uid)}: name a "
+                    "directory that the service's own user has made"
+                )
+            target = at.parent / at.readlink()
+            waiting += reversed(target.parts[1:])
+            at = Path(target.anchor)
+            continue
+        _refuse_directory(at, status, None if waiting else store, f"{at}, above the store {store},")
+        if not waiting:
+            return
+        at /= waiting.pop()
+
+
+def _refuse_directory(directory: Path, status: os.stat_result, store: Path | None, above: str) -> None:
+    """Look at one directory: the ``store``, or with None one ``above`` it."""
+    if status.st_uid not in _trusted():
+        if store is not None:
+            raise OutboxError(_belongs(f"the store {store}", status.st_uid, directory))
+        raise OutboxError(
+            f"{above} belongs to {_user(status.st_uid)}, who could put another store in its place, and the "
+            f"service runs as {_user(os.geteuid())}: give it a directory of its own, such as /var/lib/daqsvc"
+        )
+    mode = stat.S_IMODE(status.st_mode)
+    is_open = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and status.st_gid != os.getegid())
+    if not is_open or (store is None and mode & stat.S_ISVTX):
+        return
+    raise OutboxError(
+        f"{above if store is None else f'the store {store}'} has mode {mode:04o}, so that others may put "
+        f"files of theirs into it: chmod go-w {directory}, and look at what is in it before the next start"
+    )
+
+
+def _refuse_file(path: Path, status: os.stat_result) -> None:
+    if stat.S_ISLNK(status.st_mode):
+        raise OutboxError(
+            f"{path} is a symbolic link of {_user(status.st_uid)} to {path.readlink()}: the service follows "
+            "none in its store; remove it, and move what it points to here if it is the store's"
+        )
+    if status.st_uid not in _trusted():
+        raise OutboxError(_belongs(f"{path}", status.st_uid, path))
+
+
+def _belongs(what: str, owner: int, path: Path) -> str:
+    return (
+        f"{what} belongs to {_user(owner)} and the service runs as {_user(os.geteuid())}: "
+        f"chown {_user(os.geteuid())} {path}, run the service as {_user(owner)}, "
+        "or give it a directory of its own"
+    )
+
+
+def _trusted() -> set[int]:
+    return {0, os.geteuid()}
+
+
+def _user(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return f"user {number}"
