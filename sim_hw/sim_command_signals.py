@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
     from daqsvc.settings.sensors import BaseSensor
     from sim_hw.scenario_bearing import BearingScenario, Run
+
+logger = logging.getLogger(__name__)
 
 G_M_S2 = 9.80665
 _PER_UM = {"um": 1.0, "mm": 1e-3, "mil": 1.0 / 25.4}
@@ -160,7 +164,11 @@ class RecordedSignals:
     Args:
         recording: in the sensors' units. It is played again from its beginning as often as it takes. NaN is
             sent as what the layout has for a value that is not there, or refused if it has nothing.
+            A stream of another rate gets it resampled: one machine has streams of several rates.
         duration_s: how long to play; once through unless given.
+
+    Raises:
+        SignalError: the recording holds infinite samples.
     """
 
     def __init__(self, recording: Recording, duration_s: float | None = None) -> None:
@@ -170,9 +178,8 @@ class RecordedSignals:
                 "interpolate them"
             )
         self._recording = recording
-        self._n = (
-            len(recording.samples) if duration_s is None else max(round(duration_s * recording.rate_hz), 1)
-        )
+        self._duration_s = len(recording.samples) / recording.rate_hz if duration_s is None else duration_s
+        self._resampled: set[str] = set()
 
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:
         """See `Signals.of`."""
@@ -183,13 +190,51 @@ class RecordedSignals:
                 f"{self._recording.source} has no channel for sensor {sensor.name!r} (channel "
                 f"{sensor.channel!r}); it gives {', '.join(names)}: name them with --map SENSOR=VARIABLE,..."
             )
+        column = self._recording.samples[:, names.index(name)]
         if not math.isclose(rate_hz, self._recording.rate_hz, rel_tol=1e-3):
-            raise SignalError(
-                f"stream {sensor.stream!r} is sampled at {rate_hz:g} Hz and {self._recording.source} at "
-                f"{self._recording.rate_hz:g} Hz; set the stream's rate_hz, or state the recording's with "
-                "--fs"
+            self._say_resampled(sensor.stream, rate_hz)
+            column = resampled(column, self._recording.rate_hz, rate_hz)
+        return np.resize(column, max(round(self._duration_s * rate_hz), 1))
+
+    def _say_resampled(self, stream: str, rate_hz: float) -> None:
+        if stream not in self._resampled:
+            self._resampled.add(stream)
+            logger.warning(
+                "stream %r is sampled at %g Hz and %s at %g Hz: it is resampled. If the recording's rate is "
+                "wrong, state the right one with --fs",
+                stream,
+                rate_hz,
+                self._recording.source,
+                self._recording.rate_hz,
             )
-        return np.resize(self._recording.samples[:, names.index(name)], self._n)
+
+
+def resampled(column: NDArray[np.float64], from_hz: float, to_hz: float) -> NDArray[np.float64]:
+    """A channel at another rate, band-limited to the lower one; where samples were missing they still are.
+
+    Args:
+        column: float64 ``[n]``; NaN where a sample is missing.
+        from_hz: its rate.
+        to_hz: the rate wanted.
+
+    Returns:
+        float64 ``[ceil(n * to_hz / from_hz)]``, to a rate that differs from the one wanted by 1e-6 at most.
+    """
+    from scipy.signal import resample_poly  # noqa: PLC0415 - a second to import, seldom needed
+
+    ratio = Fraction(to_hz / from_hz).limit_denominator(10_000)
+    missing = np.isnan(column)
+    whole = column.copy()
+    if missing.all():
+        whole[:] = 0.0
+    elif missing.any():
+        there = np.flatnonzero(~missing)
+        whole[missing] = np.interp(np.flatnonzero(missing), there, column[there])
+    # Padded by a line: a channel that stands far from zero, such as a gap voltage, must not ring at its ends.
+    moved = resample_poly(whole, ratio.numerator, ratio.denominator, padtype="line")
+    taken_at = np.minimum(np.round(np.arange(len(moved)) / float(ratio)).astype(np.int64), len(column) - 1)
+    moved[missing[taken_at]] = np.nan
+    return np.asarray(moved, np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,20 +5,25 @@ from __future__ import annotations
 import argparse
 import re
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 from machine_files import MACHINES, MOTOR
 from sim_processes import DOCUMENTATION, PATIENCE_S, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process
 
+from daqsvc.recording.recording import Recording
 from daqsvc.settings import load_machine_file
 from sim_hw.scenario import Scenario, builtin_scenarios, load_any_scenario, load_scenario
 from sim_hw.sim_command import SimCommand, _misuse, _script
-from sim_hw.sim_command_signals import BearingSignals, RotorSignals, SignalError, stream_samples
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from sim_hw.sim_command_signals import (
+    BearingSignals,
+    RecordedSignals,
+    RotorSignals,
+    SignalError,
+    resampled,
+    stream_samples,
+)
 
 
 def test_every_scenario_that_comes_along_can_be_read_and_says_what_goes_wrong() -> None:
@@ -115,3 +120,34 @@ def test_a_rotor_that_leaves_its_housing_is_refused() -> None:
     signals = RotorSignals(scenario.model_copy(update={"plant": plant}), 0.5)
     with pytest.raises(SignalError, match="cannot be played: the rotor left its housing"):
         stream_samples(load_machine_file(VIRTUAL_RIG), "shaft", signals)
+
+
+def test_streams_of_two_rates_are_played_from_one_recording(caplog: pytest.LogCaptureFixture) -> None:
+    t_s = np.arange(4000) / 2000.0
+    recording = Recording(
+        ("probe-x", "probe-y", "keyphasor"),
+        np.column_stack([np.sin(2 * np.pi * 20.0 * t_s), np.full(4000, -9.0), np.zeros(4000)]),
+        2000.0,
+        Path("run.npz"),
+        0,
+    )
+    machine = load_machine_file(VIRTUAL_RIG)
+    played = stream_samples(machine, "shaft", RecordedSignals(recording))
+    n = len(played.samples)
+    assert (n, played.rate_hz) == (2 * 640, 640.0)
+    middle = slice(64, n - 64)
+    expected = np.sin(2 * np.pi * 20.0 * np.arange(n) / 640.0)
+    np.testing.assert_allclose(played.samples[middle, 0], expected[middle], atol=2e-3)
+    np.testing.assert_allclose(played.samples[:, 1], -9.0, atol=1e-3)
+    assert (
+        caplog.text.count("stream 'shaft' is sampled at 640 Hz and run.npz at 2000 Hz: it is resampled") == 1
+    )
+
+
+def test_what_is_missing_in_a_recording_is_missing_at_another_rate() -> None:
+    column = np.ones(1000)
+    column[500:520] = np.nan
+    moved = resampled(column, 1000.0, 250.0)
+    assert np.flatnonzero(np.isnan(moved)).tolist() == [125, 126, 127, 128, 129]
+    np.testing.assert_allclose(moved[~np.isnan(moved)], 1.0, atol=1e-3)
+    assert np.isnan(resampled(np.full(10, np.nan), 10.0, 20.0)).all()
