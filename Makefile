@@ -4,6 +4,7 @@
 # make hil    tests on real CAN interfaces (vcan), in a guest kernel where this one has none; as root
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
+# make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
@@ -20,7 +21,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check bench bench-data nothing-lost lock clean
+.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -56,6 +57,15 @@ bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
 	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
 
+# Built with what requirements-dev.lock pins: nothing is fetched meanwhile.
+DIST := dist
+dist: $(READY)
+	@rm -rf $(DIST) && mkdir -p $(DIST)
+	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation --wheel-dir $(DIST) .
+	@$(BIN)/python -m cyclonedx_py requirements requirements.lock --pyproject pyproject.toml --output-reproducible \
+		--output-file $$(ls $(DIST)/*.whl | sed 's/-py3.*//').cdx.json
+	@ls $(DIST)
+
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)
 
@@ -66,6 +76,7 @@ bench-data: $(READY)
 lock:
 	uv pip compile pyproject.toml --all-extras --group dev --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-dev.lock
 	uv pip compile pyproject.toml --all-extras --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements.lock
+	echo 'setuptools>=77' | uv pip compile - --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-build.lock
 
 clean:
 	rm -rf $(VENV) .cache build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
