@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 _NS_PER_MS = 1_000_000
 
 
-def alignment(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> Alignment:
+def alignment(machine: MachineFile, clock: Clock | None, deliver: Callable[[SampleBlock], None]) -> Alignment:
     """The grids that the detectors of a machine file need; often none.
 
     Args:
         machine: the machine file.
-        clock: of the host.
+        clock: of the host; None where blocks come as fast as samples were taken.
         deliver: called with each block of a grid, which is named by `Grid.name`.
     """
 

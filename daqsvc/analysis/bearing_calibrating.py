@@ -14,7 +14,6 @@ from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
-from daqsvc.recording.recording import load_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -60,13 +59,7 @@ def learn_by_machine(
     analyst.check_map(machine)
     given = machine.pipeline.bearing
     assert given is not None  # noqa: S101 - the command has asked for it
-    columns = analyst.columns(machine, path)
-    if lacking := [name for name in given.sensors if name not in columns]:
-        raise RefusedError(
-            f"{path} has no channel for {', '.join(lacking)} of {machine.path}; name its variable, e.g. "
-            f"--map {lacking[0]}=VARIABLE"
-        )
-    recording = load_recording(path, {name: columns[name] for name in given.sensors}, rate_hz)
+    recording = analyst.load(machine, path, given.sensors)
     watched = present(given, recording.names)
     assert watched is not None  # noqa: S101 - none is lacking
     bearings = {bearing.sensor: orders_of(bearing, i) for i, bearing in enumerate(watched.bearings)}

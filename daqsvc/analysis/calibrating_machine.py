@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from daqsvc.analysis.calibrating import CalibrationSetup
 from daqsvc.analysis.machine import MachineAnalyst
-from daqsvc.recording.recording import load_recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -62,6 +61,4 @@ class MachineRecordings:
             RecordingError: it cannot be read.
             RefusedError: it lacks one of them.
         """
-        columns = self._analyst.columns(self._machine, path)
-        needed = {name: columns[name] for name in self._given.sensors}
-        return load_recording(path, needed, self._analyst.rate_hz)
+        return self._analyst.load(self._machine, path, self._given.sensors)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -17,6 +17,7 @@ from daqsvc.analysis.bearing_machine import (
     present,
 )
 from daqsvc.analysis.bearing_setup import matching
+from daqsvc.analysis.can_logs import is_can_log, load_can_log
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import count_bad
 from daqsvc.analysis.result import RotorAnalysis
@@ -31,7 +32,7 @@ from daqsvc.rotor.synchronous.watch import WatchRules
 from daqsvc.settings import load_machine_file, models
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,8 +108,7 @@ class MachineAnalyst:
         """See `daqsvc.analysis.many.Analyst.judge`."""
         machine = load_machine_file(Path(self.machine))
         try:
-            columns = self.columns(machine, recording)
-            loaded = load_recording(recording, columns, self.rate_hz)
+            loaded = self.load(machine, recording)
         except (RecordingError, RefusedError) as error:
             return _outcome(_not_judged(machine, recording, str(error)), ())
         machine = _as_recorded(machine, loaded)
@@ -135,7 +135,62 @@ class MachineAnalyst:
             bearings = self._bearings(machine, loaded, figures)
         except ValueError as error:
             analysis, bearings = _not_judged(machine, recording, str(error)), None
-        return _outcome(analysis, tuple(statements.values()), bearings)
+        return _outcome(analysis, tuple(statements.values()), bearings, loaded.notes)
+
+    def load(self, machine: MachineFile, recording: str, only: Sequence[str] | None = None) -> Recording:
+        """The sensors of a machine in a recording, by their names.
+
+        Args:
+            machine: the machine file, loaded.
+            recording: path of the recording: a file, a CAN log, or a folder of CAN logs.
+            only: names of the sensors that are wanted; None: all that it has.
+
+        Raises:
+            RecordingError: it cannot be read.
+            RefusedError: it lacks a sensor that is wanted, or of the rotor's detector, or has none at all.
+        """
+        if not is_can_log(recording):
+            columns = self.columns(machine, recording)
+            self._refuse_lacking(machine, recording, only or (), columns)
+            wanted = columns if only is None else {name: columns[name] for name in only}
+            return load_recording(recording, wanted, self.rate_hz)
+        if self.channels or self.unit is not None:
+            raise RefusedError(
+                f"{recording} is a CAN log, of which the machine file says channels and units: leave out "
+                f"{'--map' if self.channels else '--unit'}"
+            )
+        found = load_can_log(machine, recording, self.rate_hz)
+        self._refuse_lacking(machine, recording, only or _needed(machine), found.names)
+        if only is None:
+            return found
+        samples = found.samples[:, [found.names.index(name) for name in only]]
+        return replace(
+            found,
+            names=tuple(only),
+            samples=samples,
+            nan_count=int(np.isnan(samples).sum()),
+            infinity_count=int(np.isinf(samples).sum()),
+        )
+
+    def _refuse_lacking(
+        self, machine: MachineFile, recording: str, wanted: Iterable[str], there: Container[str]
+    ) -> None:
+        """Refuse a recording without a sensor that is wanted.
+
+        Raises:
+            RefusedError: it lacks one.
+        """
+        lacking = [name for name in wanted if name not in there]
+        if lacking and is_can_log(recording):
+            raise RefusedError(
+                f"{recording} holds no samples of {', '.join(lacking)} of {self.machine}; give the log of "
+                "its bus too, in one folder"
+            )
+        if lacking:
+            raise RefusedError(
+                f"{recording} has no channel for {', '.join(lacking)} of {machine.path}; name its variable, "
+                f"e.g. --map {lacking[0]}=VARIABLE"
+            )
 
     def columns(self, machine: MachineFile, recording: str) -> dict[str, str]:
         """The variable of each sensor that a recording has.
@@ -158,11 +213,7 @@ class MachineAnalyst:
                 found[sensor.name] = sensor.name
             elif sensor.channel in there:
                 found[sensor.name] = sensor.channel
-        synchronous, bank = machine.pipeline.rotor_synchronous, machine.pipeline.rotor_bank
-        needed = () if synchronous is None else synchronous.sensors
-        if synchronous is None and bank is not None:
-            needed = (*bank.probes, bank.keyphasor)
-        missing = [name for name in needed if name not in found]
+        missing = [name for name in _needed(machine) if name not in found]
         if missing or not found:
             missing = missing or [sensor.name for sensor in machine.sensors]
             raise RefusedError(
@@ -260,6 +311,14 @@ class MachineAnalyst:
         return np.where(np.isfinite(samples), samples, np.nan)
 
 
+def _needed(machine: MachineFile) -> tuple[str, ...]:
+    """The sensors without which the rotor cannot be judged."""
+    synchronous, bank = machine.pipeline.rotor_synchronous, machine.pipeline.rotor_bank
+    if synchronous is not None:
+        return synchronous.sensors
+    return () if bank is None else (*bank.probes, bank.keyphasor)
+
+
 def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
     """The machine with the sensors of a recording only, the detectors that they suffice for, and its rate."""
     sensors = tuple(sensor for sensor in machine.sensors if sensor.name in recording.names)
@@ -293,11 +352,13 @@ def _outcome(
     analysis: RotorAnalysis | BearingAnalysis | None,
     statements: tuple[Statements, ...],
     bearings: MachineBearings | None = None,
+    notes: Iterable[str] = (),
 ) -> Outcome:
     """The rotor's verdict comes first; the bearings' if nothing watches the rotor."""
     first = analysis if analysis is not None or bearings is None else bearings.analysis
     assert first is not None  # noqa: S101 - one of the two is there
     found = first.as_json()
+    found["data_quality"]["problems"] = [*notes, *found["data_quality"]["problems"]]
     texts = [first.describe(), *(said.describe() for said in statements)]
     if bearings is not None:
         statements = (*statements, bearings.statements)
@@ -307,4 +368,5 @@ def _outcome(
     found["detectors"] = {said.detector: said.as_json() for said in statements}
     if alarmed := worst(statements):
         texts.insert(1, f"worst of the other detectors: {alarmed}")
+    texts[1:1] = notes
     return Outcome(found, "\n  ".join(texts), first.refused is not None)

@@ -38,6 +38,7 @@ class Recording:
             a column of time.
         scalars: the single numbers of the file, e.g. ``{"RPM": 1797.0}``.
         texts: its single texts, e.g. ``{"label": "healthy"}``.
+        notes: what a person should know of how it was read, in sentences.
     """
 
     names: tuple[str, ...]
@@ -50,6 +51,7 @@ class Recording:
     rate_source: str = "given"
     scalars: Mapping[str, float] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 class _Reading:

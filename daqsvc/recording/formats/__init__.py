@@ -30,6 +30,9 @@ READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
 }
 
 
+CAN_LOGS = (".blf", ".asc", ".log", ".trc")
+"""How the names of CAN logs end; ``.gz`` may stand behind."""
+
 _LONGEST_REASON = 300
 
 
@@ -48,6 +51,10 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
         raise RecordingError(f"{path!s:.200} cannot be read: {_one_line(error)}; correct the path") from None
     name = path.name.lower()
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
+    if reader is None and name.removesuffix(".gz").endswith(CAN_LOGS):
+        raise RecordingError(
+            f"{path} is a CAN log, which only the layouts of a machine file make sense of: name that first"
+        )
     if reader is None:
         raise RecordingError(f"{path} is not a kind of file that can be read; use {', '.join(READERS)}")
     if not stat.S_ISREG(status.st_mode):

@@ -1,0 +1,392 @@
+"""CAN logs as recordings: decoded and put together as the service does it live."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.assembly_alignment import alignment
+from daqsvc.assembly_drivers import frame_layout
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.formats import CAN_LOGS
+from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE
+from daqsvc.recording.recording import Recording
+from daqsvc.settings.models import DbcLayout, PlainLayout
+from drivers.base import StreamSpec
+from drivers.can_adapter import batch_of
+from drivers.can_batches import FrameSorter, Sorted
+from drivers.replay_can import CanLog
+from drivers.replay_files import RecordingError as LogError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    import can
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.settings import MachineFile
+    from daqsvc.settings.models import Sensor
+    from drivers.frames import FrameLayout
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+_SPAN_NS = NS_PER_S // 20
+_NS_PER_MS = 1_000_000
+_MOST_OFF_RATE = 0.05
+_LONG_ENOUGH_S = 1.0
+"""A shorter log does not tell the rate of a stream."""
+_NAMED_IDS = 8
+
+
+def is_can_log(path: str) -> bool:
+    """Whether a recording is a CAN log by its ending, or a folder of such."""
+    return Path(path).is_dir() or _is_log(Path(path))
+
+
+def _is_log(path: Path) -> bool:
+    return path.name.lower().removesuffix(".gz").endswith(CAN_LOGS)
+
+
+def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) -> Recording:
+    """The sensors of a machine in a CAN log, or in all logs of a folder: its buses, and the parts of each.
+
+    The frames go through the decoders and assemblers of the live service, and streams that the detectors take
+    together through its grid. A recording has one rate: streams of others are left out, and `Recording.notes`
+    says so; it also says what of a log is damaged.
+
+    Args:
+        machine: the machine file.
+        path: the log or folder.
+        rate_hz: what the user says of the rate.
+
+    Raises:
+        RecordingError: it cannot be read, holds no samples of the machine, or not at the rates that the
+            machine file says.
+    """
+    playing = _Playing(machine, path)
+    playing.play()
+    if not playing.blocks and playing.notes:
+        raise RecordingError(playing.notes[0])
+    if not playing.blocks:
+        raise RecordingError(
+            f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; give the log of "
+            "this machine's bus, or correct the ids and lengths of its layouts"
+        )
+    playing.check_rates()
+    return _recording(machine, path, playing, rate_hz)
+
+
+@dataclass(slots=True)
+class _Bus:
+    name: str
+    channel: str
+    sorter: FrameSorter
+
+
+class _Playing:
+    """All logs of a recording, played in the order of their frames."""
+
+    def __init__(self, machine: MachineFile, path: str) -> None:
+        self._machine = machine
+        self._path = path
+        self.blocks: dict[str, list[SampleBlock]] = {}
+        self.notes: list[str] = []
+        self.spans_ns: dict[str, tuple[int, int]] = {}
+        self.unknown: dict[str, int] = {}
+        self._specs = _specs(machine)
+        if not self._specs:
+            raise RecordingError(
+                f"{path} is a CAN log, and no stream of {machine.path} comes in CAN frames; give a table of "
+                "samples, or the machine file with the layout of the frames"
+            )
+        self.assemblers = {
+            spec.name: StreamAssembler(
+                spec.name,
+                spec.rate_hz,
+                counter_bits=spec.layout.counter_bits,
+                samples_per_frame=spec.layout.samples_per_frame,
+                counts_per_frame=spec.layout.counts_per_frame,
+                deliver=self._deliver,
+                reorder_window_ns=spec.reorder_window_ns,
+            )
+            for specs in self._specs.values()
+            for spec in specs
+        }
+        self._alignment = alignment(machine, None, self._keep)
+
+    def play(self) -> None:
+        """Play them."""
+        files = [Path(self._path)]
+        if files[0].is_dir():
+            files = sorted(file for file in files[0].iterdir() if _is_log(file) and file.is_file())
+            if not files:
+                raise RecordingError(
+                    f"{self._path} is a folder without a CAN log ({', '.join(CAN_LOGS)}); give that of "
+                    "the logs"
+                )
+        logs = [_Log(file, self._buses(), self.notes) for file in files]
+        for piece in heapq.merge(*(log.pieces() for log in logs), key=_first_ns):
+            self._take(piece)
+        for assembler in self.assemblers.values():
+            assembler.flush()
+        for log in logs:
+            if not log.taken and len(logs) > 1:
+                self.notes.append(f"{log.path.name} has no frame of a stream of {self._machine.path}")
+
+    def _buses(self) -> list[_Bus]:
+        return [
+            _Bus(name, str(getattr(self._machine.buses[name], "channel", None) or name), FrameSorter(specs))
+            for name, specs in self._specs.items()
+        ]
+
+    def _take(self, piece: Sorted) -> None:
+        for name, count in piece.unknown.items():
+            self.unknown[name] = self.unknown.get(name, 0) + count
+        newest_ns = 0
+        for frames in piece.frames:
+            first_ns, last_ns = self.spans_ns.get(frames.stream, (int(frames.arrival_ns[0]), 0))
+            # Logs of several interfaces may step back a little; an arrival never does.
+            arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns, last_ns))
+            newest_ns = max(newest_ns, int(arrival_ns[-1]))
+            self.spans_ns[frames.stream] = first_ns, int(arrival_ns[-1])
+            decoded = frames.decoded
+            self.assemblers[frames.stream].accept(
+                decoded.counter, decoded.samples, decoded.intact, arrival_ns
+            )
+        if newest_ns:
+            for assembler in self.assemblers.values():
+                assembler.tick(newest_ns)
+
+    def _deliver(self, block: SampleBlock) -> None:
+        self._keep(block)
+        self._alignment.accept(block)
+
+    def _keep(self, block: SampleBlock) -> None:
+        self.blocks.setdefault(block.stream, []).append(block)
+
+    def seen_instead(self) -> str:
+        """What the log holds that no stream has, in words."""
+        ids = sorted(self.unknown, key=lambda name: -self.unknown[name])[:_NAMED_IDS]
+        return f", but frames of {', '.join(ids)}" if ids else ""
+
+    def check_rates(self) -> None:
+        """See whether samples come as fast as the machine file says.
+
+        Raises:
+            RecordingError: they do not.
+        """
+        for name, (first_ns, last_ns) in self.spans_ns.items():
+            counters, stated_hz = self.assemblers[name].counters, self._machine.streams[name].rate_hz
+            span_s = (last_ns - first_ns) / NS_PER_S
+            if span_s < _LONG_ENOUGH_S:
+                continue
+            seen_hz = counters.samples_received / span_s
+            too_few = seen_hz < stated_hz * (1.0 - _MOST_OFF_RATE)
+            if seen_hz > stated_hz * (1.0 + _MOST_OFF_RATE) or (too_few and not counters.samples_lost):
+                raise RecordingError(
+                    f"{self._path}: stream {name!r} comes at {seen_hz:.4g} Hz, and {self._machine.path} says "
+                    f"{stated_hz:g} Hz; correct its rate_hz"
+                )
+
+
+def _specs(machine: MachineFile) -> dict[str, list[StreamSpec[FrameLayout]]]:
+    """By bus, its streams that come in CAN frames."""
+    found: dict[str, list[StreamSpec[FrameLayout]]] = {}
+    for name, stream in machine.streams.items():
+        if isinstance(stream.layout, PlainLayout | DbcLayout):
+            window_ns = round(stream.reorder_window_ms * _NS_PER_MS)
+            spec = StreamSpec(name, frame_layout(machine, name), stream.rate_hz, window_ns)
+            found.setdefault(stream.bus, []).append(spec)
+    return found
+
+
+class _Log:
+    """One log; which bus each of its channels is shows in the frames and the names."""
+
+    def __init__(self, path: Path, buses: Sequence[_Bus], notes: list[str]) -> None:
+        self.path = path
+        self.taken = False
+        self._buses = buses
+        self._notes = notes
+        self._chosen: dict[str, _Bus] = {}
+
+    def pieces(self) -> Iterator[Sorted]:
+        """What it holds, piece by piece; ends at what is damaged.
+
+        Raises:
+            RecordingError: it cannot be read at all.
+        """
+        try:
+            log = CanLog(self.path, self._sort)
+        except LogError as error:
+            raise RecordingError(f"{error}") from None
+        malformed = 0
+        try:
+            while (piece := log.read(_SPAN_NS)) is not None:
+                malformed += piece.notes.get("frames_malformed", 0)
+                if piece.frames or piece.unknown:
+                    yield piece
+        except LogError as error:
+            self._notes.append(f"{error}".replace("have been played", "are taken"))
+        finally:
+            log.close()
+        if malformed:
+            self._notes.append(
+                f"{malformed} lines of {self.path.name} are no frames, first {log.first_malformed}"
+            )
+
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+        found = Sorted()
+        channels = ["" if message.channel is None else str(message.channel) for message in messages]
+        for channel in dict.fromkeys(channels):
+            rows = [k for k, name in enumerate(channels) if name == channel]
+            batch = batch_of([messages[k] for k in rows], t_ns[rows].tolist())
+            bus = self._chosen.get(channel)
+            if bus is None:
+                bus = self._choose(channel, {b.name: b.sorter.sort(batch, 0) for b in self._buses})
+            part = (bus or self._buses[0]).sorter.sort(batch, 0)
+            if bus is not None:
+                found.frames += part.frames
+                self.taken = self.taken or bool(part.frames)
+            for name, count in part.unknown.items():
+                found.unknown[name] = found.unknown.get(name, 0) + count
+        return found
+
+    def _choose(self, channel: str, parts: Mapping[str, Sorted]) -> _Bus | None:
+        """The bus that a channel is; None while that does not show.
+
+        Raises:
+            RecordingError: it may be several.
+        """
+        counts = {name: sum(len(f.arrival_ns) for f in part.frames) for name, part in parts.items()}
+        fitting = [bus for bus in self._buses if counts[bus.name]]
+        named = [
+            bus
+            for bus in fitting
+            if channel in {bus.name, bus.channel}
+            or self.path.name.startswith((f"{bus.name}-", f"{bus.name}."))
+        ]
+        best = [bus for bus in fitting if counts[bus.name] == max(counts.values())]
+        candidates = named or best
+        if len(candidates) > 1:
+            raise RecordingError(
+                f"the frames of {self.path} may be of {' or '.join(bus.name for bus in candidates)}; let its "
+                f"name begin with that of the bus, e.g. {candidates[0].name}-{self.path.name}"
+            )
+        if candidates:
+            self._chosen[channel] = candidates[0]
+        return candidates[0] if candidates else None
+
+
+def _first_ns(piece: Sorted) -> int:
+    return min((int(frames.arrival_ns[0]) for frames in piece.frames), default=0)
+
+
+@dataclass(slots=True)
+class _Rows:
+    """Samples of a stream or grid in their places.
+
+    Attributes:
+        samples: float64 ``[n, channels]``.
+        t_first_ns: when the first was taken.
+    """
+
+    samples: Floats
+    t_first_ns: float
+
+
+def _rows(path: str, name: str, blocks: Sequence[SampleBlock]) -> _Rows:
+    first, end = blocks[0].first_index, blocks[-1].end_index
+    there = sum(len(block.samples) for block in blocks)
+    if end - first > MOST_STRETCHED * there:
+        raise RecordingError(
+            f"{path} lacks {end - first - there:,} of {end - first:,} samples of stream {name!r}; give the "
+            "logs of one time without long gaps between"
+        )
+    samples = np.full((end - first, blocks[0].samples.shape[1]), np.nan)
+    for block in blocks:
+        samples[block.first_index - first : block.end_index - first] = block.samples
+    last = blocks[-1]
+    return _Rows(samples, last.t_first_ns - (last.first_index - first) * last.period_ns)
+
+
+def _recording(machine: MachineFile, path: str, playing: _Playing, given_hz: float | None) -> Recording:
+    notes = list(playing.notes)
+    group, rate_hz = _group(machine, playing)
+    if given_hz is not None and abs(given_hz / rate_hz - 1.0) > SAME_RATE:
+        raise RecordingError(
+            f"the sampling rate of {path} is {rate_hz:g} Hz by {machine.path} and {given_hz:g} Hz as given: "
+            "leave --fs out, or correct it"
+        )
+    names, columns = [], []
+    rows = {name: _rows(path, name, playing.blocks[name]) for name in group}
+    begun_ns = min(one.t_first_ns for one in rows.values())
+    shifts = {n: round((one.t_first_ns - begun_ns) * rate_hz / NS_PER_S) for n, one in rows.items()}
+    length = max(shifts[name] + len(one.samples) for name, one in rows.items())
+    for sensor in machine.sensors:
+        for name, channels in group.items():
+            if (sensor.stream, sensor.channel) in channels:
+                column = np.full(length, np.nan)
+                found = rows[name].samples[:, channels.index((sensor.stream, sensor.channel))]
+                column[shifts[name] : shifts[name] + len(found)] = found
+                names.append(sensor.name)
+                columns.append(column)
+    streams = {stream for channels in group.values() for stream, _ in channels}
+    if left_out := sorted(name for name in playing.spans_ns if name not in streams):
+        notes.append(
+            f"left out, as a recording has one rate ({rate_hz:g} Hz): "
+            + ", ".join(f"{name} ({machine.streams[name].rate_hz:g} Hz)" for name in left_out)
+        )
+    samples = np.column_stack(columns)
+    return Recording(
+        names=tuple(names),
+        samples=samples,
+        rate_hz=rate_hz,
+        source=Path(path),
+        nan_count=int(np.isnan(samples).sum()),
+        infinity_count=int(np.isinf(samples).sum()),
+        rate_source=f"of {machine.path}",
+        notes=tuple(notes),
+    )
+
+
+def _group(machine: MachineFile, playing: _Playing) -> tuple[dict[str, list[tuple[str, str]]], float]:
+    """What makes the recording: a grid, or streams of one rate; with the stream and channel of each column.
+
+    Raises:
+        RecordingError: there is a grid, and nothing could be put on it.
+    """
+    for grid in machine.grids:
+        if grid.name in playing.blocks:
+            columns = [(name, c) for name, s in grid.streams.items() for c in s.layout.channel_names]
+            return {grid.name: columns}, next(iter(grid.streams.values())).rate_hz
+        if not set(grid.streams) - set(playing.spans_ns):
+            raise RecordingError(
+                f"the streams {', '.join(grid.streams)} could not be put on one grid: they are too short, or "
+                "of different times; give logs of some 10 s and more, of the same time"
+            )
+    present = [name for name in machine.streams if name in playing.blocks]
+    wanted = [sensor.stream for sensor in _watched(machine) if sensor.stream in present] or present
+    rates = [machine.streams[name].rate_hz for name in wanted]
+    rate_hz = max(dict.fromkeys(rates), key=rates.count)
+    group = {
+        name: [(name, channel) for channel in machine.streams[name].layout.channel_names]
+        for name in present
+        if machine.streams[name].rate_hz == rate_hz
+    }
+    return group, rate_hz
+
+
+def _watched(machine: MachineFile) -> list[Sensor]:
+    """The sensors of the detectors that need their samples at one rate."""
+    pipeline = machine.pipeline
+    rotors = [one.sensors for one in (pipeline.rotor_synchronous, pipeline.rotor_bank) if one is not None]
+    bearings = [] if pipeline.bearing is None else [pipeline.bearing.sensors]
+    return [machine.sensor(name) for names in (*rotors, *bearings) for name in names]
