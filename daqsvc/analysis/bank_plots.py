@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from daqsvc.analysis.plots import shortened
+
 if TYPE_CHECKING:
     from daqsvc.analysis.statements import Statements
     from daqsvc.recording.recording import Recording
@@ -31,7 +33,7 @@ def draw_bank(recording: Recording, said: Statements, prefix: str) -> list[str]:
     if not good:
         return []
     figure = Figure(figsize=(9.6, 7.0), layout="constrained")
-    figure.suptitle(f"Rotor bank: {recording.source.name}\n{good[-1].decision}", fontsize=11)
+    figure.suptitle(f"Rotor bank: {shortened(recording.source.name)}\n{good[-1].decision}", fontsize=11)
     upper, lower = figure.subplots(2, 1, sharex=True)
     turns = np.array([one.revolutions for one in good], dtype=np.float64)
     for mode in said.faults:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from daqsvc.analysis.plots import shortened
 from daqsvc.bearing.race.verdict import PARTS
 
 if TYPE_CHECKING:
@@ -54,8 +55,8 @@ def _envelope(analysis: BearingAnalysis, name: str, race: RaceVerdict) -> Figure
     figure = Figure(figsize=(9.6, 5.2), layout="constrained")
     said = race.verdict.replace("_", " ")
     figure.suptitle(
-        f"Envelope spectrum: {Path(analysis.recording).name}, {name}\n{said} (by this channel), "
-        f"{race.speed_rpm:.1f} rpm, {race.revolutions:.0f} revolutions",
+        f"Envelope spectrum: {shortened(Path(analysis.recording).name)}, {shortened(name)}\n"
+        f"{said} (by this channel), {race.speed_rpm:.1f} rpm, {race.revolutions:.0f} revolutions",
         fontsize=11,
     )
     axes = figure.add_subplot()
@@ -79,7 +80,8 @@ def _envelope(analysis: BearingAnalysis, name: str, race: RaceVerdict) -> Figure
         ),
     )
     above.set_xlabel("Hz", fontsize=9)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), fontsize=9, ncols=4, frameon=False)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", fontsize=9, ncols=4, frameon=False)
     return figure
 
 

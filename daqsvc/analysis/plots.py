@@ -50,6 +50,7 @@ _POINTS = 128
 _HARMONICS = 8
 """Harmonics of a mean revolution that are drawn."""
 _DPI = 110
+_LONGEST_NAME = 40
 _COMPONENTS = ("mean", "1X", "-1X", "2X", "-2X")
 
 
@@ -144,10 +145,19 @@ def draw(recording: Recording, setup: RotorSetup, analysis: RotorAnalysis, prefi
     return files
 
 
+def shortened(name: str) -> str:
+    """A file's name as a title has room for it."""
+    return (
+        name
+        if len(name) <= _LONGEST_NAME
+        else f"{name[: _LONGEST_NAME // 2]}...{name[-_LONGEST_NAME // 2 :]}"
+    )
+
+
 def _figure(subject: _Subject, title: str, size: tuple[float, float]) -> Figure:
     figure = Figure(figsize=size, layout="constrained")
     said = " or ".join(name.replace("_", " ") for name in subject.analysis.group) or "not judged"
-    figure.suptitle(f"{title}: {subject.name}\n{said}", fontsize=11)
+    figure.suptitle(f"{title}: {shortened(subject.name)}\n{said}", fontsize=11)
     return figure
 
 
@@ -174,7 +184,7 @@ def _orbit(subject: _Subject) -> Figure:
         axes.plot(*mean[0], "o", color=colour, markersize=7, markeredgecolor="white")
     _clearance(axes, subject)
     axes.plot([], [], "o", color=_QUIET, label="shaft angle zero")
-    _plane(axes, f"{subject.probes[0]} in um", f"{subject.probes[1]} in um")
+    _plane(figure, axes, f"{subject.probes[0]} in um", f"{subject.probes[1]} in um")
     return figure
 
 
@@ -196,16 +206,16 @@ def _clearance(axes: Axes, subject: _Subject) -> None:
         )
 
 
-def _plane(axes: Axes, across: str, up: str) -> None:
+def _plane(figure: Figure, axes: Axes, across: str, up: str) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(across)
     axes.set_ylabel(up)
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), fontsize=9, ncols=2, frameon=False)
+    _legend_below(figure, axes, columns=2)
 
 
 def _poincare(subject: _Subject) -> Figure:
-    figure = _figure(subject, "Poincare map, one point a revolution at shaft angle zero", (6.8, 6.2))
+    figure = _figure(subject, "Poincare map at shaft angle zero", (6.8, 6.2))
     axes = figure.add_subplot()
     points = subject.orbits(slice(None))[:, 0]
     drawn = axes.scatter(
@@ -216,7 +226,7 @@ def _poincare(subject: _Subject) -> Figure:
         axes.plot(
             *points[part].mean(axis=0), "+", color=colour, markersize=16, mew=2.5, label=f"mean, {label}"
         )
-    _plane(axes, f"{subject.probes[0]} in um", f"{subject.probes[1]} in um")
+    _plane(figure, axes, f"{subject.probes[0]} in um", f"{subject.probes[1]} in um")
     return figure
 
 
@@ -229,8 +239,7 @@ def _phase_plane(subject: _Subject) -> Figure:
         axes.set_xlabel(f"{subject.probes[k]} in um")
         axes.set_ylabel("velocity in mm/s")
         axes.grid(alpha=0.3)
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", fontsize=9, ncols=2, frameon=False)
+    _legend_below(figure, axes, columns=2)
     return figure
 
 
@@ -287,7 +296,7 @@ def _probabilities(subject: _Subject) -> Figure:
     axes.set_ylim(-0.03, 1.03)
     axes.set_ylabel("probability")
     _over_revolutions(axes, subject)
-    _legend_below(axes)
+    _legend_below(figure, axes)
     return figure
 
 
@@ -324,7 +333,7 @@ def _innovations(subject: _Subject) -> Figure:
     lower.set_yscale("log")
     lower.set_ylabel("evidence for a change in nats")
     _over_revolutions(lower, subject)
-    _legend_below(lower)
+    _legend_below(figure, lower)
     return figure
 
 
@@ -362,12 +371,14 @@ def _over_revolutions(axes: Axes, subject: _Subject) -> None:
     axes.grid(alpha=0.3)
 
 
-def _legend_below(axes: Axes) -> None:
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize=9, ncols=5, frameon=False)
+def _legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """What the axes show, below all of them: the layout makes room for a legend of the figure only."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", fontsize=9, ncols=columns, frameon=False)
 
 
 def _polar(subject: _Subject) -> Figure:
-    figure = _figure(subject, "1X vector in um, one point a revolution", (6.6, 6.8))
+    figure = _figure(subject, "1X vector in um by revolution", (6.6, 6.8))
     axes = figure.add_subplot(projection="polar")
     assert isinstance(axes, PolarAxes)  # noqa: S101 - what the projection makes
     forward = subject.trace.vectors.vectors[:, 1]
