@@ -106,6 +106,7 @@ def _no_log() -> Iterator[None]:
     logging.disable(logging.NOTSET)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_no_log")
 async def test_a_hundred_losses_leave_nothing_behind(transport: Transport) -> None:
     held: list[_Held] = []
@@ -320,6 +321,7 @@ async def test_a_counter_that_restarts_is_followed(transport: Transport) -> None
     assert len(rig.stored) >= 68 * transport.samples_per_frame, "more than the doubtful frame is missing"
 
 
+@pytest.mark.long
 @pytest.mark.needs("overflow")
 async def test_a_consumer_that_cannot_keep_up_costs_samples_and_not_memory(transport: Transport) -> None:
     async with Rig(transport) as rig:

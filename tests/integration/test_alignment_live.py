@@ -124,6 +124,7 @@ async def watch(machine, shaft, ppm, store: Path) -> tuple[Service, list[Diagnos
     return service, heard
 
 
+@pytest.mark.long
 async def test_probes_on_two_buses_give_the_diagnosis_of_one(shaft, tmp_path: Path) -> None:
     one, heard_one = await watch(
         machine_file("rotor-synchronous.toml"), shaft, {"shaft": 50.0}, tmp_path / "one"

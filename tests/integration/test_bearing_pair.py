@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from machine_files import MACHINES, changed
 
 from daqsvc.bearing.parameter_sets import S3
@@ -28,6 +29,7 @@ WRONG = "orders = { bpfi = 9.45, bpfo = 4.55, bsf = 3.05, ftf = 0.325 }"
 """Of another bearing: no line is where it says."""
 
 
+@pytest.mark.long
 def test_a_calibrated_pair_names_the_race_that_no_line_shows(verb: Run, tmp_path: Path) -> None:
     text = changed(
         EXAMPLE,

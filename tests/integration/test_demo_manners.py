@@ -302,6 +302,7 @@ def left_behind(tmp_path: Path) -> list[Path]:
 # The view.
 
 
+@pytest.mark.long
 async def test_a_low_terminal_shows_loss_lag_and_the_newest_alarm() -> None:
     console = Console(width=60, height=24, file=io.StringIO())
     script = script_of(arguments_of())

@@ -122,6 +122,7 @@ async def test_the_papers_faults_reach_an_independent_client_in_order(kind: str,
     assert (states[0], states[-1]) == ("online", "offline")
 
 
+@pytest.mark.long
 async def test_playing_fast_loses_nothing_and_sees_the_same() -> None:
     slow, fast = [(await play(paper(seed=5), speed))[1] for speed in (20, 1000)]
     for outcome in (slow, fast):
@@ -138,6 +139,7 @@ async def test_playing_fast_loses_nothing_and_sees_the_same() -> None:
     assert at[0] == at[1]
 
 
+@pytest.mark.long
 @pytest.mark.data
 async def test_a_race_fault_arrives_sample_for_sample_and_raises_the_alarm_of_record_97(data: Path) -> None:
     """CWRU records 97 (healthy) and 105 (inner race), https://engineering.case.edu/bearingdatacenter."""
@@ -221,6 +223,7 @@ def test_the_demo_prints_one_json_object_a_line() -> None:
     assert figures["streams"]["shaft"]["samples_lost"] == 0
 
 
+@pytest.mark.long
 def test_the_demo_in_a_pipe_tells_alarms_and_a_summary() -> None:
     done = demo("--speed", "200", "--seed", "2")
     assert done.returncode == 0

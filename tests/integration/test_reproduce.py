@@ -43,6 +43,7 @@ def rows(out: Path) -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in table}
 
 
+@pytest.mark.long
 def test_figures_and_tables_are_written(out: Path, rows: dict[str, dict[str, Any]]) -> None:
     assert sorted(file.name for file in out.iterdir()) == [*FIGURES, "results.csv", "results.md"]
     for name in FIGURES:
@@ -57,6 +58,7 @@ def test_figures_and_tables_are_written(out: Path, rows: dict[str, dict[str, Any
     assert numbers == {(name, key): v for name, row in rows.items() for key, v in row["values"].items()}
 
 
+@pytest.mark.long
 def test_linear_modes_turn_on_the_orbits_of_theory(rows: dict[str, dict[str, Any]]) -> None:
     for mode, zeta in (("N", 0.18), ("F1", 0.10), ("F1L2", 0.06)):
         values = rows[f"motion-{mode}"]["values"]
@@ -68,6 +70,7 @@ def test_linear_modes_turn_on_the_orbits_of_theory(rows: dict[str, dict[str, Any
         assert values["poincare_spread"] < 5e-3
 
 
+@pytest.mark.long
 def test_rub_begins_when_the_linear_transient_reaches_the_housing(rows: dict[str, dict[str, Any]]) -> None:
     # Exact: the deviation from F1L3's own orbit starts as the difference of two orbits and decays freely.
     onset = 3 * 170.0
@@ -87,6 +90,7 @@ def test_rub_begins_when_the_linear_transient_reaches_the_housing(rows: dict[str
     assert values["damping_limit"] == pytest.approx(0.1 / 2 / 0.9)
 
 
+@pytest.mark.long
 def test_rub_is_quasi_periodic_backward_whirl(rows: dict[str, dict[str, Any]]) -> None:
     values = {**rows["quasi-periodic"]["values"], **rows["poincare-rub"]["values"]}
     whirl = rows["whirl-rub"]["values"]
@@ -121,16 +125,19 @@ def test_rub_is_quasi_periodic_backward_whirl(rows: dict[str, dict[str, Any]]) -
     assert values["loop_rev"] == pytest.approx(1.0 / (-whirl["whirl_per_rev"] - 1.0), rel=0.02)
 
 
+@pytest.mark.long
 def test_printed_sign_throws_the_rotor_out(rows: dict[str, dict[str, Any]]) -> None:
     assert rows["printed-sign"]["agrees"] is False
     assert 0.0 < rows["printed-sign"]["values"]["escape_rev"] < 0.8
 
 
+@pytest.mark.long
 def test_26_revolutions_are_not_170_s(rows: dict[str, dict[str, Any]]) -> None:
     assert rows["schedule"]["agrees"] is False
     assert rows["schedule"]["values"]["revolutions_per_mode"] == pytest.approx(27.06, abs=5e-3)
 
 
+@pytest.mark.long
 def test_observers_track_the_process(rows: dict[str, dict[str, Any]]) -> None:
     noise = math.sqrt(2.0) * (0.1 / 0.36) / math.sqrt(2.0)  # both axes, 0 dB against the AC power in N
     linear, rub = rows["observer-N"]["values"], rows["observer-F1L3"]["values"]
@@ -145,6 +152,7 @@ def test_observers_track_the_process(rows: dict[str, dict[str, Any]]) -> None:
     assert converged["error_after"] < 0.6 * converged["error_before"]
 
 
+@pytest.mark.long
 def test_probabilities_are_saw_teeth(rows: dict[str, dict[str, Any]]) -> None:
     assert rows["saw-tooth"]["values"]["declarations_per_rev"] == pytest.approx(1.9, rel=0.2)
     shares = rows["declared-rightly"]["values"]
@@ -152,6 +160,7 @@ def test_probabilities_are_saw_teeth(rows: dict[str, dict[str, Any]]) -> None:
     assert all(0.7 < share <= 1.0 for share in shares.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rule", KNOWN_DELAYS_REV)
 def test_every_mode_is_found_in_order_and_in_time(rule: str, rows: dict[str, dict[str, Any]]) -> None:
     order, medians = rows[f"order-{rule}"]["values"], rows[f"delays-{rule}"]["values"]
@@ -162,6 +171,7 @@ def test_every_mode_is_found_in_order_and_in_time(rule: str, rows: dict[str, dic
     assert rows["delays-paper"]["agrees"]
 
 
+@pytest.mark.long
 def test_paper_rule_is_often_wrong_and_the_service_is_not(rows: dict[str, dict[str, Any]]) -> None:
     paper, cusum = rows["wrong-paper"]["values"], rows["wrong-cusum"]["values"]
     assert all(100.0 < rate < 500.0 for rate in paper.values())

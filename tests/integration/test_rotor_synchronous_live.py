@@ -61,6 +61,7 @@ def machine_file(url):
     return parse_machine_file(text, EXAMPLE)
 
 
+@pytest.mark.long
 async def test_a_change_is_one_alarm_refined_from_departure_to_name(rebalanced) -> None:
     heard: list[Received] = []
     script = Script(

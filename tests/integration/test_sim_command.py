@@ -104,6 +104,7 @@ async def test_run_counts_to_the_sample_what_sim_has_sent_and_spoilt(
     assert counted["frames_rejected"] == counted["frames_late"] == 0
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_a_bus_that_is_killed_comes_back_and_the_books_still_close(
     tmp_path: Path, mosquitto: Mosquitto
@@ -155,6 +156,7 @@ def test_sim_alone_plays_for_any_client_of_the_bus(tmp_path: Path) -> None:
     assert 0 < summary["streams"]["shaft"]["frames_sent"] < 3438
 
 
+@pytest.mark.long
 def test_the_same_seed_puts_the_same_bytes_on_the_bus(tmp_path: Path) -> None:
     seen = []
     for seed in (3, 3, 4):

@@ -52,6 +52,7 @@ def serial_file(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.long
 async def test_a_serial_device_behind_a_pseudo_terminal(
     tmp_path: Path, bad_link: Path, serial_file: Path
 ) -> None:
@@ -125,6 +126,7 @@ def modbus_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.long
 async def test_a_modbus_unit_hands_out_every_sample_however_bad_its_replies(
     tmp_path: Path, modbus_file: Path
 ) -> None:

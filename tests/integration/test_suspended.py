@@ -140,6 +140,7 @@ async def test_whoever_was_suspended_has_not_heard_a_silence() -> None:
     await task
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lossy", [False, True], ids=["the socket keeps it", "the buffers overflow"])
 async def test_a_suspended_process_raises_clears_and_reorders_nothing(lossy: bool, tmp_path: Path) -> None:  # noqa: FBT001
     file, store = tmp_path / "motor.toml", tmp_path / "store"

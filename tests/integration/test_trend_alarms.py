@@ -9,6 +9,7 @@ import struct
 import sys
 
 import numpy as np
+import pytest
 from brokers import PATIENCE_S, eventually
 from live_service import running
 from machine_files import MACHINES, changed
@@ -151,6 +152,7 @@ async def test_a_temperature_leaves_its_window_both_ways_and_a_broken_sensor_say
         assert "is 1 degC, lower alert limit 2 degC" in alarm("de-temperature").message
 
 
+@pytest.mark.long
 async def test_the_simulator_plays_a_trend_that_raises_an_alarm_and_returns_it(tmp_path):
     machine, link = pump(tmp_path)
     names = [sensor.name for sensor in machine.sensors]

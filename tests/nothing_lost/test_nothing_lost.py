@@ -27,6 +27,7 @@ def _mosquitto():
         pytest.skip(reason)
 
 
+@pytest.mark.long
 async def test_nothing_is_lost(tmp_path):
     reports = await run_all(courses(24), tmp_path, AT_A_TIME)
     assert not [str(report) for report in reports if report.verdict.violations]
@@ -38,6 +39,7 @@ async def test_nothing_is_lost(tmp_path):
     assert {"disk full", "broker restart", "broker kill", "half open", "one byte slices"} <= befell
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mutation", ["none", "bypass", "forget-early"])
 async def test_only_without_a_working_outbox_something_is_lost(tmp_path, mutation):
     befalls = ("half_open_for_good", "kill") * 3
@@ -49,6 +51,7 @@ async def test_only_without_a_working_outbox_something_is_lost(tmp_path, mutatio
         assert bool(lost) == (mutation != "none"), report
 
 
+@pytest.mark.long
 async def test_wall_clock_steps_and_a_suspension_move_nothing(tmp_path):
     course = Course(5, befalls=("suspend_for_long",))
     offsets_s = {step.wall_offset_s for step in Script.of_seed(course.seed).steps}

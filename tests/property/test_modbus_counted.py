@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
@@ -204,6 +205,7 @@ DAMAGED = st.tuples(st.sampled_from([0.002, 0.01]), st.sampled_from([0.0, 0.005]
 BEGINNINGS = st.one_of(st.integers(0, 1500), st.integers(0, 2**16 - 1), st.integers(2**16 - 3000, 2**16 - 1))
 
 
+@pytest.mark.long
 @settings(max_examples=15, deadline=None)
 @given(
     st.integers(0, 2**32),

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 import rotor_runs as runs
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -202,6 +203,7 @@ def measured(seed, revolutions, truth):
     return z, turn
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),

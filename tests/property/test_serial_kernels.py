@@ -94,6 +94,7 @@ def test_rows_are_gathered_from_wherever_they_begin() -> None:
     assert gather(buffer, np.array([16, 0, 3]), 4).tolist() == [[16, 17, 18, 19], [0, 1, 2, 3], [3, 4, 5, 6]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", ["little", "big"])
 @pytest.mark.parametrize(
     ("bits", "kind"),

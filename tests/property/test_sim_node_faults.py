@@ -228,6 +228,7 @@ def received(plan, samples: np.ndarray, reorder_window_ns: int = 100_000_000):
     return assembler.counters, blocks
 
 
+@pytest.mark.long
 @given(node_faults)
 @settings(max_examples=40)
 def test_a_receiver_s_books_agree_to_the_sample(faults: NodeFaults) -> None:

@@ -22,6 +22,7 @@ def arrivals(frames: np.ndarray, rng: np.random.Generator, jitter_ms: float, ppm
     return np.maximum.accumulate(late).astype(np.int64)  # a bus does not overtake
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(
     seed=st.integers(0, 2**31),

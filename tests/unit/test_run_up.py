@@ -44,6 +44,7 @@ def test_a_fast_run_up_is_not_taken_for_a_chain_of_steady_speeds() -> None:
     assert fit.damping_ratio == pytest.approx(0.04, rel=0.02)
 
 
+@pytest.mark.long
 def test_uncertainties_cover_the_errors() -> None:
     """95 % intervals of 4 figures over 24 noise runs: at least 84 of 96 (binomial, 99.9 %)."""
     inside = 0
