@@ -47,7 +47,7 @@ PUBACK_S = 10.0
 INCOMING: Final = 64
 """Messages from the broker that may wait to be looked at; a flood of them is dropped and counted."""
 
-FLOOD_PER_S: Final = 2000
+FLOOD_PER_S: Final = 10_000
 """Packets a second that nobody waits for; a broker that sends more waits in its socket, not in our memory."""
 
 OWED: Final = 1000

@@ -19,7 +19,7 @@ LARGEST_PACKET: Final = 1 << 20
 CUT_TO: Final = 1 << 18
 """What is left of a larger message of MQTT 3.1.1: too much to be a command, so it is refused as too long."""
 
-_DISCARD_BYTES = 1 << 16
+_READ_BYTES = 1 << 16
 _CONNACK, _PUBLISH, _DISCONNECT = 2, 3, 14
 _ANSWERS = {4: "PUBACK", 9: "SUBACK", 11: "UNSUBACK", 13: "PINGRESP"}
 _LENGTH_BYTES = 4
@@ -47,6 +47,7 @@ class Wire:
         self._inner = inner
         self._mqtt5 = mqtt5
         self._consented = False
+        self._read, self._at = b"", 0
         self._head = bytearray()
         self._ready = bytearray()
         self._passing = 0
@@ -66,13 +67,22 @@ class Wire:
             data = bytes(self._ready[:size])
             del self._ready[:size]
             return data
-        data = self._inner.recv(min(size, self._passing))
+        data = self._take(min(size, self._passing))
         self._passing -= len(data)
         return data
 
     def pending(self) -> int:
-        """Bytes that have arrived although the system shows none: those that TLS has decoded."""
-        return self._inner.pending() if isinstance(self._inner, ssl.SSLSocket) else 0
+        """Bytes that have arrived although the system shows none any more."""
+        decoded = self._inner.pending() if isinstance(self._inner, ssl.SSLSocket) else 0
+        return decoded + len(self._ready) + len(self._read) - self._at
+
+    def _take(self, most: int) -> bytes:
+        """What has arrived, at most so much; read in large pieces, for the library asks for single bytes."""
+        if self._at == len(self._read):
+            self._read, self._at = self._inner.recv(_READ_BYTES), 0
+        data = self._read[self._at : self._at + most]
+        self._at += len(data)
+        return data
 
     def send(self, data: bytes) -> int:
         """Send what fits now; how many bytes that were."""
@@ -112,14 +122,14 @@ class Wire:
     def _next_packet(self) -> bool:
         """Drop what is left of a packet that was cut, and read the next one's header; False at the end."""
         while self._discarding:
-            dropped = len(self._inner.recv(min(self._discarding, _DISCARD_BYTES)))
+            dropped = len(self._take(self._discarding))
             if not dropped:
                 return False
             self._discarding -= dropped
         while len(self._head) < 2 or self._head[-1] & 0x80:
             if len(self._head) > _LENGTH_BYTES:
                 raise self._violated("a packet whose length has more than four bytes")
-            byte = self._inner.recv(1)
+            byte = self._take(1)
             if not byte:
                 return False
             self._head += byte

@@ -11,7 +11,12 @@ from brokers import Consumer, eventually, running_mosquitto
 from mqtt_publishing import CLOCK, publishing
 from picky_broker import PickyBroker
 
+from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.manager import DiagnosisRule
+from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
+from daqsvc.publish.settings import MqttSettings
 
 BASE = "daqsvc/lab/edge-1"
 GOOD, BAD = f"{BASE}/rig/alarms/rotor-fault", f"{BASE}/rig/alarms/sensor-ok/probe-x"
@@ -204,3 +209,58 @@ async def test_a_disk_that_takes_no_refused_messages_keeps_them_in_the_journal(
             await eventually(lambda: outbox.counters.depth == 0, "and the journal is done with them")
             broker.refuse.clear()
             await eventually(lambda: broker.sequences(BAD) == bad, "tried again, they arrive in their order")
+
+
+@pytest.mark.mosquitto
+async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_path, monkeypatch):
+    """Also where its own topic is among the refused."""
+    monkeypatch.setattr("daqsvc.publish.delivery.TRY_AGAIN_S", 0.1)
+    store = tmp_path / "store"
+    alarm = f"{BASE}/rig/alarms/broker/refused"
+    rules = [DiagnosisRule(name, name) for name in ("rotor-fault", "sensor")]
+
+    def said(detector):
+        return Diagnosis("rig", detector, CLOCK.monotonic_ns(), "shaft", 0, 1, "bad", severity="alert")
+
+    async def desk_at(port):
+        desk = AlarmDesk(
+            Identity("lab", "edge-1", "rig"), rules, store, CLOCK, MqttSettings("127.0.0.1", port, "c")
+        )
+        await desk.open()
+        await desk.resume({})
+        return desk, asyncio.create_task(desk.run())
+
+    async def closed(desk, running):
+        await desk.settle(2.0)
+        await desk.stop(2.0)
+        await running
+        await desk.close(2.0)
+
+    async def ticking(desk, condition, what):
+        def ticks():
+            desk.tick()
+            return condition()
+
+        await eventually(ticks, what)
+
+    sensor = f"{BASE}/rig/alarms/sensor"
+    with running_mosquitto(tmp_path, acl=f"{ACL}topic write {alarm}\n") as strict:
+        async with Consumer(strict.port, alarm) as live:
+            desk, running = await desk_at(strict.port)
+            try:
+                desk.take(said("sensor"))
+                await ticking(desk, lambda: live.messages, "the alarm has arrived")
+                told = live.messages[-1].payload
+                assert (told["kind"], told["level"]) == ("raised", "alert")
+                assert f"{sensor} (the broker refuses messages: Not authorized)" in told["message"]
+            finally:
+                await closed(desk, running)
+    with running_mosquitto(tmp_path, acl=f"{ACL}topic write {BASE}/#\n") as kinder:
+        async with Consumer(kinder.port, f"{BASE}/rig/alarms/#") as live:
+            desk, running = await desk_at(kinder.port)
+            try:
+                await eventually(lambda: live.on(sensor), "what was refused has arrived")
+                await ticking(desk, lambda: live.messages[-1].payload["kind"] == "returned", "it is over")
+                assert live.messages[-1].topic == alarm
+            finally:
+                await closed(desk, running)

@@ -8,7 +8,9 @@ import json
 import logging
 import os
 import random
+import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import paho.mqtt.client as paho
 import pytest
@@ -16,9 +18,12 @@ from brokers import Consumer, eventually
 from mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
 from mqtt_publishing import publishing
 from rogue_broker import CONSENT, RogueBroker
+from sparkplug_edge import Machine, edge_node
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
+from daqsvc.publish.connection import OWED, Connection
 from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings
+from daqsvc.publish.wire import Wire
 
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
 QUIET = "daqsvc/lab/edge-1/rig/alarms/shaft-vibration-x"
@@ -238,3 +243,102 @@ async def test_a_retained_discovery_message_may_say_anything(mosquitto, outbox, 
             )
             assert box.figures()["faults"] == 0
             assert box.counters.connections == 1
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_rogue_broker_of_sparkplug_costs_connections_and_nothing_else(
+    outbox, caplog, monkeypatch, tmp_path, protocol
+):
+    monkeypatch.setattr("daqsvc.publish.sparkplug.session.HOST_S", 0.05)
+    with nothing_but_counters_move(caplog):
+        async with (
+            RogueBroker(7, 500) as broker,
+            edge_node(outbox, tmp_path, broker.port, protocol=protocol) as edge,
+        ):
+            edge._backoff.next_ns = lambda: 1_000_000
+            while broker.left:
+                await Machine(outbox).flips(1)
+                await asyncio.sleep(0.01)
+            await eventually(lambda: edge.counters.connected, "connected to what is an honest broker now")
+            births = edge.counters.births
+            await eventually(lambda: edge.counters.births > births or edge.counters.alarms, "it tells")
+            assert edge._faults.count == 0
+
+
+@pytest.mark.mosquitto
+async def test_with_mqtt_3_1_1_a_message_of_any_size_is_one_that_is_too_long(mosquitto, outbox, caplog):
+    """No broker of 3.1.1 knows how much is too much: not even retained may it end every connection."""
+    sender = paho.Client(paho.CallbackAPIVersion.VERSION2, "rogue")
+    await asyncio.to_thread(sender.connect, "127.0.0.1", mosquitto.port)
+    sender.loop_start()
+    with nothing_but_counters_move(caplog):
+        async with listening(outbox, mosquitto.port, "3.1.1", Desk()) as box:
+            await eventually(lambda: box.counters.connected, "connected")
+            for qos in (0, 1, 1):
+                sender.publish(f"{COMMANDS}/acknowledge", b"x" * 3_000_000, qos)
+            await eventually(lambda: box.figures()["commands"]["malformed"] == 3, "they are refused")
+            sender.publish(f"{COMMANDS}/acknowledge", b"{}", 1)
+            await eventually(lambda: box.figures()["commands"]["malformed"] == 4, "and the next one is read")
+            assert box.counters.connections == 1
+    sender.disconnect()
+    await asyncio.to_thread(sender.loop_stop)
+
+
+class Flooding(RogueBroker):
+    """Sends messages as fast as they are taken."""
+
+    async def _answer(self, reader, writer, *, mqtt5):
+        # What waits between the two is what the box has to read before it hears of anything else.
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 16)
+        answering = asyncio.create_task(super()._answer(reader, writer, mqtt5=mqtt5))
+        flood = message("notice", mqtt5=True, said=b"x" * 100, flags=0) * 100
+        with contextlib.suppress(OSError):
+            while not answering.done():
+                writer.write(flood)
+                await writer.drain()
+                await asyncio.sleep(0)
+        answering.cancel()
+        await asyncio.gather(answering, return_exceptions=True)
+
+
+async def test_a_flood_of_messages_waits_in_the_brokers_socket(outbox, caplog, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.connection.FLOOD_PER_S", 2000)
+    with nothing_but_counters_move(caplog):
+        async with Flooding(1, 0) as broker, listening(outbox, broker.port, "5", Desk()) as box:
+            await eventually(lambda: box.counters.ignored + box.counters.overlooked > 1000, "it floods")
+            taken = box.counters.ignored + box.counters.overlooked
+            await asyncio.sleep(1.0)
+            assert box.counters.ignored + box.counters.overlooked - taken < 6000
+            monkeypatch.undo()
+            await outbox.append(ALARM, lambda _: b"{}", retain=True)
+            await eventually(lambda: outbox.counters.depth == 0, "alarms pass all the same")
+            assert box.counters.connections == 1
+
+
+async def test_nothing_is_read_while_too_many_acknowledgements_wait():
+    """A broker that sends messages of QoS 1, and takes nothing."""
+    near, far = socket.socketpair()
+    made = Connection("127.0.0.1", 1, in_flight=1, mqtt5=True, identifier="c")
+    wire = Wire(near, mqtt5=True)
+    near.setblocking(False)
+    waits = True
+    made._client = SimpleNamespace(want_write=lambda: waits, socket=lambda: wire, loop_write=lambda: None)
+    made._attach(wire)
+    try:
+        wire.packets = OWED
+        made._hold_back(wire)
+        assert made._reads
+        wire.packets += 1
+        made._hold_back(wire)
+        assert not made._reads
+        made._writable()
+        assert not made._reads, "some are written, but not all"
+        waits = False
+        made._writable()
+        assert made._reads
+        wire.packets += OWED
+        made._hold_back(wire)
+        assert made._reads, "a broker that takes what it is sent may send as much as it likes"
+    finally:
+        made.abandon()
+        far.close()

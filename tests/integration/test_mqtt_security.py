@@ -359,7 +359,7 @@ async def test_what_is_no_password_is_said_and_awaited(tmp_path, outbox, caplog)
             await eventually(lambda: publisher.counters.connected, "the file is in order")
 
 
-@pytest.mark.parametrize("host", ["a..b", "x" * 64, "", "\ud800"])
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, ""])
 async def test_a_host_that_cannot_be_one_is_an_outage_like_any_other(outbox, caplog, host):
     async with publishing(outbox, MqttSettings(host, 1883, "c")) as publisher:
         await eventually(lambda: "is away" in caplog.text, "it is said")

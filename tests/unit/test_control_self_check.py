@@ -9,6 +9,7 @@ import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import Level
+from daqsvc.publish.settings import MqttSettings
 from daqsvc.self_check import MIB, NS_PER_DAY, BusHealth, SelfCheck, Vitals, conditions
 from drivers.base import BusCounters
 from drivers.can_errors import CanCounters
@@ -134,6 +135,23 @@ def test_what_happens_now_and_then_is_one_alarm(count: str, condition: str) -> N
         for t_s, happened in ((0, 0), (1, 3), (30, 3), (60, 4), (119, 4), (121, 4))
     ]
     assert levels == [Level.NORMAL, *[Level.ALERT] * 4, Level.NORMAL]
+
+
+def test_what_the_broker_refuses_is_named_once_without_a_count() -> None:
+    check = self_check()
+    assert "broker/refused" not in look(check), "there is no broker"
+    assert look(check, refused={})["broker/refused"][0] is Level.NORMAL
+    level, one = look(check, refused={"a/b": "not allowed"})["broker/refused"]
+    assert level is Level.ALERT
+    assert "will not take messages on a/b (not allowed): they wait on disk" in one
+    many = {f"a/{n}": "no" for n in range(3, 9)}
+    _, several = look(check, refused=many)["broker/refused"]
+    assert several == look(check, refused=many | {"a/9": "no"})["broker/refused"][1]
+    assert "a/3 (no); a/4 (no); a/5 (no), and others" in several
+    gone = look(check, conditions_told=frozenset({"broker/refused"}))
+    assert gone["broker/refused"][0] is Level.NORMAL
+    assert "broker/refused" in conditions(MqttSettings("h", 1, "c"))
+    assert "broker/refused" not in conditions(None)
 
 
 def test_the_disk_is_asked_for_what_the_service_may_use(tmp_path: Path) -> None:

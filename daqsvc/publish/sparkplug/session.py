@@ -34,6 +34,9 @@ READ_AHEAD = 100
 TELL_S = 1.0
 """How often changed figures are told."""
 
+HEARD = 16
+"""Messages from the broker that may wait here; more wait, and are dropped, in the connection."""
+
 HOST_S = 5.0
 """How long a broker's word about the primary host is waited for where there are other brokers."""
 
@@ -130,7 +133,7 @@ class EdgeSession:
             MqttError: the connection is lost.
         """
         self._there = there
-        heard: asyncio.Queue[Incoming] = asyncio.Queue()
+        heard: asyncio.Queue[Incoming] = asyncio.Queue(HEARD)
         wanted = [self._node.commands, self._node.device_commands]
         await self._connection.watch(*wanted, *([self._host.topic] if self._host else []))
         listening = asyncio.create_task(self._listen(heard), name="sparkplug-listen")
@@ -175,7 +178,7 @@ class EdgeSession:
 
     async def _listen(self, heard: asyncio.Queue[Incoming]) -> None:
         async for message in self._connection.incoming():
-            heard.put_nowait(message)
+            await heard.put(message)
 
     async def _await_host(
         self,
