@@ -165,9 +165,9 @@ class AlarmDesk:
         if self.outbox.counters.shut:
             latest = await self.outbox.glimpse()
             self._knows_journal, self._is_in_step = latest is not None, False
-            self._take_over(recall(latest or (), self.topics))
+            self._take_over(await asyncio.to_thread(recall, latest or (), self.topics))
             return
-        told = recall(await self.outbox.latest(), self.topics)
+        told = await asyncio.to_thread(recall, await self.outbox.latest(), self.topics)
         self._take_over(told)
         self._damage_seen = self._damage()
         if self._damage_seen:
@@ -213,7 +213,7 @@ class AlarmDesk:
         damage = self._damage()
         before = dict(self._newest)
         try:
-            told = recall(await self.outbox.latest(), self.topics)
+            told = await asyncio.to_thread(recall, await self.outbox.latest(), self.topics)
         finally:
             self._catching_up = False
         if not self._knows_journal:

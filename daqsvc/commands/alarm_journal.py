@@ -6,7 +6,7 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from daqsvc.outbox.reading import read_journal
+from daqsvc.outbox.reading import read_journal, read_pasts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -60,14 +60,21 @@ def standing(store: Path, events: Sequence[Told]) -> list[Standing]:
     Raises:
         OutboxError: the journal cannot be read.
     """
-    latest = read_journal(store, history=0).latest
-    topics = {json.loads(entry.payload).get("id"): entry.topic for entry in latest}
+    topics = {entry.topic: json.loads(entry.payload) for entry in read_journal(store, history=0).latest}
+    topic_of = {told.get("id"): topic for topic, told in topics.items()}
+    standing_now = {
+        topic: told["occurrence"]
+        for told in events
+        if told["occurrence"] and (topic := topic_of.get(told["id"])) is not None
+    }
+
+    def is_over(entry: JournalEntry) -> bool:
+        return bool(json.loads(entry.payload).get("occurrence") != standing_now[entry.topic])
+
+    pasts = read_pasts(store, standing_now, is_over, MOST_EVENTS) if standing_now else {}
     found = []
     for told in events:
-        past: list[Told] = []
-        if told["occurrence"] and (topic := topics.get(told["id"])):
-            view = read_journal(store, history=MOST_EVENTS, topic=topic)
-            past = [one for one in _told(view.history) if one["occurrence"] == told["occurrence"]]
+        past = list(_told(pasts.get(topic_of.get(told["id"], ""), ())))
         findings = [one["message"] for one in past if one["kind"] in _FINDINGS]
         message = told["message"]
         if findings and findings[-1] != message:

@@ -30,12 +30,13 @@ def current(alarms: Sequence[Standing], now_ns: int) -> str:
         now_ns: wall clock, ns since the Unix epoch.
     """
     events = [alarm.told for alarm in alarms]
+    machines = _machine_title(events)
     worst_first = sorted(alarms, key=lambda alarm: (-_LEVELS.index(alarm.told["level"]), -alarm.since_ns))
     rows = [
         [
             told["level"],
             _state(told),
-            *_machine(told, events),
+            *_machine(told, machines),
             told["alarm"],
             (told["occurrence"] or "-")[:ID_LENGTH],
             f"{_local(since_ns)} ({ago(now_ns - since_ns)})",
@@ -43,25 +44,26 @@ def current(alarms: Sequence[Standing], now_ns: int) -> str:
         ]
         for told, since_ns, message in worst_first
     ]
-    return _aligned(["LEVEL", "STATE", *_machine_title(events), "ALARM", "ID", "SINCE", "MESSAGE"], rows)
+    return _aligned(["LEVEL", "STATE", *machines, "ALARM", "ID", "SINCE", "MESSAGE"], rows)
 
 
 def history(events: Sequence[Told]) -> str:
     """What has happened: one line an event, newest last."""
+    machines = _machine_title(events)
     rows = [
         [
             _local(told["wall_ns"]),
             told["kind"],
             told["level"],
             _state(told),
-            *_machine(told, events),
+            *_machine(told, machines),
             told["alarm"],
             (told["occurrence"] or "-")[:ID_LENGTH],
             told["message"],
         ]
         for told in events
     ]
-    titles = ["TIME", "EVENT", "LEVEL", "STATE", *_machine_title(events), "ALARM", "ID", "MESSAGE"]
+    titles = ["TIME", "EVENT", "LEVEL", "STATE", *machines, "ALARM", "ID", "MESSAGE"]
     return _aligned(titles, rows)
 
 
@@ -92,8 +94,8 @@ def _state(told: Told) -> str:
     return words
 
 
-def _machine(told: Told, events: Sequence[Told]) -> list[str]:
-    return [told["machine"]] if _machine_title(events) else []
+def _machine(told: Told, machines: Sequence[str]) -> list[str]:
+    return [told["machine"]] if machines else []
 
 
 def _machine_title(events: Iterable[Told]) -> list[str]:

@@ -15,7 +15,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
 from daqsvc.outbox.files import FileError, pragma
@@ -24,7 +24,9 @@ from daqsvc.outbox.safety import refuse_link
 from daqsvc.outbox.tables import SCHEMA_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
+
+_T = TypeVar("_T")
 
 JOURNAL_NAME = "outbox.sqlite"
 """What the service calls the journal in its store."""
@@ -72,20 +74,71 @@ class JournalView:
     damaged: int
 
 
-def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -> JournalView:
+def read_journal(store: Path, *, history: int = 100) -> JournalView:
     """Read the journal of a service; blocks.
 
     Args:
         store: the service's directory.
         history: how many messages of the past at most.
-        topic: only messages on this topic count; None for all.
 
     Raises:
         OutboxError: there is none, or it cannot be read; the text says what to do.
     """
-    path = store / JOURNAL_NAME
+    return _read(store / JOURNAL_NAME, lambda connection: _view(connection, history))
+
+
+def read_pasts(
+    store: Path, topics: Collection[str], is_over: Callable[[JournalEntry], bool], most: int
+) -> dict[str, list[JournalEntry]]:
+    """Read what led to the latest message of each of many topics, in one walk back; blocks.
+
+    Args:
+        store: the service's directory.
+        topics: which ones.
+        is_over: whether a message is of the time before the one that is asked for; with it, its topic ends.
+        most: how many messages of each topic at most.
+
+    Returns:
+        By topic its messages, the newest last. Those that have changed on the disk are left out.
+
+    Raises:
+        OutboxError: as of `read_journal`.
+    """
+    return _read(store / JOURNAL_NAME, lambda connection: _pasts(connection, topics, is_over, most))
+
+
+def _pasts(
+    connection: sqlite3.Connection,
+    topics: Collection[str],
+    is_over: Callable[[JournalEntry], bool],
+    most: int,
+) -> dict[str, list[JournalEntry]]:
+    pasts: dict[str, list[JournalEntry]] = {topic: [] for topic in topics}
+    asked = set(topics)
+    rows = connection.execute(f"SELECT {_COLUMNS} FROM messages ORDER BY sequence DESC")  # noqa: S608  constants only
+    for row in rows:
+        if not asked:
+            break
+        if row[1] not in asked:
+            continue
+        for entry in _sound([row]):
+            if is_over(entry):
+                asked.discard(entry.topic)
+                break
+            pasts[entry.topic].append(entry)
+            if len(pasts[entry.topic]) >= most:
+                asked.discard(entry.topic)
+    return {topic: past[::-1] for topic, past in pasts.items()}
+
+
+def _read(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
+    """What a query finds in the journal, all of it at one moment.
+
+    Raises:
+        OutboxError: there is no journal, or it cannot be read; the text says what to do.
+    """
     try:
-        return _read(path, history, topic)
+        return _tried(path, query)
     except FileNotFoundError:
         raise OutboxError(
             f"there is no journal {path}: the service has not run with this store yet, or keeps it "
@@ -101,24 +154,25 @@ def read_journal(store: Path, *, history: int = 100, topic: str | None = None) -
         ) from error
 
 
-def _read(path: Path, history: int, topic: str | None) -> JournalView:
+def _tried(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
     """Read; again, if the service comes or goes meanwhile and takes the write-ahead log with it."""
     for _ in range(ATTEMPTS - 1):
         try:
-            return _read_once(path, history, topic)
+            return _read_once(path, query)
         except (sqlite3.Error, UnicodeDecodeError, FileNotFoundError):
             path.stat()
             time.sleep(RETRY_S)
-    return _read_once(path, history, topic)
+    return _read_once(path, query)
 
 
-def _read_once(path: Path, history: int, topic: str | None) -> JournalView:
+def _read_once(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
     with opened_to_read(path) as connection:
         connection.execute("BEGIN")  # all that follows tells of one moment
-        return _view(path, connection, history, topic)
+        _check_version(path, connection)
+        return query(connection)
 
 
-def _view(path: Path, connection: sqlite3.Connection, history: int, topic: str | None) -> JournalView:
+def _check_version(path: Path, connection: sqlite3.Connection) -> None:
     version = pragma(connection, "user_version")
     if version != SCHEMA_VERSION:
         raise OutboxError(
@@ -129,15 +183,16 @@ def _view(path: Path, connection: sqlite3.Connection, history: int, topic: str |
                 else "start the service once"
             )
         )
-    wanted, parameters = ("", []) if topic is None else ("WHERE topic = ?", [topic])
+
+
+def _view(connection: sqlite3.Connection, history: int) -> JournalView:
     newest = connection.execute(
-        f"SELECT {_COLUMNS} FROM messages {wanted} ORDER BY sequence DESC LIMIT ?",  # noqa: S608  constants only
-        [*parameters, history],
+        f"SELECT {_COLUMNS} FROM messages ORDER BY sequence DESC LIMIT ?",  # noqa: S608  constants only
+        [history],
     ).fetchall()
     latest = connection.execute(
         f"SELECT {_COLUMNS} FROM messages WHERE sequence IN "  # noqa: S608  constants only
-        f"(SELECT sequence FROM latest {wanted}) ORDER BY sequence",
-        parameters,
+        "(SELECT sequence FROM latest) ORDER BY sequence"
     ).fetchall()
     unsent = connection.execute("SELECT count(*) FROM messages WHERE NOT sent").fetchone()[0]
     sound_latest, sound_history = _sound(latest), _sound(reversed(newest))

@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.outbox import reading
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.outbox.reading import JOURNAL_NAME, read_journal
+from daqsvc.outbox.reading import JOURNAL_NAME, read_journal, read_pasts
 from daqsvc.outbox.store import Outbox
 
 READER = """
@@ -92,15 +93,35 @@ async def test_it_is_read_while_the_service_runs(outbox, tmp_path):
     assert await outbox.append("a", lambda n: b"", retain=True) == other + 1
 
 
-async def test_only_one_topic_and_only_so_many(outbox, tmp_path):
-    first, second, other = await filled(outbox)
-    view = read_journal(tmp_path / "store", topic="a")
-    assert [entry.sequence for entry in view.history] == [first, second]
-    assert [entry.sequence for entry in view.latest] == [second]
-    assert [entry.sequence for entry in read_journal(tmp_path / "store", history=2).history] == [
-        second,
-        other,
-    ]
+async def test_only_so_many(outbox, tmp_path):
+    _, *newest = await filled(outbox)
+    assert [e.sequence for e in read_journal(tmp_path / "store", history=2).history] == newest
+
+
+async def test_the_pasts_of_many_topics_come_from_one_walk_back(outbox, tmp_path, monkeypatch):
+    topics = [f"alarm-{number}" for number in range(40)]
+    for turn in range(5):
+        for topic in topics:
+            await outbox.append(topic, lambda _, turn=turn: b"%d" % turn, retain=True)
+    opened = []
+    really = reading.opened_to_read
+    monkeypatch.setattr(reading, "opened_to_read", lambda path: opened.append(path) or really(path))
+    looked = []
+
+    def is_over(entry):
+        looked.append(entry.sequence)
+        return entry.payload == (b"1" if entry.topic == "alarm-7" else b"0")
+
+    asked = [*topics[:20], "of-nobody"]
+    pasts = read_pasts(tmp_path / "store", asked, is_over, most=4)
+    told = {topic: [entry.payload for entry in past] for topic, past in pasts.items()}
+    whole = [b"1", b"2", b"3", b"4"]
+    assert told == dict.fromkeys(topics[:20], whole) | {"alarm-7": whole[1:], "of-nobody": []}
+    assert all(past == sorted(past, key=lambda entry: entry.sequence) for past in pasts.values())
+    assert len(opened) == 1
+    assert looked == sorted(looked, reverse=True)
+    short = read_pasts(tmp_path / "store", topics[:1], lambda _: False, most=2)
+    assert [entry.payload for entry in short[topics[0]]] == whole[2:]
 
 
 async def test_it_is_read_without_a_service_and_nothing_is_left_behind(outbox, tmp_path):
