@@ -418,9 +418,11 @@ class Connection:
             self._client.connect(*self._address, properties=told)
         except OSError as failure:  # before ValueError, which unverified certificates are, too
             error = failure
-        except ValueError:
-            # No host, or in the library of names an empty part, or one of more than 63 letters.
+        except UnicodeError:
+            # The library of names: an empty part, or one of more than 63 letters.
             error = OSError(f"{self._address[0]!r} cannot be the name of a host; correct mqtt.url")
+        except ValueError as failure:
+            error = OSError(f"the connection cannot be made: {failure}")
         except Exception as failure:  # noqa: BLE001  whatever it is, the caller shall see it
             error = failure
         try:

@@ -71,7 +71,12 @@ class Listener:
     def _take(self, topic: str, payload: bytes, *, retained: bool) -> None:
         if retained or not payload:
             return  # what an earlier run has left behind
-        content = json.loads(payload)
+        try:
+            content = json.loads(payload)
+        except (ValueError, RecursionError):
+            return  # of somebody else, on a broker of the user's
+        if not isinstance(content, dict):
+            return
         kind = str(content.get("schema", "")).removeprefix("daqsvc.").split("/")[0]
         self.messages += 1
         if kind == "availability":
