@@ -6,7 +6,6 @@ schedule are revolutions of the shaft, parameters are the paper's dimensionless 
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
 from sim_hw.plants.rotor import Change, RotorParameters, simulate
 from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
 from sim_hw.scenario_bearing import BearingScenario
@@ -277,13 +277,13 @@ def _table(name_or_path: str | Path) -> dict[str, Any]:
     builtin = _builtin_files().get(str(name_or_path))
     source: Traversable = Path(name_or_path) if builtin is None else builtin
     try:
-        return tomllib.loads(source.read_text(encoding="utf-8"))
+        return read_toml(source) if isinstance(source, Path) else parse_toml(source.read_text("utf-8"))
     except FileNotFoundError:
         raise ScenarioError(
             f"there is no scenario {str(name_or_path)!r}: neither a file nor one of "
             f"{', '.join(builtin_scenarios())}"
         ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, TomlFileError) as error:
         raise ScenarioError(f"scenario {name_or_path} cannot be read: {error}") from error
 
 

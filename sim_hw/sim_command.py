@@ -10,10 +10,10 @@ import logging
 import signal
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.confined.small_toml import TomlFileError, read_toml
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
 if TYPE_CHECKING:
@@ -264,8 +264,8 @@ def _script(
 
 def _is_scenario(path: Path) -> bool:
     try:
-        return "plant" in tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return "plant" in read_toml(path)
+    except (OSError, TomlFileError):
         return False  # the reader of machine files says what is wrong with it
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tomllib
 from collections.abc import Mapping  # noqa: TC003 - pydantic reads the annotations
 from dataclasses import MISSING, asdict, fields
 from pathlib import Path
@@ -22,6 +21,7 @@ from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence
 from daqsvc.bearing.sliding_mode import SlidingGains, UnitEnergies
 from daqsvc.bearing.two_sensors import HealthyPair
+from daqsvc.confined.small_toml import read_toml
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -201,8 +201,7 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
         BaselineFileError: the file cannot be read or used; the message names file, key, value and remedy.
     """
     try:
-        with Path(path).open("rb") as file:
-            table = _File.model_validate(tomllib.load(file))
+        table = _File.model_validate(read_toml(Path(path)))
         return BearingBaseline(
             rate_hz=table.rate_hz,
             speed_rpm=table.speed_rpm,

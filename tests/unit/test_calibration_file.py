@@ -228,7 +228,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(CalibrationFileError, match=r"no\.toml: No such file or directory; name a file that"):
         load_calibration(tmp_path / "no.toml")
     (tmp_path / "zip").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(CalibrationFileError, match="this is no text; name a file that"):
+    with pytest.raises(CalibrationFileError, match=r"this is not UTF-8: .*; name a file that"):
         load_calibration(tmp_path / "zip")
     with pytest.raises(CalibrationFileError, match="cannot be written: No such file or directory; name a"):
         save_calibration(calibration(), tmp_path / "none" / "rotor.toml")

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
 from daqsvc.rotor.calibration.reading import CalibrationFileError, Table
 from daqsvc.rotor.calibration.record import CalibrationRecord
 from daqsvc.rotor.calibration.run_up_fit import RunUpFit
@@ -22,7 +22,7 @@ from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
 __all__ = [
     "SCHEMA_VERSION",
@@ -38,6 +38,8 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = 1
+
+_REMEDY = "name a file that daqsvc calibrate wrote, or calibrate again"
 
 _COMPONENTS = (
     "mean_position_um",
@@ -112,16 +114,14 @@ def load_record(path: Path | str) -> CalibrationRecord:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        document = read_toml(path)
     except OSError as error:
         raise CalibrationFileError(
             f"{path}: {error.strerror}; name a file that daqsvc calibrate wrote"
         ) from None
-    except UnicodeDecodeError:
-        raise CalibrationFileError(
-            f"{path}: this is no text; name a file that daqsvc calibrate wrote"
-        ) from None
-    return parse_record(text, path)
+    except TomlFileError as error:
+        raise CalibrationFileError(f"{path}: {error}; {_REMEDY}") from None
+    return _record(document, path)
 
 
 def save_calibration(calibration: Calibration, path: Path | str, *, source: str = "") -> None:
@@ -245,11 +245,13 @@ def parse_record(text: str, path: Path) -> CalibrationRecord:
         CalibrationFileError: the text cannot be used.
     """
     try:
-        document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CalibrationFileError(
-            f"{path}: this is not TOML: {error}; restore the file, or calibrate again"
-        ) from None
+        document = parse_toml(text)
+    except TomlFileError as error:
+        raise CalibrationFileError(f"{path}: {error}; {_REMEDY}") from None
+    return _record(document, path)
+
+
+def _record(document: Mapping[str, Any], path: Path) -> CalibrationRecord:
     table = Table(document, path)
     version = table.whole("schema_version")
     if version != SCHEMA_VERSION:
