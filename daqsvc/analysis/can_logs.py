@@ -43,6 +43,7 @@ _MOST_OFF_RATE = 0.05
 _LONG_ENOUGH_S = 1.0
 """A shorter log does not tell the rate of a stream."""
 _NAMED_IDS = 8
+_LAYOUTS = "ids and lengths of its layouts"
 
 
 def is_can_log(path: str) -> bool:
@@ -72,12 +73,14 @@ def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) 
     """
     playing = _Playing(machine, path)
     playing.play()
-    if not playing.blocks and playing.notes:
-        raise RecordingError(playing.notes[0])
     if not playing.blocks:
+        why = (
+            playing.notes[0]
+            if playing.notes
+            else f"give the log of this machine's bus, or correct {_LAYOUTS}"
+        )
         raise RecordingError(
-            f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; give the log of "
-            "this machine's bus, or correct the ids and lengths of its layouts"
+            f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; {why}"
         )
     playing.check_rates()
     return _recording(machine, path, playing, rate_hz)

@@ -87,6 +87,24 @@ def test_a_bomb_among_recordings_costs_its_own_line(tmp_path, capsys):
     assert said[1]["verdict"] == "normal"
 
 
+@pytest.mark.parametrize(("work", "why"), [("crash", "SIGSEGV"), ("spin", "more processor time than it may")])
+def test_a_reader_that_crashes_or_never_ends_costs_its_own_line(tmp_path, capsys, monkeypatch, work, why):
+    spoils, run = Orbit().save(tmp_path / "spoils.npz"), Orbit().save(tmp_path / "run.npz")
+    call = shared.call
+
+    def spoilt(function, arguments, **limits):
+        if arguments["path"] != str(spoils):
+            return call(function, arguments, **limits)
+        return call(f"confined_work:{work}", {}, **{**limits, "cpu_s": 0.1})
+
+    monkeypatch.setattr(shared, "call", spoilt)
+    code, said = analyze(capsys, spoils, run, *OPTIONS, "--jobs", 1)
+    assert code == 3
+    assert why in said[0]["refused"]
+    assert "copy or save it anew" in said[0]["refused"]
+    assert said[1]["verdict"] == "normal"
+
+
 def test_memory_is_given_on_the_command_line(tmp_path, capsys):
     run = tmp_path / "run.npz"
     np.savez(run, **dict.fromkeys("xy", np.random.default_rng(1).normal(size=2_000_000)), fs=1000)
