@@ -79,8 +79,8 @@ class CommandCounters:
 class AlarmDesk:
     """Alarms of one machine, from diagnosis to broker.
 
-    Use: `open`, `resume`, then `take` and `obey` as diagnoses and commands come while `run` and `keep_time`
-    run; `settle`, `stop`, `close`.
+    Use: `open`, `resume`, then `take` and `obey` as diagnoses and commands come while `tellers` and
+    `keep_time` run; `settle`, `stop`, `close`.
 
     Args:
         identity: whose alarms these are.
@@ -230,12 +230,11 @@ class AlarmDesk:
         self._is_in_step, self._damage_seen = True, damage
         self._confirm(committed)
 
-    async def run(self) -> None:
-        """Publish until `stop`; returns at once without a broker."""
-        tellers = [teller for teller in (self.publisher, self.sparkplug) if teller is not None]
-        async with asyncio.TaskGroup() as telling:
-            for teller in tellers:
-                telling.create_task(teller.run(), name=type(teller).__name__)
+    @property
+    def tellers(self) -> Mapping[str, MqttPublisher | SparkplugEdge]:
+        """What publishes, by name; each is to be run by itself, until `stop`."""
+        there = {"mqtt": self.publisher, "sparkplug": self.sparkplug}
+        return {name: teller for name, teller in there.items() if teller is not None}
 
     async def keep_time(self) -> None:
         """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
@@ -314,9 +313,18 @@ class AlarmDesk:
         await asyncio.wait({telling, *self._under_way}, timeout=timeout_s)
 
     async def stop(self, deadline_s: float) -> None:
-        """Hand over to the broker what is left, and end `run`; see `MqttPublisher.stop`."""
-        tellers = [teller for teller in (self.publisher, self.sparkplug) if teller is not None]
-        await asyncio.gather(*(teller.stop(deadline_s) for teller in tellers))
+        """Hand over to the broker what is left, and end `tellers`; see `MqttPublisher.stop`."""
+        stopping = {
+            asyncio.create_task(t.stop(deadline_s), name=f"{name} stop") for name, t in self.tellers.items()
+        }
+        if not stopping:
+            return
+        ended, hanging = await asyncio.wait(stopping, timeout=2 * deadline_s)
+        for task in hanging:
+            task.cancel()
+        for task in ended:
+            if not task.cancelled() and (error := task.exception()) is not None:
+                logger.error("%s has failed: %s", task.get_name(), error)
 
     async def close(self, timeout_s: float) -> None:
         """Close the journal; see `Outbox.close`."""

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
+import contextlib
 import errno
 import logging
 import os
-import signal
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
+from daqsvc import kernel_cache
 from daqsvc.commands.alarm_orders import order_commands
 from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.record import RecordCommand
-from daqsvc.commands.store_argument import store_directory
+from daqsvc.commands.run import RunCommand
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,6 +69,7 @@ class CheckCommand:
         machine = load(arguments.file)
         if machine is None:
             return EXIT_BAD_FILE
+        kernel_cache.prepare()
         from daqsvc.assembly import AssemblyError, check_calibrations  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
 
@@ -79,68 +80,6 @@ class CheckCommand:
             return EXIT_BAD_FILE
         print(describe(machine))  # noqa: T201 - this is what the verb is for
         return EXIT_OK
-
-
-class RunCommand:
-    """``daqsvc run FILE``."""
-
-    help = "run the service until SIGTERM or SIGINT"
-    description = (
-        "Run the service for one machine file: acquire, diagnose, and publish alarms. SIGTERM or SIGINT "
-        "(Ctrl-C) stop it within two seconds; alarms that the broker has not acknowledged stay in the "
-        "journal and go out at the next start."
-    )
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """See `Command.add_arguments`."""
-        parser.add_argument("file", type=Path, metavar="FILE", help="the machine file (TOML)")
-        parser.add_argument(
-            "--store",
-            type=Path,
-            metavar="DIR",
-            help="directory of the alarm journal (default: as in the file, else $STATE_DIRECTORY, "
-            "else ~/.local/state/daqsvc)",
-        )
-        parser.add_argument("-v", "--verbose", action="store_true", help="log what goes well, too")
-
-    def run(self, arguments: argparse.Namespace) -> int:
-        """See `Command.run`."""
-        start_logging(verbose=arguments.verbose)
-        machine = load(arguments.file)
-        if machine is None:
-            return EXIT_BAD_FILE
-        prepare_kernel_cache()
-        from daqsvc.assembly import AssemblyError  # noqa: PLC0415
-        from daqsvc.outbox.store import OutboxError  # noqa: PLC0415
-        from drivers.base import DeviceAbsentError  # noqa: PLC0415
-        from drivers.frames import LayoutError  # noqa: PLC0415
-
-        try:
-            asyncio.run(_run_until_signal(machine, arguments.store or store_directory(machine)))
-        except (AssemblyError, DeviceAbsentError, LayoutError, OutboxError) as error:
-            logging.getLogger(__name__).critical("%s", error)
-            return EXIT_FAILED
-        return EXIT_OK
-
-
-async def _run_until_signal(machine: MachineFile, store: Path) -> None:
-    from daqsvc.service import Service  # noqa: PLC0415
-
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    # Before anything slow: a signal that comes while kernels compile must not kill.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop.set)
-    service = Service(machine, store)
-    log = logging.getLogger(__name__)
-    running = asyncio.create_task(service.run(stop))
-    ready = asyncio.create_task(service.ready.wait())
-    await asyncio.wait({running, ready}, return_when=asyncio.FIRST_COMPLETED)
-    if service.ready.is_set():
-        log.info("watching %s; the journal is in %s", machine.machine.name, store)
-    ready.cancel()
-    await running
-    log.info("stopped")
 
 
 def load(path: Path) -> MachineFile | None:
@@ -154,33 +93,13 @@ def load(path: Path) -> MachineFile | None:
         return None
 
 
-def prepare_kernel_cache() -> None:
-    """Keep compiled kernels in the service's own cache directory; call before any kernel is imported."""
-    if "NUMBA_CACHE_DIR" in os.environ:
-        return
-    given = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
-    cache = Path(given or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    directory = cache / "kernels" if given else cache / "daqsvc" / "kernels"
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        logging.getLogger(__name__).warning(
-            "compiled kernels cannot be kept in %s (%s): every start compiles them again; "
-            "set NUMBA_CACHE_DIR to a directory that can be written",
-            directory,
-            error.strerror,
-        )
-        return
-    os.environ["NUMBA_CACHE_DIR"] = str(directory)
-
-
-def start_logging(*, verbose: bool) -> None:
-    """Log to stderr; under systemd without time stamps, which the journal adds itself."""
+def start_logging(*, verbose: bool, handler: logging.Handler | None = None) -> None:
+    """Log to stderr, or to a handler; under systemd without time stamps, which the journal adds itself."""
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING,
         format=f"{stamp}%(levelname)s %(message)s",
-        stream=sys.stderr,
+        handlers=[handler or logging.StreamHandler()],
     )
     logging.getLogger("can").setLevel(logging.ERROR)
 
@@ -188,13 +107,13 @@ def start_logging(*, verbose: bool) -> None:
 def commands() -> dict[str, Command]:
     """Every verb there is, by name."""
     known: dict[str, Command] = {
-        "run": RunCommand(),
+        "run": RunCommand(load, start_logging),
         "check": CheckCommand(),
         "alarms": AlarmsCommand(load),
         **order_commands(load),
-        "analyze": AnalyzeCommand(load, prepare_kernel_cache),
-        "calibrate": CalibrateCommand(load, prepare_kernel_cache),
-        "detectability": DetectabilityCommand(load, prepare_kernel_cache),
+        "analyze": AnalyzeCommand(load, kernel_cache.prepare),
+        "calibrate": CalibrateCommand(load, kernel_cache.prepare),
+        "detectability": DetectabilityCommand(load, kernel_cache.prepare),
         "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):
@@ -251,10 +170,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("daqsvc: interrupted", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in {errno.ENOSPC, errno.EIO}:
             raise
+        # A full disk, or a terminal that is gone; stderr may be the same one.
         _give_up_stdout()
-        print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
+        with contextlib.suppress(OSError):
+            print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
     return code
 

@@ -3,7 +3,8 @@
 A request is one line of JSON, and so is its answer; `Request` and `Answer` say what is in them. The socket
 is ``control.sock`` in the store's directory, mode 0600: only the service's own user and root may open it, and
 whoever may open it may command the alarms. Whatever a client sends or leaves unsent costs the service a
-counter and a few kilobytes at most.
+counter and a few kilobytes at most. Clients that hang keep nobody out: each user has connections of their
+own, and the quietest of them makes way for a new one.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.alarms.asked import printable, refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 
@@ -38,9 +41,14 @@ MODE = 0o600
 LONGEST_PATH = 107
 """Bytes that the address of a Unix socket has room for (sun_path less its end)."""
 LONGEST_LINE = 16 * 1024
-MOST_CLIENTS = 16
+MOST_CLIENTS = 8
+"""Connections of one user at a time."""
 PATIENCE_S = 10.0
 """How long a client may take to finish a line, and to take its answer."""
+CLOSE_S = 0.2
+"""How long the end waits for connections that are being ended."""
+LOOK_S = 10.0
+"""How often the service looks whether its socket is still there."""
 ANSWER_S = 20.0
 """How long the client waits for the service: longer than that waits for its disk."""
 
@@ -109,7 +117,9 @@ class ControlCounters:
 
     Attributes:
         clients: connections taken.
-        clients_turned_away: connections beyond those that are served at a time.
+        clients_turned_away: connections of a user of whose others each has a request under way.
+        clients_displaced: idle connections ended to make room for a new one of the same user.
+        clients_failed: connections ended by a mistake in this program.
         clients_given_up: connections ended because the client was too slow, or went away in mid-line.
         requests: requests that were handed on as commands.
         malformed: lines that were no request: not JSON, of another schema, too long, for another machine.
@@ -117,9 +127,28 @@ class ControlCounters:
 
     clients: int = 0
     clients_turned_away: int = 0
+    clients_displaced: int = 0
+    clients_failed: int = 0
     clients_given_up: int = 0
     requests: int = 0
     malformed: int = 0
+
+
+@dataclass(eq=False, slots=True)
+class _Client:
+    """One connection.
+
+    Attributes:
+        uid: whose.
+        source: the same in words.
+        busy: whether a request of it is being carried out.
+        task: serves it.
+    """
+
+    uid: int
+    source: str
+    busy: bool = False
+    task: asyncio.Task[None] | None = None
 
 
 class ControlServer:
@@ -142,7 +171,8 @@ class ControlServer:
         self._waiting = waiting
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
-        self._clients: set[asyncio.Task[None]] = set()
+        self._clients: list[_Client] = []
+        """The one that has been quiet for longest first."""
 
     async def open(self) -> None:
         """Begin to listen.
@@ -162,34 +192,92 @@ class ControlServer:
             raise
         self._server = await asyncio.start_unix_server(self._welcome, sock=listening, limit=LONGEST_LINE)
 
+    async def serve(self) -> None:
+        """Listen until cancelled, and begin again where that fails, or where the socket is taken away."""
+        backoff, said = Backoff(), self._server is None
+        try:
+            while True:
+                if self._server is None:
+                    try:
+                        await self.open()
+                    except ControlError:
+                        await asyncio.sleep(backoff.next_ns() / NS_PER_S)
+                        continue
+                    if said:
+                        log.warning("commands are taken at %s now", self.path)
+                    backoff.reset()
+                await asyncio.sleep(LOOK_S)
+                if not await asyncio.to_thread(_is_at, self.path, self._inode):
+                    said = True
+                    log.warning("the control socket %s was taken away; another one is made", self.path)
+                    await self.close()
+        finally:
+            await self.close()
+
     async def close(self) -> None:
         """Stop listening, end every connection at once, and take the socket away."""
-        if self._server is None:
+        server, self._server = self._server, None
+        if server is None:
             return
-        self._server.close()
-        for client in self._clients:
-            client.cancel()
-        if self._clients:
-            await asyncio.wait(set(self._clients))
-        await self._server.wait_closed()
-        self._server = None
-        await asyncio.to_thread(_remove, self.path, self._inode)
+        server.close()
+        ending = {client.task for client in self._clients if client.task is not None}
+        for task in ending:
+            task.cancel()
+        if ending:
+            await asyncio.wait(ending, timeout=CLOSE_S)
+        try:
+            async with asyncio.timeout(CLOSE_S):
+                await server.wait_closed()
+                await asyncio.to_thread(_remove, self.path, self._inode)
+        except TimeoutError:
+            log.warning(
+                "the control socket %s does not close within %g s and is left behind", self.path, CLOSE_S
+            )
+        except OSError as error:
+            log.warning(
+                "the control socket %s is left behind, where the next start replaces it: %s",
+                self.path,
+                error.strerror or error,
+            )
 
     def _welcome(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._clients) >= MOST_CLIENTS:
+        try:
+            uid, pid = _peer(writer)
+        except OSError:  # it has gone again
+            self.counters.clients_given_up += 1
+            writer.transport.abort()
+            return
+        if not self._make_room(uid):
             self.counters.clients_turned_away += 1
             writer.transport.abort()
             return
         self.counters.clients += 1
-        client = asyncio.create_task(self._serve(reader, writer), name="control client")
-        self._clients.add(client)
-        client.add_done_callback(self._clients.discard)
+        client = _Client(uid, f"local uid {uid} pid {pid}")
+        self._clients.append(client)
+        client.task = asyncio.create_task(self._serve(client, reader, writer), name="control client")
+        client.task.add_done_callback(lambda _: self._clients.remove(client))
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        source = _peer(writer)
+    def _make_room(self, uid: int) -> bool:
+        """Whether there is room for one more connection of a user; only that user's others make way."""
+        theirs = [client for client in self._clients if client.uid == uid and not _is_ending(client)]
+        if len(theirs) < MOST_CLIENTS:
+            return True
+        quiet = next((client for client in theirs if not client.busy), None)
+        if quiet is None or quiet.task is None:
+            return False
+        self.counters.clients_displaced += 1
+        quiet.task.cancel()
+        return True
+
+    async def _serve(
+        self, client: _Client, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         try:
             while (line := await _next_line(reader)) is not None:
-                answer = await self._answer(line, source)
+                client.busy = True
+                answer = await self._answer(line, client.source)
+                client.busy = False
+                self._clients.append(self._clients.pop(self._clients.index(client)))
                 writer.write(_json_line(answer))
                 async with asyncio.timeout(PATIENCE_S):
                     await writer.drain()
@@ -197,6 +285,12 @@ class ControlServer:
                     return  # what follows is the rest of it, or of its kind
         except (TimeoutError, ConnectionError, asyncio.IncompleteReadError):
             self.counters.clients_given_up += 1
+        except Exception:
+            self.counters.clients_failed += 1
+            if self.counters.clients_failed == 1:
+                log.exception(
+                    "the service has failed on what %s asked for, and ends the connection", client.source
+                )
         finally:
             if writer.transport.get_write_buffer_size():
                 writer.transport.abort()
@@ -335,12 +429,20 @@ def _json_line(message: Request | Answer) -> bytes:
     return json.dumps(message.model_dump(mode="json", by_alias=True)).encode("ascii") + b"\n"
 
 
-def _peer(writer: asyncio.StreamWriter) -> str:
-    """Who is at the other end, by the word of the kernel."""
+def _is_ending(client: _Client) -> bool:
+    return client.task is not None and client.task.cancelling() > 0
+
+
+def _peer(writer: asyncio.StreamWriter) -> tuple[int, int]:
+    """Who is at the other end, by the word of the kernel: uid and pid.
+
+    Raises:
+        OSError: nobody any more.
+    """
     connection = writer.get_extra_info("socket")
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     pid, uid, _ = struct.unpack("3i", credentials)
-    return f"local uid {uid} pid {pid}"
+    return uid, pid
 
 
 def _bind(path: Path) -> tuple[socket.socket, int]:
@@ -371,6 +473,16 @@ def _check_free(path: Path) -> None:
     """Only a socket may be replaced: it is left over from a service that was killed."""
     if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
         raise ControlError(f"{path} is in the way of the control socket and is none; move it away")
+
+
+def _is_at(path: Path, inode: int | None) -> bool:
+    """Whether the socket that was made is still at its path; one that cannot be looked at may be."""
+    try:
+        return path.lstat().st_ino == inode
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
 
 
 def _remove(path: Path, inode: int | None) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections import deque
 from dataclasses import asdict
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,10 +26,13 @@ from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
 from daqsvc.self_check import BusHealth
 from daqsvc.settings.alignment import Grid
+from daqsvc.supervision import EssentialLostError, Supervisor, over, stop_all
+from daqsvc.threads import CallThreads
+from drivers.base import DeviceAbsentError
 from drivers.can_errors import CanCounters
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -52,8 +56,10 @@ DRAIN_S = 0.3
 """What the pipeline may take to finish, and again what the disk may take for the events of it."""
 GOODBYE_S = 0.5
 """What the broker may take to get the rest."""
+STOP_S = 1.3
+"""What all of these may take together, ..."""
 CLOSE_S = 0.3
-"""What the journal may take to close. All together: the two seconds in which the service promises to stop."""
+"""... and then the journal to close: within the two seconds in which the service promises to stop."""
 
 
 class LoopLag:
@@ -103,17 +109,26 @@ class Service:
         machine: the machine file.
         store: directory of the journal.
         clock: the service's clock.
+        on_ending: called when the service begins to end, for whatever reason.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
         LayoutError: a DBC file does not hold what the machine file says.
     """
 
-    def __init__(self, machine: MachineFile, store: Path, clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        machine: MachineFile,
+        store: Path,
+        clock: Clock | None = None,
+        on_ending: Callable[[], None] = lambda: None,
+    ) -> None:
         self.machine = machine
         self.clock: Clock = clock or SystemClock()
         self.lag = LoopLag()
         self.ready = asyncio.Event()
+        self.supervisor = Supervisor()
+        self._on_ending = on_ending
         self._identity = identity(machine)
         detectors = assembly.detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
@@ -128,6 +143,7 @@ class Service:
             self.clock,
             settling_ns=settling_ns,
             patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
+            supervisor=self.supervisor,
         )
         self.desk = AlarmDesk(
             self._identity,
@@ -153,22 +169,31 @@ class Service:
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
 
+        Blocking calls get threads of their own from here on; the end of the process waits for none of them.
+
         Raises:
             OutboxError: the journal's directory cannot be used.
             DeviceAbsentError: a device is absent whose bus has ``start = "error"``.
+            EssentialLostError: the journal's writer is gone, or the start was cancelled.
         """
-        starting = self._task(self._start(), "start")
-        stopped = self._task(stop.wait(), "stop")
-        try:
-            # Opening a disk and compiling kernels may take long; a stop does not wait for them.
-            await asyncio.wait({starting, stopped}, return_when=asyncio.FIRST_COMPLETED)
-            if starting.done():
-                starting.result()
-                await self._serve(stopped)
-        finally:
-            await _cancel([starting, stopped], DRAIN_S)
-            await self.control.close()
-            await self.desk.close(CLOSE_S)
+        asyncio.get_running_loop().set_default_executor(CallThreads())
+        with self.supervisor.hearing():
+            starting = asyncio.create_task(self._start(), name="start")
+            try:
+                # Opening a disk and compiling kernels may take long; a stop does not wait for them.
+                await self._until_stopped(stop, starting)
+                if starting.cancelled():
+                    raise EssentialLostError(
+                        "the start of the service was cancelled by something in its process"
+                    )
+                if starting.done():
+                    starting.result()
+                    await self._serve(stop)
+            finally:
+                starting.cancel()
+                await asyncio.wait({starting}, timeout=DRAIN_S)
+                await self.control.close()
+                await self.desk.close(CLOSE_S)
 
     async def _start(self) -> None:
         await self.desk.open()
@@ -178,59 +203,100 @@ class Service:
             await self.control.open()
         except ControlError as error:
             # Watching the machine matters more than being told what to do.
-            logger.error("no commands on this box: %s", error)  # noqa: TRY400 - the message says it all
+            logger.error("no commands on this box until this is mended: %s", error)  # noqa: TRY400
 
     async def _resume(self) -> None:
         """Take over from the journal how the alarms stood when the service ended."""
         now_ns = self.clock.monotonic_ns()
-        said = [s for detector in self.pipeline.detectors for s in detector.silent(0.0, now_ns)]
-        await self.desk.resume({s.detector: s.sensors for s in said})
+        speakers: dict[str, Sequence[str]] = {}
+        for detector in self.pipeline.detectors:
+            with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
+                speakers.update({s.detector: s.sensors for s in detector.silent(0.0, now_ns)})
+        await self.desk.resume(speakers)
 
-    async def _serve(self, stopped: asyncio.Task[Any]) -> None:
+    async def _serve(self, stop: asyncio.Event) -> None:
+        keep = self.supervisor.keep
         helpers = [
-            self._task(self.lag.watch(), "loop lag"),
-            self._task(self._tell_status(), "status"),
-            self._task(self.desk.keep_time(), "alarm times"),
+            keep("loop lag", self.lag.watch),
+            keep("status", self._tell_status),
+            keep("alarm times", self.desk.keep_time),
+            keep("journal", self._watch_journal),
         ]
-        publishing = None if self.publisher is None else self._task(self.desk.run(), "mqtt")
-        pipeline = self._task(self.pipeline.run(), "pipeline")
-        reading = [self._task(driver.run(), f"driver {driver.name}") for driver in self.drivers]
-        everything = [*helpers, *reading, pipeline, stopped, *([publishing] if publishing else [])]
+        controlling = keep("control socket", self.control.serve)
+        telling = [keep(name, teller.run) for name, teller in self.desk.tellers.items()]
+        pipeline = keep(
+            "pipeline", self.pipeline.run, may_end=lambda: all(r.is_closed for r in self.rings.values())
+        )
+        reading = [
+            keep(
+                f"driver {driver.name}",
+                driver.run,
+                # One that is to be ignored if absent ends, and so does a recording.
+                may_end=partial(_has_ended, driver),
+                fatal=(DeviceAbsentError,),
+            )
+            for driver in self.drivers
+        ]
         try:
             self.ready.set()
-            await self._until_stopped(stopped, everything)
+            await self._until_stopped(stop)
         finally:
-            await self.control.close()
-            await _cancel(reading, RELEASE_S)
+            self._on_ending()
+            left = _Deadline(STOP_S)
+            for part in (*telling, pipeline):
+                part.leave()
+            await stop_all([controlling], left.most(DRAIN_S))
+            await stop_all(reading, left.most(RELEASE_S))
             for ring in self.rings.values():
                 ring.close()
-            await asyncio.wait([pipeline], timeout=DRAIN_S)
-            await self.desk.settle(DRAIN_S)
-            self._publish_status()
-            await self.desk.stop(GOODBYE_S)
-            await _cancel(everything, DRAIN_S)
+            await over([pipeline], left.most(DRAIN_S))
+            await self.desk.settle(left.most(DRAIN_S))
+            with self.supervisor.sparing_others("status", "the service is stopping anyway"):
+                self._publish_status()
+            await self.desk.stop(left.most(GOODBYE_S))
+            await stop_all([*helpers, *telling, pipeline], left.most(DRAIN_S))
 
-    async def _until_stopped(self, stopped: asyncio.Task[Any], tasks: list[asyncio.Task[Any]]) -> None:
-        waiting = set(tasks)
-        while not stopped.done():
-            done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                # A driver that is to be ignored if absent may end; nothing may fail unheard.
-                task.result()
+    async def _until_stopped(self, stop: asyncio.Event, first: asyncio.Task[None] | None = None) -> None:
+        """Wait until the service is to stop, or ``first`` is done.
 
-    @staticmethod
-    def _task(work: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-        return asyncio.create_task(work, name=name)
+        Raises:
+            Exception: something is lost without which the service is useless.
+        """
+        lost = self.supervisor.lost
+        while not (stop.is_set() or lost.done() or (first is not None and first.done())):
+            stopped = asyncio.create_task(stop.wait(), name="stop")
+            try:
+                waited_for: set[asyncio.Future[Any]] = {stopped, lost}
+                if first is not None:
+                    waited_for.add(first)
+                await asyncio.wait(waited_for, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                stopped.cancel()
+        if lost.done():
+            lost.result()
+
+    async def _watch_journal(self) -> None:
+        """Have the service end if no alarm can reach the disk any more: as a zombie it would be of no use."""
+        reason = await self.desk.outbox.until_broken()
+        self.supervisor.give_up(EssentialLostError(reason))
+        await asyncio.Event().wait()
 
     def _deliver(self, block: SampleBlock) -> None:
-        self.rings[block.stream].write(block)
-        self.alignment.accept(block)
+        with self.supervisor.sparing_others(f"stream {block.stream}", "a block of its samples is lost"):
+            self.rings[block.stream].write(block)
+            self.alignment.accept(block)
 
     def _report(self, diagnosis: Diagnosis) -> None:
-        self.desk.take(diagnosis)
+        with self.supervisor.sparing_others(
+            f"alarms by {diagnosis.detector}", "one of its statements is lost"
+        ):
+            self.desk.take(diagnosis)
         if self.publisher is not None:
-            payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
-            self.publisher.telemetry(f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload)
+            with self.supervisor.sparing_others(f"telemetry of {diagnosis.detector}", "one message is lost"):
+                payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
+                self.publisher.telemetry(
+                    f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload
+                )
 
     def _bus_health(self) -> dict[str, BusHealth]:
         found: dict[str, BusHealth] = {}
@@ -282,6 +348,7 @@ class Service:
             "detectors": {name: asdict(c) for name, c in self.pipeline.counters.items()},
             "loop_lag_ms": self.lag.figures_ms(),
             "suspensions": self.lag.suspensions,
+            "failures": dict(self.supervisor.failures),
             "alarms": self.desk.figures(),
             "commands": asdict(self.desk.commands),
             "control": asdict(self.control.counters),
@@ -299,15 +366,20 @@ def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> Sa
     return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
 
 
-async def _cancel(tasks: list[asyncio.Task[Any]], patience_s: float) -> None:
-    running = {task for task in tasks if not task.done()}
-    if not running:
-        return
-    for task in running:
-        task.cancel()
-    ended, hanging = await asyncio.wait(running, timeout=patience_s)
-    for task in ended:
-        if not task.cancelled() and (error := task.exception()) is not None:
-            logger.error("%s failed while the service stopped", task.get_name(), exc_info=error)
-    for task in hanging:
-        logger.error("%s does not stop within %g s and is left behind", task.get_name(), patience_s)
+def _has_ended(driver: Driver) -> bool:
+    return driver.link.over
+
+
+class _Deadline:
+    """The time that there is for several things one after the other.
+
+    Args:
+        seconds: for all of them.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._until_s = asyncio.get_running_loop().time() + seconds
+
+    def most(self, seconds: float) -> float:
+        """So long, or what is left of it."""
+        return max(0.0, min(seconds, self._until_s - asyncio.get_running_loop().time()))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from daqsvc.cli import prepare_kernel_cache
+from daqsvc import kernel_cache
 from sim_hw.demo.command import DemoCommand, script_of
 from sim_hw.demo.session import Session
 from sim_hw.demo.summary import summarise
@@ -22,7 +22,7 @@ PICTURE = Path(__file__).with_name("demo.svg")
 
 def main() -> None:
     """Play the paper's scenario in real time and save the last view and the summary."""
-    prepare_kernel_cache()
+    kernel_cache.prepare()
     parser = argparse.ArgumentParser()
     DemoCommand().add_arguments(parser)
     arguments = parser.parse_args()

@@ -19,7 +19,7 @@ from drivers.can_batches import FrameSorter
 from drivers.can_errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can_reader import SHUTDOWN_S, CanReader, close_quietly, words
 from drivers.can_record import recorder_of
-from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
 from drivers.socketcan import open_socketcan
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class CanDriver:
         )
         reader.start()
         try:
-            return await reader.ended
+            return await ended(reader.ended, reader)
         finally:
             # Cancelled while the bus is being closed: that takes its half second all the same.
             await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
@@ -143,10 +143,12 @@ class CanDriver:
         for frames in found.frames:
             decoded = frames.decoded
             assembler = self._assemblers[frames.stream]
-            assembler.accept(decoded.counter, decoded.samples, decoded.intact, frames.arrival_ns)
+            with sparing_others(self.link, frames.stream, self.counters):
+                assembler.accept(decoded.counter, decoded.samples, decoded.intact, frames.arrival_ns)
         if found.drained_ns is not None:
-            for assembler in self._assemblers.values():
-                assembler.tick(found.drained_ns)
+            for name, assembler in self._assemblers.items():
+                with sparing_others(self.link, name, self.counters):
+                    assembler.tick(found.drained_ns)
 
     def _take_errors(self, errors: ErrorCounts) -> None:
         """Count what error frames said; the link goes down with the controller and comes back with it."""

@@ -77,6 +77,7 @@ class CanCounters(BusCounters):
         restarts: how often it came back after bus-off.
         frames_recorded: frames that are in the recording of the bus.
         frames_unrecorded: frames that are not, because the disk refused them or was too slow.
+        recorder_failures: how often the recording began again because its thread was lost.
         controller_state: its state as last reported; error-active until something else is reported.
         tx_errors: its transmit error counter as last reported.
         rx_errors: its receive error counter as last reported.
@@ -97,6 +98,7 @@ class CanCounters(BusCounters):
     restarts: int = 0
     frames_recorded: int = 0
     frames_unrecorded: int = 0
+    recorder_failures: int = 0
     controller_state: ControllerState = "error-active"
     tx_errors: int = 0
     rx_errors: int = 0

@@ -71,7 +71,7 @@ class CanReader(threading.Thread):
             reason = BUS_OFF_REASON
         except (can.CanError, OSError, ValueError) as error:
             reason = words(error)
-        except Exception as error:
+        except BaseException as error:
             logger.exception("the reader of %s failed", self._link_name)
             self._post(self._take, Sorted(notes={"reader_failures": 1}))
             reason = f"its reader failed: {words(error)}"

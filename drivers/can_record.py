@@ -69,9 +69,10 @@ class CanRecorder:
         self._lock = threading.Lock()
         self._held = 0
         self._closed = False
+        self._ending = False
         self._too_slow = False
         self._queue: queue.SimpleQueue[CanBatch | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write_all, name=f"can-recorder {link_name}", daemon=True)
+        self._thread = self._new_thread()
         self._log: LogFile | None = None
         self._pending = 0
         self._flushed_ns = 0
@@ -88,6 +89,8 @@ class CanRecorder:
         frames = len(batch.ids)
         if not frames:
             return
+        if self._is_lost():
+            self._begin_again()
         with self._lock:
             too_many = self._held + frames > MOST_FRAMES_HELD
             left_out = too_many or self._closed
@@ -108,6 +111,7 @@ class CanRecorder:
 
     def close(self) -> None:
         """Write the rest and end the file; blocks for `PATIENCE_S` at most."""
+        self._ending = True
         self._queue.put(None)
         self._thread.join(PATIENCE_S)
         with self._lock:
@@ -123,6 +127,36 @@ class CanRecorder:
                 self._logs.place,
                 PATIENCE_S,
             )
+
+    def _new_thread(self) -> threading.Thread:
+        return threading.Thread(target=self._record_on, name=f"can-recorder {self._link_name}", daemon=True)
+
+    def _is_lost(self) -> bool:
+        """Whether the thread has ended, which it does only when it is told to."""
+        return self._thread.ident is not None and not self._thread.is_alive() and not self._ending
+
+    def _begin_again(self) -> None:
+        """Go on in a new thread and a new file; what the thread that is gone was handed is lost."""
+        with self._lock:
+            lost, self._held = self._held, 0
+            self._counters.frames_unrecorded += lost
+            self._counters.recorder_failures += 1
+        self._queue, self._pending, self._log = queue.SimpleQueue(), 0, None
+        logger.error(
+            "%s: the thread that records it in %s was lost, and %d frames with it; another one goes on",
+            self._link_name,
+            self._logs.place,
+            lost,
+        )
+        self._thread = self._new_thread()
+        self._thread.start()
+
+    def _record_on(self) -> None:
+        try:
+            self._write_all()
+        except BaseException:
+            logger.exception("the thread that records %s has failed", self._link_name)
+            self._end_log()
 
     def _write_all(self) -> None:
         while not self._closed:

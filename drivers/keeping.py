@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-from concurrent.futures import Future
+import contextlib
+import logging
 from functools import partial
-from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Iterator
+    from concurrent.futures import Future
+    from threading import Thread
 
     from daqsvc.acquisition.supervisor import Link
-    from drivers.base import BusPort
+    from drivers.base import BusCounters, BusPort
 
 T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
+
+LOOK_S = 1.0
+"""How often to look whether a thread that is waited for still lives."""
 
 
 class Attempt(NamedTuple):
@@ -45,6 +53,10 @@ async def keep_up(
 ) -> None:
     """Try a link again and again, each time later unless something came over it; until cancelled.
 
+    An attempt that fails in a way that nobody has foreseen is said with its traceback and tried again like
+    any other. What to do about a device that is absent at first holds until it has been there once, also if
+    this is called again.
+
     Args:
         link: its state; `attempt` says when it is up.
         port: what to do if the device is absent at first, and the clock.
@@ -56,8 +68,8 @@ async def keep_up(
         DeviceAbsentError: the device is absent at start and the policy is ``"error"``.
     """
     backoff = Backoff()
-    first = True
-    while (outcome := await _outcome(attempt)) is not None:
+    first = not link.ever_up
+    while (outcome := await _outcome(link, attempt)) is not None:
         if first and not outcome.present and port.start == "error":
             raise DeviceAbsentError(f"{link.name}: {outcome.reason}")
         if first and not outcome.present and port.start == "ignore":
@@ -70,11 +82,38 @@ async def keep_up(
         await port.clock.sleep_ns(backoff.next_ns())
 
 
-async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt | None:
+async def _outcome(link: Link, attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt | None:
     try:
         return await attempt()
     except CannotOpenError as error:
         return Attempt(present=False, useful=False, reason=f"{error}")
+    except Exception as error:
+        reason = f"its driver failed: {error or type(error).__name__}"
+        if reason != link.reason:
+            logger.exception("the driver of %s has failed; it begins again", link.name)
+        return Attempt(present=True, useful=False, reason=reason)
+
+
+async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:
+    """Wait for the reason with which the threads of a reader end, or for the end of one that gives none."""
+    while not reason.done():
+        # Looked at before the wait: what a thread has said last is on its way to the loop when it ends.
+        alive = all(thread.is_alive() for thread in threads)
+        await asyncio.wait({reason}, timeout=LOOK_S)
+        if not alive and not reason.done():
+            return "its reader has ended without a word"
+    return reason.result()
+
+
+@contextlib.contextmanager
+def sparing_others(link: Link, stream: str, counters: BusCounters) -> Iterator[None]:
+    """What goes wrong with one stream is counted and said once, and costs the others of its bus nothing."""
+    try:
+        yield
+    except Exception:
+        counters.reader_failures += 1
+        if counters.reader_failures == 1:
+            logger.exception("%s: samples of stream %r cannot be taken in and are lost", link.name, stream)
 
 
 async def in_thread(
@@ -94,7 +133,11 @@ async def in_thread(
         patience_s: how long to wait for its end when cancelled; None for as long as it takes. One that takes
             longer is left behind: what it did is undone when it ends, and the process may end before it.
     """
-    begun = None if patience_s is None else _in_thread_of_its_own(call, *arguments)
+    begun = (
+        None
+        if patience_s is None
+        else call_in_thread(partial(call, *arguments), name=getattr(call, "__name__", "call"))
+    )
     work = asyncio.ensure_future(
         asyncio.to_thread(call, *arguments) if begun is None else asyncio.wrap_future(begun)
     )
@@ -113,25 +156,6 @@ async def in_thread(
         # The exception of a failed call holds this frame: were it held from here, what the call has opened
         # would lie about until the next garbage collection.
         del work, begun
-
-
-def _in_thread_of_its_own(call: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Begin a call in a thread that nobody waits for: asyncio's own are waited for when the process ends."""
-    outcome: Future[T] = Future()
-    outcome.set_running_or_notify_cancel()
-    name = f"blocking {getattr(call, '__name__', 'call')}"
-    Thread(target=_settle, args=(outcome, call, arguments), name=name, daemon=True).start()
-    return outcome
-
-
-def _settle(outcome: Future[T], call: Callable[..., T], arguments: tuple[Any, ...]) -> None:
-    try:
-        result = call(*arguments)
-    except BaseException as error:  # noqa: BLE001 - whoever waits for the outcome gets it
-        outcome.set_exception(error)
-        del outcome  # as in `in_thread`
-    else:
-        outcome.set_result(result)
 
 
 def _undo_late(undo: Callable[[T], object], outcome: Future[T]) -> None:

@@ -144,6 +144,8 @@ class ModbusDriver:
         if line.lost.done():
             return line.lost.result()
         for task in ended:
+            if task.cancelled():
+                return f"its {task.get_name()} was cancelled"
             if (error := task.exception()) is not None:
                 logger.error("%s: %s failed", self.link.name, task.get_name(), exc_info=error)
                 self.counters.reader_failures += 1

@@ -20,7 +20,7 @@ import serial
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusCounters, BusPort
-from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
 from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial_lines import TIME_COUNTER_BITS, LineFraming, LineLayout
 from drivers.serial_reader import SHUTDOWN_S, Batch, SerialReader, close_port
@@ -139,7 +139,7 @@ class SerialDriver:
         reader = SerialReader(self.link.name, device, self._framing, self, self._port.clock, loop)
         reader.start()
         try:
-            return await reader.ended
+            return await ended(reader.ended, reader, reader.cutter)
         finally:
             # Cancelled while the port is being closed: that takes its time all the same.
             await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
@@ -173,14 +173,16 @@ class SerialDriver:
             )
         for stream, frames in found.frames.items():
             decoded = frames.decoded
-            self._assemblers[stream].accept(
-                decoded.counter, decoded.samples, decoded.intact, batch.arrivals_ns[stream]
-            )
+            with sparing_others(self.link, stream, counters):
+                self._assemblers[stream].accept(
+                    decoded.counter, decoded.samples, decoded.intact, batch.arrivals_ns[stream]
+                )
 
     def tick(self, drained_ns: int) -> None:
         """Nothing more is under way that was sent before ``drained_ns``; runs on the event loop."""
-        for assembler in self._assemblers.values():
-            assembler.tick(drained_ns)
+        for name, assembler in self._assemblers.items():
+            with sparing_others(self.link, name, self.counters):
+                assembler.tick(drained_ns)
 
     def note(self, counter: str, count: int = 1) -> None:
         """Add to one of the bus's counters; runs on the event loop."""

@@ -104,6 +104,10 @@ class SerialReader(threading.Thread):
         taker: who is given the frames.
         clock: stamps arrivals.
         loop: where the taker lives.
+
+    Attributes:
+        ended: what becomes the reason why the reading has ended.
+        cutter: the thread that finds and decodes the frames.
     """
 
     def __init__(
@@ -128,13 +132,13 @@ class SerialReader(threading.Thread):
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._cutter = threading.Thread(target=self._cut_on, name=f"cutter of {name}", daemon=True)
+        self.cutter = threading.Thread(target=self._cut_on, name=f"cutter of {name}", daemon=True)
         self._line_errors = _line_errors(self._fd)
         self._line_errors_due_ns = 0
 
     def start(self) -> None:
         """Start both threads."""
-        self._cutter.start()
+        self.cutter.start()
         super().start()
 
     def run(self) -> None:
@@ -145,7 +149,7 @@ class SerialReader(threading.Thread):
             reason = "it was closed"
         except _HungUpError as error:
             reason = f"{error}"
-        except Exception as error:
+        except BaseException as error:
             logger.exception("the %s failed", self.name)
             reason = self._failed(error)
         self._jobs.put(partial(self._post, self._end, reason))
@@ -158,7 +162,7 @@ class SerialReader(threading.Thread):
         if self.is_alive():
             logger.warning("the %s hangs in the port and is left behind", self.name)
             self._jobs.put(None)
-        self._cutter.join(SHUTDOWN_S)
+        self.cutter.join(SHUTDOWN_S)
         close_port(self._device)
 
     def _cut_on(self) -> None:
@@ -166,12 +170,12 @@ class SerialReader(threading.Thread):
         try:
             while (job := self._jobs.get()) is not None:
                 job()
-        except Exception as error:
-            logger.exception("the %s failed", self._cutter.name)
+        except BaseException as error:
+            logger.exception("the %s failed", self.cutter.name)
             self._stopping.set()
             self._post(self._end, self._failed(error))
 
-    def _failed(self, error: Exception) -> str:
+    def _failed(self, error: BaseException) -> str:
         """Count a failure of one of the threads, and say it in words."""
         self._post(self._taker.note, "reader_failures")
         return f"its reader failed: {error or type(error).__name__}"

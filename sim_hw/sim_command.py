@@ -81,9 +81,11 @@ class SimCommand:
         """See `daqsvc.cli.Command.run`."""
         if wrong := _misuse(arguments):
             self._parser.error(wrong)
+        from daqsvc import kernel_cache  # noqa: PLC0415
         from daqsvc.cli import start_logging  # noqa: PLC0415
 
         start_logging(verbose=False)
+        kernel_cache.prepare()
         # What python-can has to say of a bus is raised too; of a lost one it would say so at each attempt.
         logging.getLogger("can").setLevel(logging.CRITICAL)
         if arguments.what is None:

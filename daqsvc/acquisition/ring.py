@@ -232,6 +232,11 @@ class SampleRing:
             if not woken.done():
                 woken.set_result(None)
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing more will be written."""
+        return self._closed
+
     def close(self) -> None:
         """Let nobody wait any longer; what was written can still be read."""
         self._closed = True

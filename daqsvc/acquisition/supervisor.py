@@ -57,14 +57,21 @@ class Link:
         state: up or down.
         losses: how often it went down after it had been up.
         reason: why it is down.
+        over: whether it is down for good, and nobody tries it again.
     """
 
     name: str
     state: LinkState = "down"
     losses: int = 0
     reason: str = ""
+    over: bool = False
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
+
+    @property
+    def ever_up(self) -> bool:
+        """Whether the link has worked before."""
+        return self._ever_up
 
     def up(self) -> None:
         """The link works."""
@@ -73,6 +80,7 @@ class Link:
         elif self.state == "down":
             logger.info("%s is up", self.name)
         self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
+        self.over = False
 
     def down(self, reason: str) -> None:
         """The link does not work, because of ``reason``, and is tried again; repeated calls are silent."""
@@ -90,12 +98,12 @@ class Link:
             self.name,
             reason,
         )
-        self.state, self.reason, self._said_down = "down", reason, False
+        self.state, self.reason, self._said_down, self.over = "down", reason, False, True
 
     def end(self, reason: str) -> None:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
         logger.info("%s has ended: %s", self.name, reason)
-        self.state, self.reason, self._said_down = "down", reason, False
+        self.state, self.reason, self._said_down, self.over = "down", reason, False, True
 
     def stop(self) -> None:
         """Nobody keeps the link up any more: its driver was stopped. That is no loss."""

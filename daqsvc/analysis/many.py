@@ -10,6 +10,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+from daqsvc import kernel_cache
 from daqsvc.recording.recording import get_limits, set_limits
 
 if TYPE_CHECKING:
@@ -100,3 +101,4 @@ def _prepare(limits: Limits) -> None:
     """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_limits(limits)
+    kernel_cache.prepare(say=False)

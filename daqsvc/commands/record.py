@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc import kernel_cache
 from daqsvc.commands.option_types import positive
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ class RecordCommand:
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
         self._start_logging(verbose=False)
+        kernel_cache.prepare()
         machine = self._load(arguments.file)
         if machine is None:
             return EXIT_MISUSED

@@ -30,6 +30,9 @@ def store_directory(machine: MachineFile) -> Path:
     """Where the journal lives if nobody says otherwise.
 
     The machine file's own word first, then systemd's, then the user's state directory (XDG).
+
+    Raises:
+        StoreNotFoundError: none of these says anything.
     """
     if machine.store is not None:
         return machine.resolve(machine.store.directory)
@@ -88,4 +91,10 @@ def _only_store(state: Path) -> Path:
 
 
 def _state_directory() -> Path:
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "daqsvc"
+    try:
+        return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "daqsvc"
+    except RuntimeError:
+        raise StoreNotFoundError(
+            f"user {os.geteuid()} has no home directory for the alarm journal: name one with --store, or in "
+            "[store] of the machine file"
+        ) from None

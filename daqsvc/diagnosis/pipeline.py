@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.silence import Patience
+from daqsvc.supervision import Supervisor, over
+from daqsvc.threads import call_in_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import Chunk, SampleRing
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.kernel_threads import Job
     from daqsvc.diagnosis.record import Diagnosis
 
 logger = logging.getLogger(__name__)
@@ -30,6 +32,9 @@ MOST_BLOCKS = 64
 """Blocks in one window at most: a detector that is behind catches up in long strides."""
 
 LOOK_NS = NS_PER_S // 2
+
+HANG_S = 30.0
+"""A window that takes longer to process hangs; its detector is left alone with it, and the others go on."""
 
 
 @dataclass(slots=True)
@@ -52,7 +57,7 @@ class DetectorCounters:
 
 
 class Pipeline:
-    """Runs detectors over rings until the rings are closed.
+    """Runs detectors over rings until the rings are closed; the failure of one is no matter to another.
 
     Args:
         rings: by stream name.
@@ -62,6 +67,7 @@ class Pipeline:
         threads: kernels that may run at a time.
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
         patience: by stream, how long it may be silent; whatever is not named is fast.
+        supervisor: keeps the detectors' tasks going; None for one of its own.
     """
 
     def __init__(
@@ -73,6 +79,7 @@ class Pipeline:
         threads: int = 2,
         settling_ns: Mapping[str, int] | None = None,
         patience: Mapping[str, Patience] | None = None,
+        supervisor: Supervisor | None = None,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
@@ -83,7 +90,10 @@ class Pipeline:
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._report = report
         self._clock = clock
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="kernel")
+        self._supervisor = supervisor or Supervisor()
+        self._threads = threads
+        self._under_way: dict[str, Job[Sequence[Diagnosis]]] = {}
+        """By detector, the window that is being processed: it outlives the task that has begun it."""
 
     @property
     def behind_samples(self) -> int:
@@ -93,40 +103,46 @@ class Pipeline:
     async def warm(self) -> None:
         """Compile every kernel before the first sample comes.
 
-        May be cancelled at any time: compiling cannot be interrupted, but the process need not wait.
+        May be cancelled at any time: compiling cannot be interrupted, but the process need not wait. A
+        detector that fails here will compile when its samples come.
         """
-        loop = asyncio.get_running_loop()
-        warmed: asyncio.Future[None] = loop.create_future()
+        warming = call_in_thread(self._compile_all, name="kernel warming")
+        with self._supervisor.sparing_others("kernel warming", "kernels compile when samples come"):
+            await asyncio.wrap_future(warming)
 
-        def settle(error: Exception | None) -> None:
-            if not warmed.done():
-                warmed.set_result(None) if error is None else warmed.set_exception(error)
-
-        def compile_all() -> None:
-            failure: Exception | None = None
-            try:
-                for detector in self.detectors:
-                    detector.warm()
-            except Exception as error:  # noqa: BLE001 - raised again where it is awaited
-                failure = error
-            # Whoever waited may be gone, and the loop with them.
-            with contextlib.suppress(RuntimeError):
-                loop.call_soon_threadsafe(settle, failure)
-
-        threading.Thread(target=compile_all, name="kernel-warming", daemon=True).start()
-        await warmed
+    def _compile_all(self) -> None:
+        for detector in self.detectors:
+            with self._supervisor.sparing_others(_part(detector), "it compiles when samples come"):
+                detector.warm()
 
     async def run(self) -> None:
-        """Process until every ring is closed and every whole block in it is processed."""
-        listening = asyncio.create_task(self._listen_for_silence(), name="silence")
+        """Process until every ring is closed and every whole block in it is processed.
+
+        Cancelled, it can be called again, and goes on where it was.
+        """
+        kernels = KernelThreads(self._threads, self._kernel_failed)
+        keep = self._supervisor.keep
+        listening = keep("silence", self._listen_for_silence)
+        following = [
+            keep(
+                _part(d),
+                partial(self._follow, d, kernels),
+                may_end=partial(_is_closed, self._rings[d.stream]),
+            )
+            for d in self.detectors
+        ]
         try:
-            async with asyncio.TaskGroup() as group:
-                for detector in self.detectors:
-                    group.create_task(self._follow(detector), name=f"detector {detector.name}")
+            await over(following)
         finally:
-            listening.cancel()
+            for part in (listening, *following):
+                part.stop()
+            kernels.close()
             # A cancelled task may have left a kernel running; nothing is left behind, nor the loop held up.
-            await asyncio.shield(asyncio.to_thread(self._pool.shutdown))
+            await asyncio.shield(asyncio.to_thread(kernels.join))
+            await over([listening, *following])
+
+    def _kernel_failed(self, error: BaseException) -> None:
+        self._supervisor.failed("kernel thread", error, "it goes on")
 
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
@@ -155,32 +171,65 @@ class Pipeline:
                     silence_s = (now_ns - since_ns[name]) / NS_PER_S
                     for detector in self.detectors:
                         if detector.stream == name:
-                            for diagnosis in detector.silent(silence_s, now_ns):
-                                self._report(diagnosis)
+                            self._say_silent(detector, silence_s, now_ns)
 
-    async def _follow(self, detector: Detector) -> None:
-        reader, counters = self._readers[detector.name], self.counters[detector.name]
-        loop = asyncio.get_running_loop()
+    def _say_silent(self, detector: Detector, silence_s: float, now_ns: int) -> None:
+        with self._supervisor.sparing_others(_part(detector), "the other detectors say that nothing comes"):
+            for diagnosis in detector.silent(silence_s, now_ns):
+                self._report(diagnosis)
+
+    async def _follow(self, detector: Detector, kernels: KernelThreads) -> None:
         while True:
-            try:
-                chunk = await reader.take(detector.block, MOST_BLOCKS)
-            except RingClosed:
-                return
-            if missed := chunk.skipped - chunk.lost:
-                counters.samples_skipped += missed
-                logger.warning(
-                    "detector %s was too slow and has missed %d samples of %r from index %d on",
-                    detector.name,
-                    missed,
-                    detector.stream,
-                    chunk.first_index - chunk.skipped,
-                )
-            window = _window(reader.ring, chunk)
-            said = await loop.run_in_executor(self._pool, _process, detector, window, counters)
-            for diagnosis in said:
+            if detector.name not in self._under_way:
+                window = await self._next_window(detector)
+                if window is None:
+                    return
+                work = partial(_process, detector, window, self.counters[detector.name])
+                self._under_way[detector.name] = kernels.submit(work)
+            job = self._under_way[detector.name]
+            await self._until_made(detector, job, kernels)
+            del self._under_way[detector.name]
+            for diagnosis in job.outcome.result():
                 # What lies before a silence that has been told is history: it must not speak after it.
                 if diagnosis.t_ns > self._silent_until_ns[detector.stream]:
-                    self._report(diagnosis)
+                    with self._supervisor.sparing_others(_part(detector), "one statement of it is lost"):
+                        self._report(diagnosis)
+
+    async def _next_window(self, detector: Detector) -> Window | None:
+        """The next samples for a detector; None if no more will come."""
+        reader, counters = self._readers[detector.name], self.counters[detector.name]
+        try:
+            chunk = await reader.take(detector.block, MOST_BLOCKS)
+        except RingClosed:
+            return None
+        if missed := chunk.skipped - chunk.lost:
+            counters.samples_skipped += missed
+            logger.warning(
+                "detector %s was too slow and has missed %d samples of %r from index %d on",
+                detector.name,
+                missed,
+                detector.stream,
+                chunk.first_index - chunk.skipped,
+            )
+        return _window(reader.ring, chunk)
+
+    async def _until_made(
+        self, detector: Detector, job: Job[Sequence[Diagnosis]], kernels: KernelThreads
+    ) -> None:
+        """Wait for a window; one that hangs must not keep its thread from the other detectors."""
+        while not job.outcome.done():
+            await asyncio.wait({job.outcome}, timeout=HANG_S)
+            if not job.outcome.done() and kernels.replace(job):
+                hangs = f"it has computed on one window for {HANG_S:g} s"
+                self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
+
+
+def _part(detector: Detector) -> str:
+    return f"detector {detector.name}"
+
+
+def _is_closed(ring: SampleRing) -> bool:
+    return ring.is_closed
 
 
 def _window(ring: SampleRing, chunk: Chunk) -> Window:

@@ -41,6 +41,9 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 
+LOOK_S = 0.25
+"""How often to look whether the writer of the alarms still lives."""
+
 
 class Outbox:
     """Messages to the broker, durable in the order in which they were appended.
@@ -208,6 +211,24 @@ class Outbox:
     def mark_telemetry_sent(self, number: int) -> None:
         """The broker has taken this message of telemetry: it is deleted, soon."""
         self._telemetry.mark_sent(number)
+
+    async def until_broken(self) -> str:
+        """Wait until the thread that writes the alarms has ended by itself; why, in a sentence."""
+        # A thread that is gone tells nobody.
+        while self._ended is None or self._writer.is_closing or self._writer.is_alive:  # noqa: ASYNC110
+            await asyncio.sleep(LOOK_S)
+        why = self._books.broken or "has stopped: its thread was lost"
+        return f"outbox {self._journal.path} {why}; no alarm can reach the disk any more"
+
+    def close_from_outside(self, timeout_s: float) -> bool:
+        """Like `close`, but from any thread, and of the alarms only: the way out if the event loop hangs.
+
+        Blocks for at most ``timeout_s``; whether the file is closed.
+        """
+        if self._ended is None:
+            return True
+        self._writer.close()
+        return self._writer.join(timeout_s)
 
     async def close(self, timeout_s: float = 1.0) -> None:
         """Write what waits, once, and close the files; takes at most ``timeout_s``."""

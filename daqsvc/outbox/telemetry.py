@@ -29,6 +29,9 @@ log = logging.getLogger(__name__)
 LINGER_S = 0.05
 """How long a message may wait for company on its way to the file."""
 
+RETRY_FIRST_S, RETRY_MOST_S = 0.25, 30.0
+"""Waits before the thread begins again after a failure."""
+
 WAITING_MAX_BYTES = 4 * 1024 * 1024
 """What may wait for the file; beyond that, the oldest is dropped."""
 
@@ -137,18 +140,31 @@ class Telemetry:
             with contextlib.suppress(RuntimeError):
                 loop.call_soon_threadsafe(function, *args)
 
+        retry_s = RETRY_FIRST_S
+        try:
+            while not self._serve(post):
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closing, timeout=retry_s)
+                retry_s = min(2 * retry_s, RETRY_MOST_S)
+        finally:
+            self._closing = True
+            post(_finish, ended, None)
+
+    def _serve(self, post: Callable[..., None]) -> bool:
+        """Work until told to end; False after a failure, which costs what was being written."""
         try:
             self.file.open()
             post(self._settle, self.file.last_number)
             while self._turn(post):
                 pass
         except BaseException:
-            log.exception("telemetry cannot be kept any more; it is dropped until the service starts again")
-            raise
+            self.counters.restarts += 1
+            if self.counters.restarts == 1:
+                log.exception("the thread that keeps telemetry has failed; it begins again")
+            return self._closing
         finally:
-            self._closing = True
             self.file.close()
-            post(_finish, ended, None)
+        return True
 
     def _turn(self, post: Callable[..., None]) -> bool:
         """Do what has come in the meantime; whether to go on."""
@@ -158,7 +174,7 @@ class Telemetry:
             closing = self._closing
             arrived, self._arrived, self._arrived_bytes = self._arrived, deque(), 0
             sent, self._sent = self._sent, []
-            reads, self._reads = self._reads, []
+            reads = list(self._reads)
             overflowed, self._overflowed = self._overflowed, 0
         self.counters.accepted += overflowed
         self.counters.dropped_full += overflowed
@@ -167,6 +183,8 @@ class Telemetry:
             post(self._settle, self.file.last_number)
         for after, limit, answer in reads:
             post(_finish, answer, self.file.pending(after, limit))
+            with self._changed:
+                self._reads.pop(0)
         return not closing
 
     def _is_urgent(self) -> bool:

@@ -36,6 +36,9 @@ CROWD_OVER_S, CROWD = 0.1, 20
 
 RETRY_FIRST_S, RETRY_MOST_S = 0.1, 5.0
 
+IDLE_S = 0.5
+"""How long the thread sleeps at a time when there is nothing to do."""
+
 COMMIT_AT_MOST = 500
 """Messages, and marks, in one transaction, so that the write-ahead log does not grow with the backlog."""
 
@@ -138,6 +141,7 @@ class JournalWriter:
         self._work: queue.SimpleQueue[Batch] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._crowd = Crowd()
+        self._thread: threading.Thread | None = None
 
     def start(self) -> tuple[asyncio.Future[int | None], asyncio.Future[None]]:
         """Start the thread.
@@ -149,10 +153,22 @@ class JournalWriter:
         loop = asyncio.get_running_loop()
         opened: asyncio.Future[int | None] = loop.create_future()
         ended: asyncio.Future[None] = loop.create_future()
-        threading.Thread(
+        self._thread = threading.Thread(
             target=self._run, args=(loop, opened, ended), name="outbox-writer", daemon=True
-        ).start()
+        )
+        self._thread.start()
         return opened, ended
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the end of the thread, at most so long; whether it has ended. Blocks; from any thread."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+        return not self.is_alive
 
     @property
     def is_closing(self) -> bool:
@@ -257,7 +273,7 @@ class JournalWriter:
     def _gather(self, batch: Batch, *, wait: bool) -> None:
         """Add what has arrived; marks alone wait for company for a while."""
         if wait:
-            batch.add(self._work.get())
+            batch.add(self._next())
             if self._crowd.is_there(time.monotonic()) and not batch.reads:
                 self._closing.wait(CROWD_LINGER_S)
         until = time.monotonic() + MARK_LINGER_S
@@ -268,6 +284,13 @@ class JournalWriter:
                 batch.add(self._work.get(timeout=linger_s) if patient else self._work.get_nowait())
             except queue.Empty:
                 return
+
+    def _next(self) -> Batch:
+        # Not one long wait: whatever interrupts a thread does so between two steps, and would take with it
+        # what has just been got.
+        while True:
+            with contextlib.suppress(queue.Empty):
+                return self._work.get(timeout=IDLE_S)
 
     def _perform(self, batch: Batch, post: _Post) -> Failure:
         """Commit, then read, even if the former failed. What is done is taken out of the batch."""

@@ -125,18 +125,24 @@ class Session:
             telling = self._tell_home_assistant(self._home_assistant)
             others.add(asyncio.create_task(telling, name="mqtt-home-assistant"))
         try:
-            await self._until_stopped(deliveries | others)
+            await self._until_stopped(deliveries, others)
             await self._hand_over(deliveries, others, left_s)
         finally:
             for task in deliveries | others:
                 task.cancel()
             await asyncio.gather(*deliveries, *others, return_exceptions=True)
 
-    async def _until_stopped(self, tasks: set[asyncio.Task[Any]]) -> None:
+    async def _until_stopped(
+        self, deliveries: set[asyncio.Task[None]], others: set[asyncio.Task[Any]]
+    ) -> None:
+        tasks: set[asyncio.Task[Any]] = deliveries | others
         while not self._stopping.is_set():
             done, tasks = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
+                if task in deliveries and not self._stopping.is_set():
+                    # With the connection up and nothing going out, nobody would notice.
+                    raise RuntimeError(f"{task.get_name()} has ended by itself")
 
     async def _hand_over(
         self,

@@ -107,12 +107,13 @@ class DemoCommand:
 def _run(arguments: argparse.Namespace) -> int:
     import logging  # noqa: PLC0415
 
-    from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
+    from daqsvc import kernel_cache  # noqa: PLC0415
+    from daqsvc.cli import start_logging  # noqa: PLC0415
 
     start_logging(verbose=False)
     # Every alarm comes back from the broker and is shown; the service's log would say it twice.
     logging.getLogger("daqsvc.alarm_desk").setLevel(logging.ERROR)
-    prepare_kernel_cache()
+    kernel_cache.prepare()
     try:
         import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415

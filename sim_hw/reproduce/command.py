@@ -61,7 +61,8 @@ class ReproduceCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
-        from daqsvc.cli import prepare_kernel_cache, start_logging  # noqa: PLC0415
+        from daqsvc import kernel_cache  # noqa: PLC0415
+        from daqsvc.cli import start_logging  # noqa: PLC0415
 
         start_logging(verbose=False)
         if importlib.util.find_spec("matplotlib") is None:
@@ -69,7 +70,7 @@ class ReproduceCommand:
         out: Path = arguments.out
         if problem := _cannot_write_into(out):
             return _fail(problem)
-        prepare_kernel_cache()
+        kernel_cache.prepare()
         try:
             rows = _reproduce(out, arguments.seed, arguments.snr_db)
         except OSError as error:

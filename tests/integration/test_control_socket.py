@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import json
 import os
 import socket
@@ -196,16 +197,103 @@ async def test_a_client_that_never_reads_its_answers_is_given_up(
         assert server.counters.clients_given_up == 1
 
 
-async def test_more_clients_than_are_served_at_a_time_are_turned_away(tmp_path: Path) -> None:
+async def test_idle_clients_of_a_user_make_way_for_the_next_one(tmp_path: Path) -> None:
     async with serving(tmp_path) as server:
-        many = range(control.MOST_CLIENTS)
-        writers = [(await asyncio.open_unix_connection(server.path))[1] for _ in many]
-        await eventually(lambda: server.counters.clients == control.MOST_CLIENTS, "all of them are in")
+        hanging = [await asyncio.open_unix_connection(server.path) for _ in range(3 * control.MOST_CLIENTS)]
+        for _, writer in hanging:
+            writer.write(b'{"half')
+        assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"], (
+            "there is room for one more"
+        )
+        assert len(server._clients) <= control.MOST_CLIENTS
+        assert server.counters.clients_displaced == 2 * control.MOST_CLIENTS + 1
+        for _, writer in hanging:
+            writer.close()
+
+
+async def test_clients_with_a_request_under_way_do_not_make_way(tmp_path: Path) -> None:
+    desk = Desk()
+    desk.may_answer.clear()
+    async with serving(tmp_path, desk) as server:
+        busy = [await asyncio.open_unix_connection(server.path) for _ in range(control.MOST_CLIENTS)]
+        for _, writer in busy:
+            writer.write(json.dumps(wish()).encode() + b"\n")
+        await eventually(lambda: len(desk.told) == control.MOST_CLIENTS, "all of them have asked")
         reader, writer = await asyncio.open_unix_connection(server.path)
         assert await reader.read() == b""
         assert server.counters.clients_turned_away == 1
-        for each in [*writers, writer]:
+        desk.may_answer.set()
+        for answers, _ in busy:
+            assert json.loads(await answers.readline())["accepted"]
+        for _, each in [*busy, (reader, writer)]:
             each.close()
+
+
+async def test_clients_of_one_user_keep_no_other_user_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk()
+    desk.may_answer.clear()
+    async with serving(tmp_path, desk) as server:
+        monkeypatch.setattr(control, "_peer", lambda _: (NOBODY, 7))
+        busy = [await asyncio.open_unix_connection(server.path) for _ in range(control.MOST_CLIENTS)]
+        for _, writer in busy:
+            writer.write(json.dumps(wish()).encode() + b"\n")
+        await eventually(lambda: len(desk.told) == control.MOST_CLIENTS, "all of them have asked")
+        monkeypatch.setattr(control, "_peer", lambda _: (0, 8))
+        desk.may_answer.set()
+        assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
+        assert desk.told[-1][1] == "local uid 0 pid 8"
+        assert (server.counters.clients_displaced, server.counters.clients_turned_away) == (0, 0)
+        for _, each in busy:
+            each.close()
+
+
+async def test_a_mistake_in_carrying_out_costs_one_connection(tmp_path: Path) -> None:
+    async def fail(_command: AlarmCommand, _source: str) -> CommandOutcome:
+        raise RuntimeError("a mistake")
+
+    server = ControlServer(tmp_path, MACHINE, fail)
+    await server.open()
+    try:
+        reader, writer = await asyncio.open_unix_connection(server.path)
+        writer.write(json.dumps(wish()).encode() + b"\n")
+        assert await reader.read() == b""
+        writer.close()
+        assert server.counters.clients_failed == 1
+        assert (await say(server, b"?\n"))["accepted"] is False, "the next one is served"
+    finally:
+        await server.close()
+
+
+async def test_a_socket_that_is_taken_away_or_cannot_be_made_comes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "LOOK_S", 0.01)
+    (tmp_path / "control.sock").write_text("in the way")
+    server = ControlServer(tmp_path, MACHINE, Desk())
+    serving = asyncio.create_task(server.serve())
+    await asyncio.sleep(0.05)
+    for _ in range(2):
+        (tmp_path / "control.sock").unlink()
+        await eventually(lambda: server.path.exists() and server._inode, "there is a socket")
+        await eventually(lambda: server._server is not None, "somebody listens")
+        assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
+    serving.cancel()
+    await asyncio.wait({serving})
+    assert not server.path.exists()
+
+
+async def test_a_store_that_can_no_longer_be_written_is_one_line_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_path: Path, _inode: int | None) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    async with serving(tmp_path):
+        monkeypatch.setattr(control, "_remove", refuse)
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said.endswith("is left behind, where the next start replaces it: Read-only file system")
 
 
 async def test_nothing_is_left_of_it_and_nobody_is_waited_for_when_it_closes(tmp_path: Path) -> None:

@@ -205,7 +205,7 @@ async def run(arguments: argparse.Namespace) -> None:
     teller.write("started")
     clock.wall_offset_s = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s
     await desk.resume(SENSORS)
-    running = asyncio.create_task(desk.run())
+    running = [asyncio.create_task(each.run()) for each in desk.tellers.values()]
     timekeeper = asyncio.create_task(desk.keep_time())
     await teller.tell(script.steps[untold:])
     while desk.outbox.counters.waiting or desk.outbox.counters.depth:
@@ -214,7 +214,7 @@ async def run(arguments: argparse.Namespace) -> None:
     timekeeper.cancel()
     await desk.settle(timeout_s=2.0)
     await desk.stop(deadline_s=2.0)
-    await running
+    await asyncio.gather(*running)
     await desk.close(timeout_s=2.0)
 
 

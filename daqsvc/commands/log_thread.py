@@ -1,0 +1,90 @@
+"""The log of a service, written by a thread: whoever reads it slowly, or never, holds up nothing else."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import queue
+import threading
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MOST_LINES = 10_000
+"""Lines that may wait to be written; further ones are left out, and counted in the log."""
+
+_GONE = {errno.EIO, errno.EPIPE, errno.ENXIO}
+
+
+class LogThread(logging.Handler):
+    """Writes the log to a file descriptor.
+
+    Args:
+        fd: e.g. 2 for stderr.
+
+    Attributes:
+        on_gone: told, once and on the thread, that nobody reads it any more, and why; None if that is no
+            matter.
+    """
+
+    def __init__(self, fd: int) -> None:
+        super().__init__()
+        self.on_gone: Callable[[str], None] | None = None
+        self._fd = fd
+        self._lines: queue.Queue[str | None] = queue.Queue(MOST_LINES)
+        self._left_out = 0
+        self._writing = threading.Lock()
+        self._thread = threading.Thread(target=self._write_on, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler.emit`; never waits."""
+        try:
+            self._lines.put_nowait(self.format(record))
+        except queue.Full:
+            self._left_out += 1
+        except Exception:  # noqa: BLE001 - of whoever logs what cannot be formatted
+            self.handleError(record)
+        if not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._write_on, name="log", daemon=True)
+            self._thread.start()
+
+    def flush_within(self, timeout_s: float) -> None:
+        """Wait until everything is written, at most so long."""
+        until_s = time.monotonic() + timeout_s
+        while self._lines.unfinished_tasks and time.monotonic() < until_s:
+            time.sleep(0.005)
+
+    def end(self) -> None:
+        """Have the thread end when it has written what waits; another line starts another thread."""
+        self._lines.put(None)
+        self._thread.join()
+
+    def _write_on(self) -> None:
+        while True:
+            line = self._lines.get()
+            try:
+                if line is None:
+                    return
+                self._write(line)
+                if self._left_out:
+                    left_out, self._left_out = self._left_out, 0
+                    self._write(f"{left_out} lines of the log were left out: it is read too slowly")
+            finally:
+                self._lines.task_done()
+
+    def _write(self, line: str) -> None:
+        left = f"{line}\n".encode(errors="backslashreplace")
+        try:
+            while left:
+                left = left[os.write(self._fd, left) :]
+        except BlockingIOError:
+            self._left_out += 1
+            time.sleep(0.05)
+        except OSError as error:
+            if error.errno in _GONE and self.on_gone is not None:
+                gone, self.on_gone = self.on_gone, None
+                gone(f"nobody reads the log any more ({error.strerror})")

@@ -1,0 +1,246 @@
+"""The process around a service: its signals, its terminal, and the way out if something hangs.
+
+A thread hears the signals, so that a stop is obeyed whatever the event loop does, and sees that the loop
+turns and that a stop comes to its end. Time is counted in the thread's own turns: a process that was
+suspended has neither stood still nor stopped late.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+log = logging.getLogger(__name__)
+
+EXIT_HUNG = 4
+"""Something hung while the service stopped."""
+
+EXIT_STUCK = 5
+"""The event loop stood still."""
+
+TURN_S = 0.1
+STOP_TURNS = 17
+"""Turns that a stop may take before it is forced, which leaves `CLOSE_S` of its two seconds."""
+
+CLOSE_S = 0.3
+"""What the journal may take to close at the last moment."""
+
+STUCK_TURNS = 300
+"""Turns that the event loop may stand still."""
+
+SAY_S = 0.2
+"""What the last words may take: whoever reads them may hang, too."""
+
+LINGER_S = 1.0
+"""What threads of others may take to end when all else has."""
+
+
+class ProcessGuard:
+    """Ends the process when it is asked to, in order if possible.
+
+    Use it as a context manager around the event loop, on the main thread.
+
+    Args:
+        flush: waits for the log to be written, at most so many seconds.
+        end: ends the process with an exit code.
+    """
+
+    def __init__(
+        self, flush: Callable[[float], None] = lambda _: None, end: Callable[[int], object] = os._exit
+    ) -> None:
+        self._flush = flush
+        self._end_process = end
+        self._stop: Callable[[], None] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._close: Callable[[float], bool] | None = None
+        self._main = threading.get_ident()
+        self._others = set(threading.enumerate())
+        self._thread = threading.Thread(target=self._watch, name="process guard", daemon=True)
+        self._heard, self._tell = os.pipe()
+        self._turns_stopping: int | None = None
+        self._turns_still: int | None = None
+        self._answered = True
+        self._over = False
+        self._outlives_terminal = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        self._terminals = [fd for fd in (0, 1, 2) if _is_terminal(fd)]
+
+    def __enter__(self) -> Self:
+        os.set_blocking(self._tell, False)
+        self._wakeup_before = signal.set_wakeup_fd(self._tell, warn_on_full_buffer=False)
+        self._before = {
+            number: signal.signal(number, self._signalled) for number in (signal.SIGTERM, signal.SIGINT)
+        }
+        if not self._outlives_terminal:
+            # Only that there is a handler: the thread hears it.
+            self._before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: None)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over = True
+        with contextlib.suppress(OSError):
+            os.write(self._tell, b"\0")
+        self._thread.join()
+        signal.set_wakeup_fd(self._wakeup_before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        os.close(self._heard)
+        os.close(self._tell)
+        lingering = [
+            thread for thread in threading.enumerate() if not thread.daemon and thread not in self._others
+        ]
+        if lingering:
+            threading.Thread(target=self._end_soon, args=(lingering,), daemon=True).start()
+
+    def stop_by(self, loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:
+        """Say how the service is asked to stop; called on its event loop."""
+        self._stop, self._loop = stop, loop
+        if self._turns_stopping is not None:
+            stop()
+
+    def protect(self, close: Callable[[float], bool]) -> None:
+        """Say what must be done before the process may be ended by force.
+
+        Args:
+            close: blocks for at most so many seconds, on any thread; whether all is on disk.
+        """
+        self._close = close
+
+    def expect_turns(self) -> None:
+        """From now on the event loop turns; one that stands still is ended."""
+        self._turns_still = 0
+
+    def stopping(self) -> None:
+        """The service has begun to stop, for whatever reason; from any thread."""
+        if self._turns_stopping is None:
+            self._turns_stopping = 0
+
+    def lose_terminal(self, reason: str) -> None:
+        """Stop because whoever watched the process is gone; from any thread."""
+        if not self._outlives_terminal:
+            self._ask_to_stop(f"{reason}; the service stops")
+
+    # On the thread.
+
+    def _watch(self) -> None:
+        while not self._over:
+            try:
+                self._turn()
+            except BaseException:
+                log.exception("the guard of the process has failed; it goes on")
+
+    def _turn(self) -> None:
+        heard, _, _ = select.select([self._heard], [], [], TURN_S)
+        if heard:
+            for number in os.read(self._heard, 64):
+                self._hear(number)
+            return
+        if self._turns_stopping is not None:
+            self._turns_stopping += 1
+            if self._turns_stopping > STOP_TURNS:
+                self._end(EXIT_HUNG, f"the service did not stop in time and is ended: {self._what_hangs()}")
+        elif self._turns_still is not None and self._loop is not None:
+            self._see_whether_loop_turns(self._loop)
+
+    def _see_whether_loop_turns(self, loop: asyncio.AbstractEventLoop) -> None:
+        if self._answered:
+            self._answered, self._turns_still = False, 0
+            with contextlib.suppress(RuntimeError):  # it is closed already
+                loop.call_soon_threadsafe(self._answer)
+            return
+        self._turns_still = (self._turns_still or 0) + 1
+        if self._turns_still > STUCK_TURNS:
+            still_s = STUCK_TURNS * TURN_S
+            self._end(
+                EXIT_STUCK, f"the event loop has stood still for {still_s:g} s: {self._where_loop_is()}"
+            )
+
+    def _answer(self) -> None:
+        self._answered = True
+
+    def _signalled(self, number: int, _frame: object) -> None:
+        """On the main thread, as soon as that gets round to it: should the thread have missed it."""
+        self._hear(number)
+
+    def _hear(self, number: int) -> None:
+        if number in {signal.SIGTERM, signal.SIGINT}:
+            self._ask_to_stop("")
+        elif number == signal.SIGHUP:
+            if any(_is_gone(fd) for fd in self._terminals):
+                self.lose_terminal("the terminal is gone")
+            else:
+                log.warning(
+                    "SIGHUP is ignored: the machine file is read at the start only; restart the service to "
+                    "have it read again"
+                )
+
+    def _ask_to_stop(self, why: str) -> None:
+        if self._turns_stopping is not None:
+            return
+        if why:
+            log.warning("%s", why)
+        self.stopping()
+        if self._loop is None or self._stop is None:
+            # Nothing is open yet that would have to be closed.
+            self._flush(SAY_S)
+            self._end_process(0)
+            return
+        with contextlib.suppress(RuntimeError):  # it is closed already
+            self._loop.call_soon_threadsafe(self._stop)
+
+    def _end(self, code: int, sentence: str) -> None:
+        closed = self._close is None or self._close(CLOSE_S)
+        journal = "" if closed else "; the journal could not be closed"
+        # The log's lock may be held by what hangs.
+        saying = threading.Thread(target=log.critical, args=("%s%s", sentence, journal), daemon=True)
+        saying.start()
+        saying.join(SAY_S)
+        self._flush(SAY_S)
+        self._over = True
+        self._end_process(code)
+
+    def _what_hangs(self) -> str:
+        threads = [t.name for t in threading.enumerate() if not t.daemon and t not in self._others]
+        hanging = f"threads {', '.join(threads)}; " if threads else ""
+        return f"{hanging}{self._where_loop_is()}"
+
+    def _where_loop_is(self) -> str:
+        frame = sys._current_frames().get(self._main)  # noqa: SLF001 - there is no other way to look
+        stack = traceback.extract_stack(frame)[-3:]
+        steps = [f"{step.name} ({Path(step.filename).name}:{step.lineno})" for step in reversed(stack)]
+        return f"the event loop is in {', called from '.join(steps)}"
+
+    def _end_soon(self, lingering: list[threading.Thread]) -> None:
+        for thread in lingering:
+            thread.join(LINGER_S / len(lingering))
+        left = [thread.name for thread in lingering if thread.is_alive()]
+        if left:
+            log.critical("threads %s do not end; the process is ended", ", ".join(left))
+            self._flush(SAY_S)
+            self._end_process(EXIT_HUNG)
+
+
+def _is_terminal(fd: int) -> bool:
+    try:
+        return os.isatty(fd)
+    except OSError:
+        return False
+
+
+def _is_gone(fd: int) -> bool:
+    """Whether a terminal has hung up."""
+    poll = select.poll()
+    poll.register(fd, 0)  # hang-ups are always told
+    return any(event & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0))

@@ -1,0 +1,127 @@
+"""Where compiled kernels are kept: chosen here, before any is imported, so that every account has a place.
+
+Numba by itself looks beside the sources and below the home directory, and raises where it can write neither.
+What is kept is code that later starts run, so a place counts only if nobody else may write there.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+log = logging.getLogger(__name__)
+
+VARIABLE = "NUMBA_CACHE_DIR"
+REMEDY = f"set {VARIABLE} to a directory that the service can write"
+
+
+class _UnusableError(Exception):
+    """A place cannot be used; says why."""
+
+
+def prepare(*, say: bool = True) -> None:
+    """Choose the directory; call before any kernel is imported.
+
+    It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else the user's cache directory (XDG);
+    else one in the folder for temporary files that only this user may enter. If none of these can be
+    written, kernels are compiled at every start. Both of the latter are said.
+
+    Args:
+        say: False in a process whose parent has said it.
+    """
+    reasons: list[str] = []
+    for place in _places(reasons):
+        try:
+            _make(place)
+            if os.environ.get(VARIABLE) != str(place):
+                _check_safe(place)
+        except _UnusableError as error:
+            reasons.append(f"{error}")
+            continue
+        os.environ[VARIABLE] = str(place)
+        return
+    try:
+        temporary = _temporary()
+    except _UnusableError as error:
+        reasons.append(f"{error}")
+        _compile_at_every_start()
+        told = "compiled kernels cannot be kept, and every start compiles them"
+    else:
+        os.environ[VARIABLE] = str(temporary)
+        told = f"compiled kernels are kept in {temporary}, where they may be deleted"
+    if say:
+        log.warning("%s: %s; %s", told, ", and ".join(reasons), REMEDY)
+
+
+def _places(reasons: list[str]) -> Iterator[Path]:
+    """What may be asked for, in order of preference; notes what is not even a place."""
+    if asked := os.environ.get(VARIABLE):
+        yield Path(asked)
+    if given := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
+        yield Path(given) / "kernels"
+        return
+    try:
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "daqsvc" / "kernels"
+    except RuntimeError:
+        reasons.append(f"user {os.geteuid()} has no home directory")
+
+
+def _temporary() -> Path:
+    """A directory for this user alone in the folder for temporary files.
+
+    Raises:
+        _UnusableError: there is none that can be written, or somebody else has made one of that name.
+    """
+    try:
+        place = Path(tempfile.gettempdir()) / f"daqsvc-kernels-{os.geteuid()}"
+    except FileNotFoundError:
+        raise _UnusableError("no folder for temporary files can be written") from None
+    _make(place, 0o700)
+    _check_safe(place)
+    return place
+
+
+def _make(place: Path, mode: int = 0o755) -> None:
+    """See that a directory is there and takes files.
+
+    Raises:
+        _UnusableError: it is not, or does not.
+    """
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.mkdir(mode, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=place) as probe:
+            probe.write(bytes(4096))
+    except OSError as error:
+        raise _UnusableError(f"{place} cannot be written ({error.strerror or error})") from None
+
+
+def _check_safe(place: Path) -> None:
+    """See that nobody else may put something in a directory, or another one in its place.
+
+    Raises:
+        _UnusableError: somebody may.
+    """
+    status = place.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o022:
+        raise _UnusableError(f"{place} can be written by others")
+    for above in place.resolve().parents:
+        status = above.stat()
+        shared = status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX
+        if status.st_uid not in {0, os.geteuid()} or shared:
+            raise _UnusableError(f"{place} can be replaced by others, who can write {above}")
+
+
+def _compile_at_every_start() -> None:
+    """Have Numba keep nothing: it has no setting for that, and raises where it finds no place."""
+    from numba.core.dispatcher import Dispatcher  # noqa: PLC0415 - heavy, and seldom needed
+
+    dispatcher: Any = Dispatcher
+    dispatcher.enable_caching = lambda _self: None

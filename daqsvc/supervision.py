@@ -1,0 +1,259 @@
+"""Supervision: no part of the service ends another; what ends is said, counted and started again.
+
+A part is a task of the event loop under a name. It is watched by a callback and not by another task, so
+nothing that ends a task ends its supervision. ``docs/architecture.md`` has who restarts what.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.supervisor import Backoff
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
+
+    Work = Callable[[], Coroutine[Any, Any, None]]
+
+logger = logging.getLogger(__name__)
+
+WELL_S = 60.0
+"""A part that has run for so long has earned a quick restart."""
+
+SAY_AGAIN_S = 3600.0
+"""The same failure of the same part is said again after so long."""
+
+OTHERS = "event loop"
+"""The name under which failures of callbacks, and of tasks that nobody waits for, are counted."""
+
+_HERE = Path(__file__).parent.parent
+
+
+class EssentialLostError(Exception):
+    """Something without which the service is useless is gone for good; the text says what, and why."""
+
+
+class Supervisor:
+    """Keeps parts going, and the count of what went wrong with them.
+
+    Attributes:
+        failures: by part, how often it has failed; for threads to add to as well, by `failed`.
+    """
+
+    def __init__(self) -> None:
+        self.failures: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._said_s: dict[tuple[str, str], float] = {}
+        self._lost: asyncio.Future[None] | None = None
+
+    def keep(
+        self,
+        name: str,
+        work: Work,
+        *,
+        may_end: Callable[[], bool] = lambda: False,
+        fatal: tuple[type[Exception], ...] = (),
+    ) -> Part:
+        """Run a part, and start it again, with growing waits, whenever it ends without being told to.
+
+        Args:
+            name: of the part, in words, e.g. ``"driver can0"``.
+            work: makes the coroutine; once for each start.
+            may_end: asked when it returns: whether that is its proper end.
+            fatal: exceptions that end the service if they come out of its first start.
+        """
+        part = Part(self, name, work, may_end, fatal)
+        part.start()
+        return part
+
+    def failed(self, name: str, error: BaseException | str, then: str) -> None:
+        """Count a failure, and say it in one line, but the same one once an hour only; from any thread.
+
+        Args:
+            name: whose.
+            error: what it was; an exception's traceback is logged as well, for who logs what goes well, too.
+            then: what is done about it, e.g. ``"it is started again"``.
+        """
+        what = error if isinstance(error, str) else _in_words(error)
+        with self._lock:
+            self.failures[name] += 1
+            count = self.failures[name]
+            now_s = time.monotonic()
+            said_s = self._said_s.get((name, what))
+            if said_s is not None and now_s - said_s < SAY_AGAIN_S:
+                return
+            self._said_s[name, what] = now_s
+        times = "" if count == 1 else f" (failure {count} of it)"
+        logger.error("%s: %s; %s%s", name, what, then, times)
+        if isinstance(error, BaseException):
+            logger.info("traceback of that failure", exc_info=error)
+
+    @contextlib.contextmanager
+    def sparing_others(self, name: str, then: str) -> Iterator[None]:
+        """Let no exception out of a piece of work, on which others depend that have nothing to do with it."""
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 - said and counted there
+            self.failed(name, error, then)
+
+    @property
+    def lost(self) -> asyncio.Future[None]:
+        """What becomes the exception with which the service must end; else it stays undone."""
+        if self._lost is None:
+            self._lost = asyncio.get_running_loop().create_future()
+            # Looked at, so that a loss that comes while the service ends is not reported as unseen.
+            self._lost.add_done_callback(lambda lost: lost.cancelled() or lost.exception())
+        return self._lost
+
+    def give_up(self, error: Exception) -> None:
+        """Have the service end; on the event loop."""
+        if not self.lost.done():
+            self.lost.set_exception(error)
+
+    @contextlib.contextmanager
+    def hearing(self) -> Iterator[None]:
+        """Count and say what fails in callbacks, in tasks that nobody waits for, and in bare threads."""
+        loop = asyncio.get_running_loop()
+        loop_before, threads_before = loop.get_exception_handler(), threading.excepthook
+        loop.set_exception_handler(self._hear_loop)
+        threading.excepthook = self._hear_thread
+        try:
+            yield
+        finally:
+            threading.excepthook = threads_before
+            loop.set_exception_handler(loop_before)
+
+    def _hear_loop(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error, message = context.get("exception"), context.get("message", "something failed")
+        told = message if error is None else f"{message}: {_in_words(error)}"
+        self.failed(OTHERS, told, "the rest goes on")
+        if error is not None:
+            logger.info("traceback of that failure", exc_info=error)
+
+    def _hear_thread(self, failure: threading.ExceptHookArgs) -> None:
+        name = "thread" if failure.thread is None else f"thread {failure.thread.name}"
+        self.failed(name, failure.exc_value or failure.exc_type.__name__, "it has ended")
+
+
+class Part:
+    """A task that is started again; see `Supervisor.keep`.
+
+    Attributes:
+        name: of the part.
+        over: done when it has ended for good.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        name: str,
+        work: Work,
+        may_end: Callable[[], bool],
+        fatal: tuple[type[Exception], ...],
+    ) -> None:
+        self.name = name
+        self._loop = asyncio.get_running_loop()
+        self.over: asyncio.Future[None] = self._loop.create_future()
+        self._supervisor = supervisor
+        self._work = work
+        self._may_end = may_end
+        self._fatal = fatal
+        self._backoff = Backoff()
+        self._task: asyncio.Task[None] | None = None
+        self._waiting: asyncio.TimerHandle | None = None
+        self._started_s = 0.0
+        self._stopping = False
+
+    def start(self) -> None:
+        """Start the task."""
+        self._started_s = self._loop.time()
+        self._waiting = None
+        self._task = self._loop.create_task(self._run(), name=self.name)
+        self._task.add_done_callback(self._ended)
+
+    def stop(self) -> None:
+        """Cancel the task and do not start it again."""
+        self._stopping = True
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._finish()
+        elif self._task is not None:
+            self._task.cancel()
+
+    def leave(self) -> None:
+        """Do not start the task again when it ends."""
+        self._stopping = True
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._finish()
+
+    async def _run(self) -> None:
+        # Here, so that a call that fails before there is a coroutine is a failure of the part, too.
+        await self._work()
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._task = None
+        error = None if task.cancelled() else task.exception()
+        if self._stopping:
+            if error is not None:
+                self._supervisor.failed(self.name, error, "the service is stopping anyway")
+            self._finish()
+        elif isinstance(error, self._fatal):
+            self._supervisor.give_up(error)
+            self._finish()
+        elif not task.cancelled() and error is None and self._may_end():
+            self._finish()
+        else:
+            what = "it was cancelled" if task.cancelled() else error or "it has ended by itself"
+            self._supervisor.failed(self.name, what, "it is started again")
+            self._start_again()
+
+    def _start_again(self) -> None:
+        self._fatal = ()
+        if self._loop.time() - self._started_s > WELL_S:
+            self._backoff.reset()
+        self._waiting = self._loop.call_later(self._backoff.next_ns() / NS_PER_S, self.start)
+
+    def _finish(self) -> None:
+        if not self.over.done():
+            self.over.set_result(None)
+
+
+async def stop_all(parts: Iterable[Part], patience_s: float) -> None:
+    """Stop parts, and wait for their end at most so long; say which ones hang."""
+    parts = list(parts)
+    for part in parts:
+        part.stop()
+    await over(parts, patience_s)
+    for part in parts:
+        if not part.over.done():
+            logger.error("%s does not stop within %g s and is left behind", part.name, patience_s)
+
+
+async def over(parts: Iterable[Part], patience_s: float | None = None) -> None:
+    """Wait until parts have ended for good, at most so long."""
+    waited_for = {part.over for part in parts}
+    if waited_for:
+        await asyncio.wait(waited_for, timeout=patience_s)
+
+
+def _in_words(error: BaseException) -> str:
+    """An exception in one line, with the line of this program that it came through last."""
+    said = next(iter(f"{error}".splitlines()), "")
+    kind = type(error).__name__
+    what = f"{kind}: {said}" if said else kind
+    trace, place = error.__traceback__, ""
+    while trace is not None:
+        path = Path(trace.tb_frame.f_code.co_filename)
+        if path.is_relative_to(_HERE) and path.name != "supervision.py":
+            place = f" at {path.relative_to(_HERE)}:{trace.tb_lineno}"
+        trace = trace.tb_next
+    return f"failed with {what}{place}"
