@@ -18,7 +18,7 @@ from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.publish.connection import Connection, Will
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
-from daqsvc.publish.errors import MqttError, NoConsentError
+from daqsvc.publish.errors import MqttError
 from daqsvc.publish.faults import Faults
 from daqsvc.publish.outage import Outage
 from daqsvc.publish.sparkplug.memory import Memory
@@ -32,6 +32,7 @@ from daqsvc.publish.sparkplug.metrics import (
 )
 from daqsvc.publish.sparkplug.node import EdgeNode
 from daqsvc.publish.sparkplug.session import EdgeSession, HostAwayError, SparkplugCounters
+from daqsvc.publish.spoken import Spoken
 from daqsvc.publish.stopping import unless
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ log = logging.getLogger(__name__)
 
 FIRST_RETRY_NS = 800_000_000
 GOODBYE_S = 0.3
-_UNSUPPORTED_PROTOCOL_VERSION = 132
 
 
 class SparkplugEdge:
@@ -90,7 +90,10 @@ class SparkplugEdge:
         self._there = True
         self._server = 0
         self._backoff = Backoff(FIRST_RETRY_NS)
-        self._older = mqtt.protocol == "3.1.1"
+        self._spoken = {
+            server: Spoken(outbox.directory, server.host, server.port, mqtt.protocol, clock.wall_ns)
+            for server in settings.servers
+        }
         self._outage = Outage(log)
         self._faults = Faults()
         self._stopping = asyncio.Event()
@@ -134,7 +137,7 @@ class SparkplugEdge:
         try:
             made = await unless(self._stopping, self._connect(server))
         except (MqttError, OSError, ValueError) as error:
-            if self._falls_back(error):
+            if self._spoken[server].falls_back(error):
                 return
             self._report_outage(server, error)
             self._walk()
@@ -164,6 +167,8 @@ class SparkplugEdge:
 
     async def _connect(self, server: Server) -> tuple[Connection, EdgeSession]:
         """A connection whose last will is the node's death."""
+        spoken = self._spoken[server]
+        await asyncio.to_thread(spoken.recall)
         mqtt = replace(self._mqtt, host=server.host, port=server.port, tls=server.tls)
         credentials = await asyncio.to_thread(read_credentials, mqtt)
         death = self.node.will(self._memory.bd_seq, self._clock.wall_ns() // NS_PER_MS)
@@ -171,7 +176,7 @@ class SparkplugEdge:
             server.host,
             server.port,
             in_flight=IN_FLIGHT,
-            mqtt5=not self._older,
+            mqtt5=spoken.mqtt5,
             identifier=self._settings.client_id,
             username=mqtt.username,
             password=credentials.password,
@@ -180,7 +185,8 @@ class SparkplugEdge:
             will=Will(death.topic, death.payload, qos=death.qos, retain=False),
         )
         try:
-            await connection.open()
+            await connection.open(spoken.consent_s)
+            await asyncio.to_thread(spoken.agreed)
             bd_seq = self._memory.bd_seq
             newest = max((message.sequence for message in await self._outbox.latest()), default=0)
             # Only now: a connection that failed has used no number up.
@@ -211,15 +217,6 @@ class SparkplugEdge:
 
     async def _wait(self) -> None:
         await unless(self._stopping, asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
-
-    def _falls_back(self, error: Exception) -> bool:
-        """Take MQTT 3.1.1 from now on if the broker seems to know no other."""
-        code = getattr(getattr(error, "rc", None), "value", None)
-        refused = isinstance(error, NoConsentError) or code == _UNSUPPORTED_PROTOCOL_VERSION
-        if self._older or self._mqtt.protocol != "auto" or not refused:
-            return False
-        self._older = True
-        return True
 
     def _report_outage(self, server: Server, error: Exception) -> None:
         broker = f"Sparkplug broker {server.host}:{server.port}"
