@@ -115,7 +115,9 @@ class PlainLayout(Section):
         "values from 0xfb.. on are no measurements",
     )
     length: Annotated[
-        int, AfterValidator(_payload_length), Field(description="payload length in bytes", examples=[64])
+        int,
+        Field(ge=0, le=64, description="payload length in bytes", examples=[64]),
+        AfterValidator(_payload_length),
     ]
     byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
     counter: (

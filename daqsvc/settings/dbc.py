@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,13 @@ if TYPE_CHECKING:
 
 MOST_DBC_BYTES = 4 << 20
 """A larger DBC file describes more messages than a car has; reading it takes minutes."""
+
+
+# Start, length or page of a signal, or length of a message, of which the parser would make a list each.
+_ENDLESS = re.compile(
+    r"\bSG_\s[^:@]{0,200}:[^@(]{0,60}?\d{6}|\bBO_\s[^:]{0,200}:\s{0,20}\d{6}|\d\s{0,9}-\s{0,9}\d{6}"
+)
+_STRING = re.compile(r'"[^"]*"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,15 +108,32 @@ def _database(file: Path, at: KeyPath) -> Database | Finding:
                 "correct the path; a relative one starts at the directory of the machine file",
             )
         return Finding(here, f"{file} {error}", remedy)
-    again = "open it in the tool it came from and export it as DBC again"
+    text = data.decode("cp1252", "replace")
     try:
-        database = load_string(data.decode("cp1252", "replace"), "dbc")
+        _see_sizes(text)
+        database = load_string(text, "dbc")
     except Exception as error:  # noqa: BLE001 - the parser raises what it likes: of lookups, numbers, recursion
         reason = shortened(" ".join(str(error).split()) or type(error).__name__, 200)
-        return Finding(here, f"{file} cannot be read as a DBC file: {reason}", again)
+        return Finding(
+            here,
+            f"{file} cannot be read as a DBC file: {reason}",
+            "open it in the tool it came from and export it as DBC again",
+        )
     if not isinstance(database, can.Database):
-        return Finding(here, f"{file} describes no CAN messages", again)
+        return Finding(here, f"{file} describes no CAN messages", "give another DBC file")
     return database
+
+
+def _see_sizes(text: str) -> None:
+    """See that the parser will come to an end.
+
+    Raises:
+        ValueError: it would make lists of what has no end.
+    """
+    plain = _STRING.sub(lambda found: "\n" * found[0].count("\n"), text)
+    if (found := _ENDLESS.search(plain)) is not None:
+        line = plain.count("\n", 0, found.start()) + 1
+        raise ValueError(f"line {line} has a number of bits, bytes or pages that no message has")
 
 
 def _range(signal: Signal) -> tuple[float, float]:

@@ -18,12 +18,14 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.alarms import DiagnosisAlarm
     from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.pipeline import RotorBank
     from daqsvc.settings.problems import KeyPath
     from daqsvc.settings.rotor import RotorSynchronous
 
 _BANK: KeyPath = ("pipeline", "rotor_bank")
 _SYNCHRONOUS: KeyPath = ("pipeline", "rotor_synchronous")
-_LEAST_PROBE_ANGLE_DEG = {ROTOR_BANK: 10.0, ROTOR_SYNCHRONOUS: 30.0}
+_LEAST_PROBE_ANGLE_DEG = {ROTOR_BANK: 30.0, ROTOR_SYNCHRONOUS: 30.0}
+_LEAST_FOR_PULSES = 4.0
 _LEAST_SAMPLES_PER_REV = 12.0
 """Mean, 1X and 2X both ways are five complex figures; the rest is left for the noise."""
 
@@ -40,6 +42,7 @@ def rotor_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
             yield _modelled(draft)
             yield _sensors(draft, _BANK, bank.probes, bank.keyphasor)
             yield _geometry(draft, _BANK, bank.probes, _LEAST_PROBE_ANGLE_DEG[ROTOR_BANK])
+            yield _pulses(draft, bank)
             yield from mode_checks(draft, bank)
     with suppress(UnusableValueError):
         if (synchronous := draft.pipeline.rotor_synchronous) is not None:
@@ -194,6 +197,22 @@ def _speed_source(synchronous: RotorSynchronous) -> Iterator[Finding]:
             f'is not looked at: the shaft angle comes from speed_source = "{synchronous.reference}"',
             'write speed_source = "keyphasor", or remove it',
             fatal=False,
+        )
+
+
+def _pulses(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
+    """A revolution has enough samples for the keyphasor's pulse."""
+    keyphasor = _named(draft).get(bank.keyphasor)
+    if keyphasor is None or keyphasor.stream not in draft.streams:
+        return
+    rate_hz, speed_rpm = draft.streams[keyphasor.stream].rate_hz, abs(draft.machine.speed_rpm)
+    samples = 60.0 * rate_hz / speed_rpm
+    if samples < _LEAST_FOR_PULSES:
+        yield Finding(
+            (*_BANK, "keyphasor"),
+            f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
+            f"need {_LEAST_FOR_PULSES:g}",
+            f"sample at {_LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
         )
 
 
