@@ -12,13 +12,16 @@ import socket
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import paho.mqtt.client as paho
 import pytest
 from brokers import Consumer, eventually
+from live_service import play, running
 from mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
 from mqtt_publishing import publishing
 from rogue_broker import CONSENT, RogueBroker
 from sparkplug_edge import Machine, edge_node
+from test_mqtt_schemas import rig
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
 from daqsvc.publish.connection import OWED, Connection
@@ -44,7 +47,7 @@ def resident_mib():
 
 
 @contextlib.contextmanager
-def nothing_but_counters_move(caplog):
+def nothing_but_counters_move(caplog, most_growth_mib=MOST_GROWTH_MIB):
     """No traceback, no complaint of the event loop, no memory that grows without end."""
     caplog.set_level(logging.INFO)
     complaints = []
@@ -57,7 +60,7 @@ def nothing_but_counters_move(caplog):
     said = [r.getMessage() for r in caplog.records if r.name == "asyncio"]
     assert set(said) <= {"socket.send() raised exception."}, "which is the rogue's own"
     assert max((len(r.getMessage()) for r in caplog.records), default=0) < 2000
-    assert resident_mib() - before_mib < MOST_GROWTH_MIB
+    assert resident_mib() - before_mib < most_growth_mib
 
 
 @contextlib.asynccontextmanager
@@ -342,3 +345,17 @@ async def test_nothing_is_read_while_too_many_acknowledgements_wait():
     finally:
         made.abandon()
         far.close()
+
+
+async def test_a_rogue_broker_ends_no_acquisition(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    with nothing_but_counters_move(caplog, most_growth_mib=400):  # compiled kernels among them
+        async with RogueBroker(11, 300) as broker, running(rig(broker.port), tmp_path / "store") as service:
+            service.publisher._backoff.next_ns = lambda: 1_000_000
+            await play(service, np.zeros((1280, 3)), 640.0)
+            await eventually(lambda: not broker.left, "it has sent what it wanted")
+            streams = service.figures()["streams"]
+            assert streams["shaft"]["samples_received"] > 1200
+            assert streams["shaft"]["samples_lost"] == 0
+            assert service.figures()["mqtt"]["faults"] == 0
+            assert broker.connections > 1
