@@ -228,7 +228,7 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
         )
         await desk.open()
         await desk.resume({})
-        return desk, asyncio.create_task(desk.run())
+        return desk, asyncio.create_task(desk.publisher.run())
 
     async def closed(desk, running):
         await desk.settle(2.0)
