@@ -125,7 +125,7 @@ class AlarmDesk:
         self.sparkplug = (
             None
             if mqtt is None or sparkplug is None
-            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock)
+            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.obey)
         )
         self._clock = clock
         self._conditions = conditions(mqtt, buses or {})

@@ -189,5 +189,9 @@ class Host:
         told = json.dumps({"online": online, "timestamp": timestamp})
         self._client.publish(f"spBv1.0/STATE/{self._host_id}", told, 1, retain=True).wait_for_publish(5.0)
 
+    def say_word(self, word: str) -> None:
+        """Its state as of Sparkplug 2.2."""
+        self._client.publish(f"STATE/{self._host_id}", word, 1, retain=True).wait_for_publish(5.0)
+
     def ask(self, topic: str, payload: bytes) -> None:
         self._client.publish(topic, payload, 0, properties=Properties(3)).wait_for_publish(5.0)

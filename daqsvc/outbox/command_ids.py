@@ -8,6 +8,7 @@ is needed.
 from __future__ import annotations
 
 import os
+import threading
 import zlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Literal
@@ -27,7 +28,7 @@ _READ_AT_MOST = 4 * 1024 * 1024
 class CommandIds:
     """The ids of the commands that have come, and until when each could still be obeyed.
 
-    Not thread-safe: one caller at a time.
+    Thread-safe: commands may come by several ways at a time.
 
     Args:
         path: the file; its directory is there.
@@ -37,6 +38,7 @@ class CommandIds:
         self._path = path
         self._until_ns: OrderedDict[tuple[str, str], int] = OrderedDict()
         self._lines: int | None = None
+        self._one_at_a_time = threading.Lock()
 
     def remember(
         self, machine: str, identifier: str, *, until_ns: int, now_ns: int
@@ -55,6 +57,12 @@ class CommandIds:
         Raises:
             OSError: the file cannot be read or written; the id is not taken in.
         """
+        with self._one_at_a_time:
+            return self._remember(machine, identifier, until_ns, now_ns)
+
+    def _remember(
+        self, machine: str, identifier: str, until_ns: int, now_ns: int
+    ) -> Literal["new", "known", "full"]:
         if self._lines is None:
             self._read()
         key = machine, identifier

@@ -18,6 +18,8 @@ from sparkplug_edge import (
 )
 from sparkplug_host import Host
 
+from daqsvc.publish.sparkplug import session
+
 pytestmark = pytest.mark.mosquitto
 
 
@@ -109,6 +111,45 @@ async def test_tck_id_message_flow_edge_node_birth_publish_phid_wait(mosquitto, 
             assert not host.messages
             host.say_state(online=True, timestamp=1001)
             await born(host)
+
+
+async def test_a_host_of_sparkplug_2_2_is_waited_for_and_followed(mosquitto, outbox, tmp_path) -> None:
+    async with Host(mosquitto.port) as host:
+        host.say_word("OFFLINE")
+        async with edge_node(outbox, tmp_path, mosquitto.port, primary_host="scada") as edge:
+            await eventually(lambda: "STATE/scada (QoS 1)" in mosquitto.log_text, "the node listens")
+            host.say_word("on line")
+            await eventually(lambda: edge.counters.states_refused == 1, "the word is none")
+            assert not host.messages
+            host.say_word("ONLINE")
+            await born(host)
+            host.say_word("OFFLINE")
+            await eventually(lambda: host.of("NDEATH"), "the node dies")
+            host.say_word("ONLINE")
+            await born(host, 2)
+
+
+async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
+    mosquitto, outbox, tmp_path, monkeypatch, caplog
+) -> None:
+    monkeypatch.setattr(session, "HOST_SAID_S", 0.3)
+    monkeypatch.setattr(session, "LOOK_S", 0.3)
+    async with Host(mosquitto.port, "scada-1") as host, Host(mosquitto.port, "old") as old:
+        host.say_state(online=True, timestamp=1000)
+        old.say_word("ONLINE")
+        async with edge_node(outbox, tmp_path, mosquitto.port, primary_host="scada1") as edge:
+            await eventually(lambda: "hosts at this broker are" in caplog.text, "it is said")
+            assert edge.counters.waiting_for_host
+            assert "primary host scada1 has told no state that can be read" in caplog.text
+            assert "on spBv1.0/STATE/scada1 or STATE/scada1;" in caplog.text
+            assert "hosts at this broker are 'old', 'scada-1'" in caplog.text
+            await eventually(lambda: "UNSUBACK" in mosquitto.log_text, "others are listened to no longer")
+            assert not host.messages
+            async with Host(mosquitto.port, "scada1") as wanted:
+                wanted.say_state(online=True, timestamp=1)
+                await born(host)
+            assert not edge.counters.waiting_for_host
+    assert caplog.text.count("Sparkplug tells nothing yet") == 1
 
 
 async def test_tck_id_operational_behavior_edge_node_termination_host_offline(

@@ -107,7 +107,9 @@ def test_a_host_stands_as_its_newest_word_says(words) -> None:
     host = PrimaryHost("scada")
     newest, online = -1, None
     for sent, is_online in words:
-        taken = host.take(f'{{"online": {str(is_online).lower()}, "timestamp": {sent}}}'.encode())
+        taken = host.take(
+            host.topics[0], f'{{"online": {str(is_online).lower()}, "timestamp": {sent}}}'.encode()
+        )
         assert taken == (sent >= newest)
         if taken:
             newest, online = sent, is_online
@@ -131,10 +133,25 @@ def test_a_host_stands_as_its_newest_word_says(words) -> None:
 )
 def test_what_is_no_state_is_refused_and_changes_nothing(payload: bytes) -> None:
     host = PrimaryHost("scada")
-    host.take(b'{"online": true, "timestamp": 5}')
+    host.take(host.topics[0], b'{"online": true, "timestamp": 5}')
     with pytest.raises(PayloadError, match="scada"):
-        host.take(payload)
+        host.take(host.topics[0], payload)
     assert host.online is True
+
+
+def test_a_host_of_sparkplug_2_2_says_its_state_in_one_word() -> None:
+    host = PrimaryHost("scada")
+    assert host.topics == ("spBv1.0/STATE/scada", "STATE/scada")
+    for word, online in ((b"ONLINE", True), (b"OFFLINE", False), (b"ONLINE", True)):
+        assert host.take("STATE/scada", word)
+        assert host.online is online
+    for payload in (b"", b"online", b'{"online": false, "timestamp": 1}', b"OFFLINE\n", b"\xff"):
+        with pytest.raises(PayloadError, match="neither ONLINE nor OFFLINE"):
+            host.take("STATE/scada", payload)
+    assert host.online is True
+    assert host.take("spBv1.0/STATE/scada", b'{"online": false, "timestamp": 0}')
+    assert not host.take("STATE/scada", b"ONLINE"), "what a host tells as of 3.0 has a time, and counts"
+    assert host.online is False
 
 
 def test_the_number_of_a_session_goes_round_and_is_remembered(tmp_path) -> None:

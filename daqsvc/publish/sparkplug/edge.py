@@ -21,6 +21,7 @@ from daqsvc.publish.delivery import IN_FLIGHT
 from daqsvc.publish.errors import MqttError
 from daqsvc.publish.faults import Faults
 from daqsvc.publish.outage import Outage
+from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands
 from daqsvc.publish.sparkplug.memory import Memory
 from daqsvc.publish.sparkplug.metrics import (
     NS_PER_MS,
@@ -37,6 +38,7 @@ from daqsvc.publish.stopping import unless
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import CommandHandler
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.settings import MqttSettings
@@ -60,6 +62,7 @@ class SparkplugEdge:
         outbox: where the alarms are; open while `run` runs.
         topics: the box's own topics, by which the alarms are known in the outbox.
         clock: for time stamps.
+        commands: carries out what hosts write to alarms, where the machine file allows it; None: nothing.
 
     Raises:
         ValueError: an id that a Sparkplug topic cannot hold.
@@ -72,6 +75,7 @@ class SparkplugEdge:
         outbox: Outbox,
         topics: Topics,
         clock: Clock,
+        commands: CommandHandler | None = None,
     ) -> None:
         self.counters = SparkplugCounters()
         self.node = EdgeNode(settings.group, settings.edge_node)
@@ -83,9 +87,18 @@ class SparkplugEdge:
         self._memory = Memory(settings.memory)
         self._board = Board()
         self._board.put(None, node_properties(daqsvc.__version__, topics.site, topics.box))
+        self._commands: AlarmCommands | None = None
+        if mqtt.commands is not None and commands is not None:
+            self._commands = AlarmCommands(
+                mqtt.commands, settings.machine, topics, commands, clock, outbox.command_ids
+            )
         for alarm in settings.alarms:
             self._board.put(None, quiet_alarm(settings.machine, alarm))
+            if self._commands is not None:
+                self._board.put(None, self._commands.of_node(alarm))
         self._board.put(settings.device, declared(settings.readings))
+        if self._commands is not None:
+            self._board.put(settings.device, self._commands.of_device(settings.alarms))
         self._watched = {reading.detector for reading in settings.readings}
         self._there = True
         self._server = 0
@@ -208,6 +221,7 @@ class SparkplugEdge:
             topics=self._topics,
             clock=self._clock,
             counters=self.counters,
+            commands=self._commands,
         )
         return connection, session
 

@@ -8,6 +8,11 @@ from dataclasses import dataclass
 from daqsvc.publish.sparkplug.codec import PayloadError
 from daqsvc.publish.sparkplug.node import NAMESPACE
 
+STATES = (f"{NAMESPACE}/STATE/", "STATE/")
+"""What the topics of hosts' states begin with: of Sparkplug 3.0, and of 2.2."""
+
+_WORDS = {b"ONLINE": True, b"OFFLINE": False}
+
 
 @dataclass(slots=True)
 class PrimaryHost:
@@ -23,16 +28,25 @@ class PrimaryHost:
     _newest_ms: int = -1
 
     @property
-    def topic(self) -> str:
-        """Where it tells its state."""
-        return f"{NAMESPACE}/STATE/{self.host_id}"
+    def topics(self) -> tuple[str, ...]:
+        """Where it may tell its state, that of Sparkplug 3.0 first."""
+        return tuple(f"{begin}{self.host_id}" for begin in STATES)
 
-    def take(self, payload: bytes) -> bool:
-        """Take in a STATE message; False if it is older than one before, and changes nothing.
+    def take(self, topic: str, payload: bytes) -> bool:
+        """Take in a STATE message; False if it changes nothing.
+
+        One of 3.0 that is older than one before changes nothing, and one of 2.2, which has no time, nothing
+        once the host has told its state as of 3.0.
+
+        Args:
+            topic: one of `topics`.
+            payload: the bytes.
 
         Raises:
-            PayloadError: it is no STATE message of Sparkplug 3.0.
+            PayloadError: it is no STATE message.
         """
+        if topic != self.topics[0]:
+            return self._take_word(payload)
         try:
             told = json.loads(payload)
             online, sent_ms = told["online"], told["timestamp"]
@@ -43,4 +57,14 @@ class PrimaryHost:
         if sent_ms < self._newest_ms:
             return False
         self._newest_ms, self.online = sent_ms, online
+        return True
+
+    def _take_word(self, payload: bytes) -> bool:
+        """Take in a state as of Sparkplug 2.2: one word."""
+        online = _WORDS.get(payload)
+        if online is None:
+            raise PayloadError(f"STATE of {self.host_id}: neither ONLINE nor OFFLINE")
+        if self._newest_ms >= 0:
+            return False
+        self.online = online
         return True

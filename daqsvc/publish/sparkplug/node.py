@@ -74,6 +74,10 @@ class EdgeNode:
         """Topic filter for what hosts ask of its devices."""
         return self._topic("DCMD", "+")
 
+    def command_topic(self, device: str) -> str:
+        """Topic on which hosts ask a device for something."""
+        return self._topic("DCMD", device)
+
     @property
     def is_born(self) -> bool:
         """Whether data may be sent."""
@@ -159,13 +163,21 @@ class EdgeNode:
         """The session is over: births come before anything else."""
         self._born = {}
 
-    def wants_rebirth(self, payload: bytes) -> bool:
-        """Whether a command on `commands` asks for new births.
+    def command(self, device: str | None, payload: bytes) -> Payload:
+        """What a host has written to metrics of a device, or of the node, each by its name.
 
         Raises:
-            PayloadError: it is no payload, or asks for something else.
+            PayloadError: it is no payload, or an alias stands for no metric.
         """
-        asked = decode(payload).metrics
+        told = decode(payload)
+        return replace(told, metrics=tuple(self._by_name(device, metric) for metric in told.metrics))
+
+    def wants_rebirth(self, asked: Sequence[Metric]) -> bool:
+        """Whether metrics of the node that a host has written ask for new births.
+
+        Raises:
+            PayloadError: they ask for something else.
+        """
         if not asked:
             raise PayloadError("a command without a metric asks for nothing")
         for metric in asked:
@@ -196,6 +208,15 @@ class EdgeNode:
     def _aliased(self, device: str | None, metric: Metric) -> Metric:
         """A metric as data have it: the alias alone."""
         return replace(metric, name=None, alias=self._aliases[device, metric.name or ""], properties={})
+
+    def _by_name(self, device: str | None, metric: Metric) -> Metric:
+        """A metric as a host has written it, with the name that its alias stands for."""
+        if metric.name is not None or metric.alias is None:
+            return metric
+        for (owner, name), alias in self._aliases.items():
+            if owner == device and alias == metric.alias:
+                return replace(metric, name=name)
+        raise PayloadError(f"alias {metric.alias} stands for no metric of {device or self._name}")
 
     def _demand(self, owner: str | None) -> None:
         if owner not in self._born:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.publish.errors import MqttError
+from daqsvc.publish.sparkplug.alarm_commands import MOST_AT_A_TIME
 from daqsvc.publish.sparkplug.codec import PayloadError
-from daqsvc.publish.sparkplug.host import PrimaryHost
+from daqsvc.publish.sparkplug.host import STATES, PrimaryHost
 from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.connection import Connection, Incoming
+    from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands, Wish
     from daqsvc.publish.sparkplug.codec import Metric
     from daqsvc.publish.sparkplug.memory import Memory
     from daqsvc.publish.sparkplug.metrics import Board
@@ -41,6 +43,16 @@ HOST_S = 5.0
 """How long a broker's word about the primary host is waited for where there are other brokers."""
 
 
+HOST_SAID_S = 30.0
+"""After so long it is said that the primary host has not come, and which hosts there are."""
+
+LOOK_S = 1.0
+"""How long the broker may take to tell which hosts there are."""
+
+HOSTS_NAMED = 5
+_SHOWN_ID = 64
+
+
 class HostAwayError(Exception):
     """The primary host is not at this broker."""
 
@@ -56,9 +68,11 @@ class SparkplugCounters:
         alarms: alarm events told as they happened.
         historical: alarm events told as history.
         data: messages with figures of the device.
-        commands_refused: commands that ask for what cannot be had.
+        commands: what hosts have written to alarms and was carried out.
+        commands_refused: commands that ask for what cannot be had, or were refused.
         states_refused: STATE messages of the host that cannot be read, or are older than one before.
         unreadable: messages of the outbox that are no alarm of this version.
+        waiting_for_host: whether it has waited for the primary host for longer than `HOST_SAID_S`.
     """
 
     connected: bool = False
@@ -67,9 +81,11 @@ class SparkplugCounters:
     alarms: int = 0
     historical: int = 0
     data: int = 0
+    commands: int = 0
     commands_refused: int = 0
     states_refused: int = 0
     unreadable: int = 0
+    waiting_for_host: bool = False
 
 
 class EdgeSession:
@@ -88,6 +104,7 @@ class EdgeSession:
         topics: by which alarms are known in the outbox.
         clock: for time stamps.
         counters: what is counted here.
+        commands: takes what hosts write to alarms; None if they may not.
     """
 
     def __init__(
@@ -103,12 +120,14 @@ class EdgeSession:
         topics: Topics,
         clock: Clock,
         counters: SparkplugCounters,
+        commands: AlarmCommands | None = None,
     ) -> None:
         self._connection = connection
         self._bd_seq = bd_seq
         self._node = node
         self._board = board
         self._device = settings.device
+        self._machine = settings.machine
         self._alone = len(settings.servers) == 1
         self._host = None if settings.primary_host is None else PrimaryHost(settings.primary_host)
         self._memory = memory
@@ -116,6 +135,9 @@ class EdgeSession:
         self._topics = topics
         self._clock = clock
         self._counters = counters
+        self._commands = commands
+        self._wishes: asyncio.Queue[Wish] = asyncio.Queue(MOST_AT_A_TIME)
+        self._ungranted: list[str] = []
         self._told: dict[str, Any] = {}
         self._there: Callable[[], bool] = lambda: True
         self.was_born = False
@@ -135,7 +157,8 @@ class EdgeSession:
         self._there = there
         heard: asyncio.Queue[Incoming] = asyncio.Queue(HEARD)
         wanted = [self._node.commands, self._node.device_commands]
-        await self._connection.watch(*wanted, *([self._host.topic] if self._host else []))
+        self._ungranted = await self._connection.watch(*wanted, *(self._host.topics if self._host else ()))
+        obeying = asyncio.create_task(self._obey(), name="sparkplug-commands")
         listening = asyncio.create_task(self._listen(heard), name="sparkplug-listen")
         stopped = asyncio.create_task(stopping.wait(), name="sparkplug-stop")
         try:
@@ -145,15 +168,16 @@ class EdgeSession:
                 return
             present = await self._outbox.latest()
             for message in present:
-                self._board.put(None, self._metrics_of(message))
+                self._board.put(None, self._all_metrics_of(message))
             self._be_born()
             await self._tell_history(max((message.sequence for message in present), default=0))
             await self._tell(heard, listening, stopped)
             await self._tell_alarms(await self._outbox.following(self._cursor, READ_AHEAD))
         finally:
-            for task in (listening, stopped):
+            self._counters.waiting_for_host = False
+            for task in (listening, stopped, obeying):
                 task.cancel()
-            await asyncio.gather(listening, stopped, return_exceptions=True)
+            await asyncio.gather(listening, stopped, obeying, return_exceptions=True)
 
     async def leave(self, timeout_s: float) -> None:
         """Publish the node's death, if it was born, and disconnect; takes about ``timeout_s`` at most."""
@@ -193,15 +217,71 @@ class EdgeSession:
             MqttError: the connection is lost.
         """
         assert self._host is not None  # noqa: S101 - asked for only with a host
-        patience_s = None if self._alone else HOST_S
+        loop = asyncio.get_running_loop()
+        said_at_s = loop.time() + HOST_SAID_S
         while not self._host.online and not stopped.done():
+            alone_s = None if self._counters.waiting_for_host else max(said_at_s - loop.time(), 0.0)
+            patience_s = alone_s if self._alone else HOST_S
             message = await self._first(heard.get(), listening, stopped, patience_s)
             if message is not None:
                 self._hear(message)
+            elif self._alone and not stopped.done():
+                self._counters.waiting_for_host = True
+                await self._say_who_is_there(heard, listening, stopped)
             if not self._alone and not self._host.online and not stopped.done():
                 raise HostAwayError(
                     f"primary host {self._host.host_id} is not at this broker; trying the next"
                 )
+        self._counters.waiting_for_host = False
+
+    async def _say_who_is_there(
+        self,
+        heard: asyncio.Queue[Incoming],
+        listening: asyncio.Task[None],
+        stopped: asyncio.Task[Any],
+    ) -> None:
+        """Say that the primary host has not come, what it has said, and which hosts there are instead."""
+        assert self._host is not None  # noqa: S101 - asked for only with a host
+        wanted = self._host.topics
+        everybody = [f"{begin}+" for begin in STATES]
+        await self._connection.watch(*everybody)
+        others: set[str] = set()
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + LOOK_S
+        while not stopped.done() and (left_s := until_s - loop.time()) > 0:
+            message = await self._first(heard.get(), listening, stopped, left_s)
+            if message is None:
+                break
+            if not message.topic.startswith(STATES) or message.topic in wanted:
+                self._hear(message)
+            elif len(others) < HOSTS_NAMED:
+                others.add(message.topic.rpartition("/")[2][:_SHOWN_ID])
+        for topic in everybody:
+            await self._connection.unsubscribe(topic)
+        if self._host.online:
+            return
+        offline = self._host.online is False
+        word = "says that it is offline" if offline else "has told no state that can be read"
+        closed = [topic for topic in self._ungranted if topic in wanted]
+        there = ", ".join(repr(name) for name in sorted(others))
+        log.warning(
+            "Sparkplug tells nothing yet: primary host %s %s on %s%s; %s. Correct primary_host in "
+            "[mqtt.sparkplug], or have that host connect to this broker",
+            self._host.host_id,
+            word,
+            " or ".join(wanted),
+            f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else "",
+            f"hosts at this broker are {there}" if there else "there is no other host at this broker",
+        )
+
+    async def _obey(self) -> None:
+        """Carry out what hosts have written to alarms, one after the other."""
+        while self._commands is not None:
+            wish = await self._wishes.get()
+            if await self._commands.carry_out(wish):
+                self._counters.commands += 1
+            else:
+                self._counters.commands_refused += 1
 
     async def _first(
         self,
@@ -290,7 +370,7 @@ class EdgeSession:
     async def _tell_alarms(self, messages: list[OutboxMessage]) -> None:
         """Tell alarm events as they are."""
         for message in messages:
-            changed = self._board.put(None, self._metrics_of(message))
+            changed = self._board.put(None, self._all_metrics_of(message))
             if not changed:
                 continue
             if self._node.knows(None, changed):
@@ -322,20 +402,63 @@ class EdgeSession:
         """Take in what a host says; whether it asks for new births."""
         topic, payload = message.topic, message.payload
         try:
-            if self._host is not None and topic == self._host.topic:
-                if not self._host.take(payload):
+            if self._host is not None and topic in self._host.topics:
+                if not self._host.take(topic, payload):
                     self._counters.states_refused += 1
-            elif topic == self._node.commands and not message.retain:
-                return self._node.is_born and self._node.wants_rebirth(payload)
+            elif topic.startswith(STATES):
+                pass  # of another host, which was looked for and is no longer
+            elif message.retain:
+                self._counters.commands_refused += 1
+            elif topic == self._node.commands:
+                rest = self._take_wishes(topic, None, payload)
+                return rest is not None and self._node.is_born and self._node.wants_rebirth(rest)
+            elif topic == self._node.command_topic(self._device):
+                if self._take_wishes(topic, self._device, payload) is not None:
+                    raise PayloadError("it asks for nothing that can be written")  # noqa: TRY301
             else:
                 self._counters.commands_refused += 1
         except PayloadError as error:
-            if self._host is not None and topic == self._host.topic:
+            if self._host is not None and topic in self._host.topics:
                 self._counters.states_refused += 1
             else:
                 self._counters.commands_refused += 1
             log.info("%s is left alone: %s", topic, error)
         return False
+
+    def _take_wishes(self, topic: str, device: str | None, payload: bytes) -> list[Metric] | None:
+        """Take in what is written to alarms.
+
+        Returns:
+            The metrics that are no wish; None if there were wishes and nothing else.
+
+        Raises:
+            PayloadError: it cannot be read, or asks for too much at a time.
+        """
+        told = self._node.command(device, payload)
+        if self._commands is None:
+            return list(told.metrics)
+        if len(told.metrics) > MOST_AT_A_TIME:
+            raise PayloadError(f"it writes {len(told.metrics)} metrics; {MOST_AT_A_TIME} at a time are taken")
+        rest = []
+        for metric in told.metrics:
+            wish = self._commands.meant(topic, metric, told.timestamp_ms, of_node=device is None)
+            if wish is None:
+                rest.append(metric)
+            elif self._wishes.full():
+                self._counters.commands_refused += 1
+            else:
+                self._wishes.put_nowait(wish)
+        return rest if rest or not told.metrics else None
+
+    def _all_metrics_of(self, message: OutboxMessage) -> list[Metric]:
+        """The metrics of an alarm event, and those by which hosts may ask something of the alarm."""
+        metrics = self._metrics_of(message)
+        if self._commands is None or not metrics:
+            return metrics
+        prefix = self._topics.alarm_prefix(self._machine)
+        if not message.topic.startswith(prefix):
+            return metrics  # of a machine of before
+        return [*metrics, *self._commands.of_node(message.topic.removeprefix(prefix))]
 
     def _metrics_of(self, message: OutboxMessage) -> list[Metric]:
         """The metrics of an alarm event; none of anything else in the outbox."""
