@@ -25,6 +25,8 @@ MOST_ORDER = 128
 LEAST_SAMPLES = 2048
 """A model of a few dozen coefficients needs some dozens of samples for each."""
 _SAMPLES_PER_ORDER = 40
+_LEAST_PAIRS = 0.02
+"""Share of a lag's pairs that is taken to be there at least."""
 _WHITE_NOISE = 1e-8
 """Part of the power that is added as white noise: above the anti-aliasing filter there may be none at all."""
 _GOOD_ENOUGH = 0.01
@@ -138,8 +140,7 @@ def identify(samples: Floats, rate_hz: float, most_order: int = MOST_ORDER) -> I
         )
     most = max(1, min(most_order, int(there.sum()) // (_SAMPLES_PER_ORDER * m)))
     # Channels of very different size would spoil the conditioning: unit variance first, and back at the end.
-    covariances = _autocovariance(centred / scale, most, int(there.sum()))
-    ladder = _whittle(covariances)
+    ladder = _sound(_whittle(_autocovariance(centred / scale, most, int(there.sum()), there)))
     errors = np.array([np.linalg.slogdet(step.covariance)[1] for step in ladder])
     criterion = errors + np.arange(len(ladder)) * m * m * np.log(n) / n
     best = int(np.argmin(criterion))
@@ -194,16 +195,35 @@ class _Step(NamedTuple):
     covariance: Floats
 
 
-def _autocovariance(samples: Floats, lags: int, count: int) -> Floats:
-    """E[x(t + k) x(t)'] for k = 0 to ``lags``, float64 ``[lags + 1, m, m]``; positive definite as a whole."""
+def _sound(ladder: list[_Step]) -> list[_Step]:
+    """The predictors up to the first whose error is none: lags that lack samples need not fit each other."""
+    sound = [np.linalg.eigvalsh(step.covariance)[0] > 0.0 for step in ladder]
+    return ladder if all(sound) else ladder[: sound.index(False)]
+
+
+def _autocovariance(samples: Floats, lags: int, count: int, there: Flags | None = None) -> Floats:
+    """E[x(t + k) x(t)'] for k = 0 to ``lags``, float64 ``[lags + 1, m, m]``; positive definite as a whole.
+
+    Args:
+        samples: float64 ``[n, m]`` without their mean; 0 where missing.
+        lags: how many.
+        count: how many samples are not missing.
+        there: bool ``[n]``, which are. If given, a lag with fewer pairs is not the smaller for it, and the
+            whole may fall short of positive definite.
+    """
     n, m = samples.shape
     size = next_fast_len(n + lags, real=True)
+    pairs = np.ones(lags + 1)
+    if there is not None and not there.all():
+        power = np.abs(np.fft.rfft(there, size)) ** 2
+        # Of a whole recording each lag has n - k pairs, and is divided by n all the same.
+        pairs = np.fft.irfft(power, size)[: lags + 1] / (n - np.arange(lags + 1)) * (n / count)
     spectrum = np.fft.rfft(samples, size, axis=0)
     found = np.empty((lags + 1, m, m))
     for i in range(m):
         for j in range(m):
             cross = np.fft.irfft(spectrum[:, i] * spectrum[:, j].conj(), size)
-            found[:, i, j] = cross[: lags + 1] / count
+            found[:, i, j] = cross[: lags + 1] / count / np.maximum(pairs, _LEAST_PAIRS)
     found[0] += _WHITE_NOISE * np.diag(np.diag(found[0]))
     return found
 

@@ -263,12 +263,18 @@ class BearingDetector:
         self._speed_unknown = False
         if self.keyphasor is None:
             return
+        volts = samples[:, self.keyphasor.column]
         try:
-            speed = measure_speed(samples[:, self.keyphasor.column], self.keyphasor, self._rate_hz)
+            speed = measure_speed(volts, self.keyphasor, self._rate_hz)
         except SpeedError as error:
             self._speed_unknown = True
             self._begin_anew()
-            yield "not_ok", str(error)
+            missing = int(np.isnan(volts).sum())
+            if missing > _MISSING * len(volts):
+                lost = f"{missing} of {len(volts)} samples are missing, and pulses with them"
+                yield "missing", f"{self.keyphasor.name}: {lost}; check the bus and the device"
+            else:
+                yield "not_ok", str(error)
             return
         before, tolerance = self._speed_rpm, self._race.speed_tolerance
         if speed.drift > tolerance:

@@ -32,8 +32,12 @@ HARMONICS = (0, 1, -1, 2, -2)
 
 _LEAST_SHARE = 0.75
 """Part of a revolution's samples that must be there."""
-_WORST_CONDITION = 20.0
-"""Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long."""
+_WORST_CONDITION = 2.5
+"""Largest spread of the normal equations' eigenvalues: missing samples must not lie in one piece too long.
+
+A revolution that lacks an eighth in one piece is just fitted, and the variance of its vector is a quarter
+above that of a whole one. With a quarter in one piece it would be 2.6 times that, and make departures.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,233 @@
+"""What is measured of a shaft, a rotor and a bearing while samples are lost: without bias, or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bearing_signals import OUTER, SPEED_RPM, healthy, knocks
+from bearing_signals import RATE_HZ as BEARING_HZ
+from gapped_signals import FRAMES, SHARES, lost
+from rotor_orbits import HEALTHY, orbits
+from shaft_channels import channels_of, feed
+
+from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.identify import NotIdentifiableError
+from daqsvc.bearing.identify_change import learn_healthy
+from daqsvc.bearing.race.judge import race_test
+from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.diagnosis.bearing import BearingDetector
+from daqsvc.diagnosis.bearing_housed import HousedBearing
+from daqsvc.diagnosis.bearing_speed import SpeedError, measure_speed
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
+from daqsvc.diagnosis.rotor_bank import RotorBankDetector, RotorMode
+from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
+from daqsvc.dsp.keyphasor import KeyphasorTracker
+from daqsvc.dsp.orders import order_vectors
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.model import RotorParameters
+from daqsvc.rotor.synchronous.vectors import synchronous_vectors
+from sim_hw.plants import rotor as plant
+from sim_hw.plants.sensors import keyphasor_voltage
+
+GAPS = [(share, frame) for share in SHARES for frame in FRAMES]
+FEW_GAPS = [
+    pytest.param(share, frame, marks=() if (share, frame) in {(0.3, 20), (0.5, 1)} else pytest.mark.long)
+    for share in SHARES[1:]
+    for frame in FRAMES
+]
+PER_REV = 64
+KEYPHASOR = KeyphasorProbe("keyphasor", 2, -6.0)
+PROBES = (Probe("probe-x", 0, 0.0), Probe("probe-y", 1, 90.0))
+
+
+def without(rng, samples, share, frame, begin=0):
+    """Rows ``[n, channels]`` of which some are lost from ``begin`` on."""
+    gapped = np.array(samples)
+    missing = np.isnan(lost(rng, np.zeros(len(samples) - begin), share, frame))
+    gapped[begin:][missing] = np.nan
+    return gapped
+
+
+@pytest.mark.parametrize(("share", "frame"), GAPS)
+def test_synchronous_vectors_have_no_bias(share, frame):
+    count, noise_um = 400, 2.0
+    whole = orbits(np.tile(HEALTHY, (count, 1)), noise_um, 1)
+    found = synchronous_vectors(replace(whole, xy=without(np.random.default_rng(1), whole.xy, share, frame)))
+    usable = found.usable
+    assert usable.mean() > 0.75 or share > 0.02
+    if usable.sum() < 30:
+        assert share >= 0.3, "a revolution with more than a quarter missing is not fitted"
+        return
+    off = found.vectors[usable] - HEALTHY
+    assert np.abs(off.mean(axis=0)).max() < 4.0 * off.std(axis=0).max() / np.sqrt(usable.sum())
+    # Fewer samples tell less, and hardly less than their number.
+    assert off.std(axis=0).max() < 1.15 * noise_um * np.sqrt(2.0 / (0.75 * PER_REV))
+    assert found.noise[usable].mean() == pytest.approx(2.0 * noise_um**2, rel=0.05)
+
+
+@pytest.mark.parametrize(("share", "frame"), GAPS)
+def test_orders_have_no_bias_or_are_refused(share, frame):
+    rng = np.random.default_rng(2)
+    hz, rate_hz = 24.87, 2000.0
+    t = np.arange(40_000) / rate_hz
+    samples = np.sin(2 * np.pi * hz * t) + 0.3 * np.sin(4 * np.pi * hz * t) + 0.2 * rng.normal(size=len(t))
+    gapped = lost(rng, samples, share, frame).astype(np.float64)
+    if share > 0.25:
+        with pytest.raises(ValueError, match="samples are missing"):
+            order_vectors(gapped, rate_hz, 1490.0)
+        return
+    found = order_vectors(gapped, rate_hz, 1490.0)
+    first, second = np.abs(found.amplitudes[:, :2, 0]).mean(axis=0)
+    assert (first, second) == (pytest.approx(1.0, abs=0.01), pytest.approx(0.3, abs=0.01))
+    assert found.speed_rpm == pytest.approx(60.0 * hz, abs=0.05)
+    assert found.residual_rms.mean() == pytest.approx(0.2, rel=0.03)
+
+
+@pytest.mark.parametrize(("share", "frame"), GAPS)
+def test_speed_and_angle_by_a_keyphasor_have_no_bias(share, frame):
+    rng = np.random.default_rng(3)
+    rate_hz, rpm = 12_000.0, 1797.0
+    turns = np.arange(30_000) / rate_hz * rpm / 60.0
+    volts = keyphasor_voltage(turns) + 0.02 * rng.normal(size=len(turns))
+    gapped = lost(rng, volts, share, frame).astype(np.float64)
+    tracker = KeyphasorTracker(threshold=-6.0, hysteresis=0.5, period_samples=rate_hz * 60.0 / rpm)
+    angle = tracker.process(gapped).angle_rad
+    off = np.angle(np.exp(1j * (angle - 2 * np.pi * turns)))
+    known = np.isfinite(off)
+    assert known.mean() > 0.85
+    assert np.degrees(np.abs(off[known]).max()) < 0.5
+    assert 60.0 * rate_hz / tracker.period_samples == pytest.approx(rpm, rel=1e-4)
+    try:
+        speed = measure_speed(gapped, KEYPHASOR, rate_hz)
+    except SpeedError:
+        assert share >= 0.1, "it is refused where too many pulses are lost to tell which"
+    else:
+        assert speed.rpm == pytest.approx(rpm, rel=1e-4)
+        assert speed.drift < 1e-3
+
+
+def rotor_bank():
+    modes = (RotorMode("N", 0.18), RotorMode("F1", 0.10, "alert"))
+    rotor = RotorParameters(
+        natural_frequency_hz=10.0,
+        damping_ratio=0.18,
+        eccentricity_um=10.0,
+        clearance_um=100.0,
+        static_sag_um=10.0,
+    )
+    return RotorBankDetector(
+        machine="rig",
+        stream="shaft",
+        rate_hz=640.0,
+        speed_rpm=600.0,
+        probes=PROBES,
+        keyphasor=KEYPHASOR,
+        rotor=rotor,
+        modes=modes,
+        noise_um=19.6,
+    )
+
+
+def rotor_synchronous():
+    return RotorSynchronousDetector(
+        machine="rig",
+        stream="shaft",
+        rate_hz=640.0,
+        speed_rpm=600.0,
+        probes=PROBES,
+        reference=KEYPHASOR,
+        rotor=LavalRotor(
+            natural_frequency_hz=10.5, damping_ratio=0.16, clearance_um=100.0, static_sag_um=10.0
+        ),
+    )
+
+
+@pytest.mark.parametrize(("share", "frame"), FEW_GAPS)
+@pytest.mark.parametrize("faulty", [True, False], ids=["damping lost", "healthy"])
+@pytest.mark.parametrize(("make", "noise_um"), [(rotor_bank, 19.6), (rotor_synchronous, 2.0)])
+def test_a_rotor_s_decision_neither_comes_nor_goes_with_the_samples(make, noise_um, faulty, share, frame):
+    change = [plant.Change(55.0, plant.RotorParameters(damping_ratio=0.10))] if faulty else []
+    motion = plant.simulate(plant.RotorParameters(), change, revolutions=130.0, samples_per_rev=PER_REV)
+    begin = 85 * PER_REV
+    samples = without(np.random.default_rng(4), channels_of(motion, noise_um), share, frame, begin)
+    said = feed(make(), samples, 640.0, block=PER_REV, first_index=0)
+    before = [d for d in said if d.end_index <= begin][-1]
+    assert before.severity == ("alert" if faulty else "normal")
+    lossy = [d for d in said if d.end_index > begin]
+    assert len(lossy) >= 3
+    assert {d.severity for d in lossy} == {before.severity}
+    assert {d.decision for d in lossy if d.quality != "good"} <= {d.decision for d in lossy}
+    assert any(d.quality == "missing" for d in lossy) or share < 0.3
+
+
+def housing(seconds, seed, size):
+    found = healthy(seconds, seed)
+    return (found + knocks(seconds, OUTER, seed + 1, size=size) if size else found).astype(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("share", "frame"), [(0.005, 1), (0.005, 20), *[(s, f) for s in SHARES for f in (1, 20)]]
+)
+def test_the_race_test_says_the_same_or_refuses(share, frame):
+    samples = lost(np.random.default_rng(5), housing(5.0, 1, 0.6), share, frame).astype(np.float64)
+    orders = bearing_orders("6205-2RS")
+    if share > 0.01:
+        with pytest.raises(RaceInputError, match="lacks"):
+            race_test(samples, BEARING_HZ, SPEED_RPM, orders)
+        return
+    assert race_test(samples, BEARING_HZ, SPEED_RPM, orders).verdict == "outer"
+
+
+@pytest.mark.parametrize("share", SHARES)
+def test_a_bearing_s_alarm_neither_comes_nor_goes_with_the_samples(share):
+    rng = np.random.default_rng(6)
+    bearing = HousedBearing("drive-end", "accel-de", 0, bearing_orders("6205-2RS"))
+    keyphasor = KeyphasorProbe("keyphasor", 1, -6.0)
+
+    def volts(count):
+        return keyphasor_voltage(np.arange(count) / BEARING_HZ * SPEED_RPM / 60.0)
+
+    for size, decision in ((0.6, "outer"), (0.0, "normal")):
+        watch = BearingDetector(
+            machine="motor",
+            stream="housing",
+            rate_hz=BEARING_HZ,
+            speed_rpm=SPEED_RPM,
+            bearings=[bearing],
+            keyphasor=keyphasor,
+            calibrate_s=60.0,
+        )
+        whole = housing(7.5, 11, size)
+        # Then it is the other way round, as far as the samples that are left show.
+        other = housing(25.0, 13, 0.0 if size else 0.6)
+        after = lost(rng, np.ones(len(other)), share, 20)
+        samples = np.concatenate((whole, other * after))
+        pulses = np.concatenate((volts(len(whole)), volts(len(other)) * after))
+        both = np.column_stack((samples, pulses)).astype(np.float32)
+        said = []
+        for begin in range(0, len(both) - watch.block + 1, watch.block):
+            part = both[begin : begin + watch.block]
+            said += watch.process(Window(begin, part, 10**9 + begin, 1e9 / BEARING_HZ))
+        assert [d.decision for d in said[2:]] == [decision] * len(said[2:])
+        assert {d.quality for d in said[3:]} == {"missing"}
+        assert all("samples are missing" in d.reason for d in said[3:])
+
+
+@pytest.mark.parametrize(
+    ("share", "frame"), [(0.01, 1), (0.02, 20), (0.1, 20), (0.2, 100), (0.3, 64), (0.1, 1)]
+)
+def test_a_healthy_bearing_learnt_with_gaps_is_that_without_or_is_refused(share, frame):
+    samples = housing(20.0, 21, 0.0)[:, np.newaxis]
+    whole = learn_healthy(samples, BEARING_HZ, most_order=16)
+    gaps = without(np.random.default_rng(7), samples, share, frame)
+    try:
+        gapped = learn_healthy(gaps, BEARING_HZ, most_order=16)
+    except NotIdentifiableError as error:
+        assert share >= 0.1
+        assert "give a recording without gaps" in str(error)  # noqa: PT017 - it may be learnt as well
+        return
+    # What counts as a change is 2 dB of all bands together, and 3 dB of one.
+    assert np.abs(gapped.mean_db - whole.mean_db).max() < 0.2
