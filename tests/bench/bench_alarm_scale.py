@@ -162,7 +162,7 @@ async def to_the_broker(directory: Path, port: int, seconds: float, targets: Tar
     desk, counters = rig.desk, rig.desk.outbox.counters
     await desk.open()
     await desk.resume(speakers(FLOOD_ALARMS))
-    running = asyncio.create_task(desk.run())
+    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
     helpers = [asyncio.create_task(desk.keep_time()), asyncio.create_task(rig.lag.watch())]
     try:
         while not (desk.publisher and desk.publisher.counters.connected):
@@ -181,7 +181,7 @@ async def to_the_broker(directory: Path, port: int, seconds: float, targets: Tar
     finally:
         await desk.settle(10.0)
         await desk.stop(10.0)
-        await running
+        await asyncio.gather(*running)
         for helper in helpers:
             helper.cancel()
             with contextlib.suppress(asyncio.CancelledError):

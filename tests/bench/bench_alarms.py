@@ -129,13 +129,13 @@ async def running_desk(store: Path, port: int) -> AsyncIterator[AlarmDesk]:
     )
     await desk.open()
     await desk.resume({"rotor-bank": ("probe-x",)})
-    running = asyncio.create_task(desk.run())
+    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
     try:
         yield desk
     finally:
         await desk.settle(10.0)
         await desk.stop(10.0)
-        await running
+        await asyncio.gather(*running)
         await desk.close(10.0)
 
 
