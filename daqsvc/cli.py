@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import errno
 import logging
@@ -17,12 +16,15 @@ from daqsvc import kernel_cache
 from daqsvc.commands.alarm_orders import order_commands
 from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
+from daqsvc.commands.arguments import ArgumentParser
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
+from daqsvc.commands.example import ExampleCommand
 from daqsvc.commands.record import RecordCommand
 from daqsvc.commands.run import RunCommand
 
 if TYPE_CHECKING:
+    import argparse
     from collections.abc import Sequence
 
     from daqsvc.settings import MachineFile
@@ -114,6 +116,7 @@ def commands() -> dict[str, Command]:
         "analyze": AnalyzeCommand(load, kernel_cache.prepare),
         "calibrate": CalibrateCommand(load, kernel_cache.prepare),
         "detectability": DetectabilityCommand(load, kernel_cache.prepare),
+        "example": ExampleCommand(),
         "record": RecordCommand(load, start_logging),
     }
     for point in entry_points(group=COMMANDS):
@@ -127,7 +130,7 @@ def commands() -> dict[str, Command]:
 
 def parser(known: dict[str, Command]) -> argparse.ArgumentParser:
     """The whole command line."""
-    root = argparse.ArgumentParser(
+    root = ArgumentParser(
         prog="daqsvc",
         description="Real-time data acquisition and model-based fault diagnosis for rotating machines.",
         epilog="daqsvc VERB --help tells about one verb.",

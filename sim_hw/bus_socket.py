@@ -12,7 +12,6 @@ loses: by an error frame where they are missing, and by their number in `UnixBus
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import errno
 import json
@@ -27,6 +26,7 @@ from typing import TYPE_CHECKING, Literal
 
 import can
 
+from daqsvc.commands.arguments import ArgumentParser
 from sim_hw.bus_socket_hub import QUEUE_FRAMES, Hub, HubError, HubTakenError, check_path
 from sim_hw.bus_socket_wire import (
     LONGEST,
@@ -255,7 +255,7 @@ def _no_answer(path: str) -> HubError:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """``python -m sim_hw.bus_socket PATH``: run a bus until SIGTERM or Ctrl-C; then print its counters."""
-    parser = argparse.ArgumentParser(prog="sim_hw.bus_socket", description="Run a virtual CAN bus.")
+    parser = ArgumentParser(prog="sim_hw.bus_socket", description="Run a virtual CAN bus.")
     parser.add_argument("path", metavar="PATH", help="of its socket: the channel of interface unixbus")
     parser.add_argument(
         "--queue-frames", type=int, default=QUEUE_FRAMES, help=f"kept for a slow reader ({QUEUE_FRAMES})"

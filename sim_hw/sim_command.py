@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.commands.arguments import ArgumentParser
 from daqsvc.confined.small_toml import TomlFileError, read_toml
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
@@ -121,7 +122,7 @@ class SimCommand:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script ``daqsvc-sim``; returns the exit code."""
     command = SimCommand()
-    parser = argparse.ArgumentParser(prog="daqsvc-sim", description=command.description)
+    parser = ArgumentParser(prog="daqsvc-sim", description=command.description)
     command.add_arguments(parser)
     return command.run(parser.parse_args(arguments))
 

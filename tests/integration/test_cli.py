@@ -23,6 +23,7 @@ VERBS = (
     "analyze",
     "calibrate",
     "detectability",
+    "example",
     "record",
     "demo",
     "reproduce",

@@ -1,0 +1,16 @@
+"""The parser of the command line: what is wrong is said in one line, the usage only where it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+EXIT_BAD_ARGUMENTS = 2
+
+
+class ArgumentParser(argparse.ArgumentParser):
+    """A parser whose errors are one line; so are those of its verbs."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong and where help is, and exit with 2."""
+        self.exit(EXIT_BAD_ARGUMENTS, f"{self.prog}: {message}; see {self.prog} --help\n")

@@ -1,0 +1,120 @@
+"""``daqsvc example``: machine files and scenarios to start from; they come with the package."""
+
+from __future__ import annotations
+
+import sys
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from daqsvc.settings.problems import choice
+
+if TYPE_CHECKING:
+    import argparse
+    from importlib.resources.abc import Traversable
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_BAD_NAME = 2
+
+_FOLDERS = {"machines": "machine files", "scenarios": "scenarios for daqsvc sim"}
+_DEVICES = "../devices/"
+
+
+class Example(NamedTuple):
+    """A file that comes with the package.
+
+    Attributes:
+        name: its name without ending.
+        folder: what it is, as a folder of ``config/``.
+        text: its content.
+    """
+
+    name: str
+    folder: str
+    text: str
+
+    @property
+    def about(self) -> str:
+        """The first sentence of the comment that it begins with."""
+        lines = []
+        for line in self.text.splitlines():
+            if not line.startswith("# "):
+                break
+            lines.append(line.removeprefix("# "))
+        return " ".join(lines).split(". ")[0].split(": ")[0].rstrip(".")
+
+    @property
+    def devices(self) -> list[str]:
+        """Names of the DBC files that it needs."""
+        found = [line.split(_DEVICES)[1].split('"')[0] for line in self.text.splitlines() if _DEVICES in line]
+        return [name for name in found if name.endswith(".dbc")]
+
+
+def _root() -> Traversable:
+    return resources.files("daqsvc") / "examples"
+
+
+def examples() -> dict[str, Example]:
+    """Every example by name, machine files first."""
+    found: dict[str, Example] = {}
+    for folder in _FOLDERS:
+        for file in sorted((_root() / folder).iterdir(), key=lambda one: one.name):
+            name = file.name.removesuffix(".toml")
+            found[name] = Example(name, folder, file.read_text(encoding="utf-8"))
+    return found
+
+
+class ExampleCommand:
+    """``daqsvc example [NAME] [--out PATH]``."""
+
+    help = "machine files to start from: list, print or copy them"
+    description = (
+        "List the examples that come with daqsvc, print one, or copy one with the DBC files that it needs: "
+        "daqsvc example laval-rig --out machine.toml"
+    )
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument("name", nargs="?", metavar="NAME", help="which one (default: list them)")
+        parser.add_argument("--out", type=Path, metavar="PATH", help="file or directory to write it to")
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        known = examples()
+        if arguments.name is None:
+            for folder, what in _FOLDERS.items():
+                print(f"{what[0].upper()}{what[1:]}")  # noqa: T201 - this is what the verb is for
+                for example in known.values():
+                    if example.folder == folder:
+                        print(f"  {example.name:<30}{example.about}")  # noqa: T201
+            return EXIT_OK
+        name = arguments.name.removesuffix(".toml")
+        if name not in known:
+            print(f"daqsvc example: there is no {name!r}; {choice(name, known)}", file=sys.stderr)  # noqa: T201
+            return EXIT_BAD_NAME
+        if arguments.out is None:
+            sys.stdout.write(known[name].text)
+            return EXIT_OK
+        return _copy(known[name], arguments.out)
+
+
+def _copy(example: Example, out: Path) -> int:
+    """Write an example, and beside it the DBC files that it names."""
+    target = out / f"{example.name}.toml" if out.is_dir() else out
+    files = {target: example.text.replace(f'"{_DEVICES}', '"')}
+    for device in example.devices:
+        content = (_root() / "devices" / device).read_text(encoding="utf-8")
+        files[target.parent / device] = content
+    try:
+        for path, text in files.items():
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+            print(path)  # noqa: T201 - says what was written
+    except FileExistsError:
+        print(f"daqsvc example: {path} is there already; give another name", file=sys.stderr)  # noqa: T201
+        return EXIT_FAILED
+    except OSError as error:
+        print(f"daqsvc example: {path} cannot be written: {error.strerror}", file=sys.stderr)  # noqa: T201
+        return EXIT_FAILED
+    return EXIT_OK
