@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.bearing import WINDOW_S
 from daqsvc.settings.layout_checks import unique
+from daqsvc.settings.modbus import WaveformLayout
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 
@@ -23,6 +25,8 @@ _LEAST_RATE_HZ = 2500.0
 _DIRECTION_RATE_HZ = 24_000.0
 _LEAST_REVOLUTIONS = 25.0
 _RING_WINDOWS = 2
+_LEAST_BLOCK_S = 0.5 * WINDOW_S
+"""A shorter block of samples tells the detector nothing."""
 
 
 def bearing_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
@@ -43,6 +47,7 @@ def bearing_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
             yield _keyphasor(draft, given)
             yield _speed(draft)
             yield _ring(draft)
+            yield _blocks(draft, given)
 
 
 def _named(draft: MachineFile) -> dict[str, Sensor]:
@@ -176,4 +181,20 @@ def _ring(draft: MachineFile) -> Iterator[Finding]:
             _BEARING,
             f"a ring of {ring_s:g} s must hold at least {_RING_WINDOWS} windows of {WINDOW_S:g} s",
             f"write ring_s = {_RING_WINDOWS * WINDOW_S:g} or more in [pipeline]",
+        )
+
+
+def _blocks(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+    """Blocks that a device takes by themselves are long enough for a look each."""
+    first = _named(draft).get(given.bearings[0].sensor)
+    stream = None if first is None else draft.streams.get(first.stream)
+    if first is None or stream is None or not isinstance(stream.layout, WaveformLayout):
+        return
+    least = math.ceil(_LEAST_BLOCK_S * stream.rate_hz)
+    if stream.layout.samples < least:
+        yield Finding(
+            ("streams", first.stream, "layout", "samples"),
+            f"are {stream.layout.samples / stream.rate_hz:.3g} s at {stream.rate_hz:g} Hz; a bearing is "
+            f"judged by {_LEAST_BLOCK_S:g} s or more",
+            f"make the device take blocks of {least} samples, or remove [pipeline.bearing]",
         )

@@ -153,7 +153,12 @@ class Alarms(RuleBasedStateMachine):
         )
         events = self.manager.take(diagnosis)
         self.tell(events)
-        if fields["quality"] == "missing":
+        if diagnosis.partial:
+            for event in events:
+                if event.alarm in GROUPS:
+                    assert event.kind not in ENDS | {EventKind.LOWERED}, "missing data cleared an alarm"
+                    assert event.to_level >= event.from_level
+        elif fields["quality"] == "missing":
             assert all("-ok/" in event.alarm or event.alarm == "alarm-flood" for event in events)
             for name in GROUPS:
                 assert self.manager.alarms[name] == before[name], "missing data changed an alarm"
@@ -163,9 +168,15 @@ class Alarms(RuleBasedStateMachine):
         value=st.one_of(st.floats(0, 12), st.sampled_from([0.0, 5.0, 9.0, math.nan, math.inf])),
         quality=QUALITY,
         seconds=SECONDS,
+        sure=st.sampled_from([None, None, 0.5, 0.9]),
     )
-    def measure(self, sensor, value, quality, seconds):
-        self.take(f"levels/{sensor}", seconds, decision="normal", statistics={"rms": value}, quality=quality)
+    def measure(self, sensor, value, quality, seconds, sure):
+        more = {}
+        if sure is not None and quality == "missing" and math.isfinite(value):
+            more = {"bounds": {"rms": (sure * value, math.inf)}, "missing_share": 0.3}
+        self.take(
+            f"levels/{sensor}", seconds, decision="normal", statistics={"rms": value}, quality=quality, **more
+        )
 
     @rule(
         mode=st.sampled_from(sorted(MODES)),

@@ -7,17 +7,24 @@ import asyncio
 import numpy as np
 import pytest
 from alarm_rig import AlarmRig
+from bearing_signals import OUTER, SPEED_RPM, healthy, knocks
+from bearing_signals import RATE_HZ as BEARING_HZ
+from machine_files import problems_of
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.acquisition.ring import RingReader, SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.diagnosis.bearing import BearingDetector
+from daqsvc.diagnosis.bearing_housed import HousedBearing
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.levels import LevelChannel, LevelDetector
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import SILENT_PERIODS, UNKNOWN_NS, Patience
 from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
+from daqsvc.settings import parse_machine_file
 
 RATE_HZ = 3200.0
 PERIOD_NS = 1e9 / RATE_HZ
@@ -135,3 +142,70 @@ def test_how_often_a_device_takes_blocks_by_itself_is_seen():
     asked.heard_after(2 * SECOND_NS)
     assert asked.ns == round(SILENT_PERIODS * 60 * SECOND_NS)
     assert Patience(1e9 / 10).ns == 2 * SECOND_NS
+
+
+BLOCKS = """
+schema_version = 1
+site = "lab"
+box = "edge-1"
+[machine]
+name = "pump"
+speed_rpm = 3000.0
+[buses.io]
+driver = "modbus"
+transport = "tcp"
+host = "192.0.2.1"
+[streams.casing]
+bus = "io"
+rate_hz = 12800.0
+[streams.casing.layout]
+way = "waveform"
+unit = 1
+block_id = 0
+address = 100
+samples = 32000
+channels = [{ name = "x", place = 0, type = "int16", scale = 0.0005 }]
+[[sensors]]
+name = "accel-de"
+type = "accelerometer"
+stream = "casing"
+channel = "x"
+unit = "g"
+[pipeline.bearing]
+bearings = [{ name = "drive-end", sensor = "accel-de", type = "6205-2RS" }]
+"""
+
+
+def test_a_bearing_looks_at_each_block_and_too_short_ones_are_refused(tmp_path):
+    path = tmp_path / "machine.toml"
+    assert parse_machine_file(BLOCKS, path).streams["casing"].layout.samples == 32_000
+    (problem,) = problems_of(BLOCKS.replace("samples = 32000", "samples = 8192"), path)
+    assert problem.key == "streams.casing.layout.samples"
+    assert "are 0.64 s at 12800 Hz; a bearing is judged by 1.25 s or more" in str(problem)
+
+
+def test_a_bearing_is_raised_by_two_blocks_that_agree():
+    orders = bearing_orders("6205-2RS")
+    watch = BearingDetector(
+        machine="pump",
+        stream="casing",
+        rate_hz=BEARING_HZ,
+        speed_rpm=SPEED_RPM,
+        bearings=[HousedBearing("drive-end", "accel-de", 0, orders)],
+        calibrate_s=60.0,
+    )
+    count = round(2.5 * BEARING_HZ)
+    said = []
+    for k in range(6):
+        samples = healthy(2.5, k) + (knocks(2.5, OUTER, 50 + k, size=0.6) if k > 2 else 0.0)
+        first = k * 10 * count
+        column = samples.astype(np.float32).reshape(-1, 1)
+        said += watch.process(Window(first, column, 10**9 + first, 1e9 / BEARING_HZ, snapshot=True))
+    assert [d.quality for d in said] == ["good"] * 6
+    assert [d.decision for d in said] == ["normal"] * 4 + ["outer"] * 2
+    assert [d.end_index - d.first_index for d in said] == [count] * 6
+    (short,) = watch.process(
+        Window(100 * count, np.ones((500, 1), np.float32), 10**12, 1e9 / BEARING_HZ, snapshot=True)
+    )
+    assert (short.quality, short.decision) == ("missing", "outer")
+    assert "a block of casing is 0.0417 s long, and a bearing is judged by 1.25 s or more" in short.reason
