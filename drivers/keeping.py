@@ -121,6 +121,7 @@ async def in_thread(
     *arguments: Any,
     undo: Callable[[T], object] | None = None,
     patience_s: float | None = None,
+    abort: Callable[[], object] | None = None,
 ) -> T:
     """Make a blocking call; if cancelled meanwhile, wait for its end all the same and undo what it did.
 
@@ -132,6 +133,7 @@ async def in_thread(
         undo: takes back its result; blocks.
         patience_s: how long to wait for its end when cancelled; None for as long as it takes. One that takes
             longer is left behind: what it did is undone when it ends, and the process may end before it.
+        abort: makes it end soon when cancelled; does not block.
     """
     begun = (
         None
@@ -144,6 +146,8 @@ async def in_thread(
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
+        if abort is not None:
+            abort()
         await asyncio.wait({work}, timeout=patience_s)
         if not work.done():
             work.cancel()

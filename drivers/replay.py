@@ -19,6 +19,7 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
 from daqsvc.confined.limits import GIGABYTE, Limits
+from daqsvc.confined.process import ConfinedProcess
 from drivers.base import BusCounters, BusPort
 from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
@@ -120,6 +121,7 @@ class ReplayDriver:
         self._sorter = FrameSorter(frames)
         self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
         self._place = Place()
+        self._reader = ConfinedProcess()
         memory_gb = port.options.get("max_memory_gb")
         self._limits = Limits() if memory_gb is None else Limits(round(memory_gb * GIGABYTE))
         self._first_index: dict[str, int] = {}
@@ -160,8 +162,9 @@ class ReplayDriver:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
     async def _open(self) -> Recording:
+        self._reader.close()  # it may have been told to stop when it had just ended
         try:
-            return await in_thread(self._open_file, undo=self._close)
+            return await in_thread(self._open_file, undo=self._close, abort=self._reader.abort)
         except RecordingError as error:
             self.counters.open_failures += 1
             raise CannotOpenError(f"{error}") from error
@@ -175,7 +178,7 @@ class ReplayDriver:
         if self._at_end == "wait":
             return GrowingCandump(self._path, self._sort, self._place)
         if kind_of(self._path) == "table":
-            return SampleTable(self._path, self._port.streams, self._first_index, self._limits)
+            return SampleTable(self._path, self._port.streams, self._first_index, self._limits, self._reader)
         return CanLog(self._path, self._sort)
 
     def _close(self, recording: Recording) -> None:

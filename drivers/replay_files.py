@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.confined.process import ConfinedProcess
     from drivers.base import StreamSpec
 
 PIECE_SAMPLES = 65_536
@@ -95,6 +96,7 @@ class SampleTable:
         specs: the streams; their layouts are `ColumnLayout`.
         first_index: where each stream's count of samples goes on, by name; kept up to date.
         limits: what reading the file may take.
+        reader: reads it, and can be told to stop; unless given, one of its own.
 
     Attributes:
         seamless: whether all streams last as long: played again, it goes on without a step in time.
@@ -111,10 +113,11 @@ class SampleTable:
         specs: Sequence[StreamSpec[ColumnLayout]],
         first_index: dict[str, int],
         limits: Limits | None = None,
+        reader: ConfinedProcess | None = None,
     ) -> None:
         self._first_index = first_index
         wanted = [column for spec in specs for column in spec.layout.columns]
-        table = _table(path, wanted, limits or Limits())
+        table = _table(path, wanted, limits or Limits(), reader)
         self._streams: list[tuple[StreamSpec[ColumnLayout], NDArray[np.float32]]] = []
         for spec in specs:
             columns = [table[name] for name in spec.layout.columns]
@@ -180,9 +183,11 @@ def words(error: BaseException) -> str:
     return f"{error}" or type(error).__name__
 
 
-def _table(path: Path, wanted: Sequence[str], limits: Limits) -> dict[str, NDArray[np.float64]]:
+def _table(
+    path: Path, wanted: Sequence[str], limits: Limits, reader: ConfinedProcess | None
+) -> dict[str, NDArray[np.float64]]:
     try:
-        there, found = read_columns(path, wanted, limits)
+        there, found = read_columns(path, wanted, limits, reader)
     except TableError as error:
         raise RecordingError(
             f"{path} cannot be read as a table of samples: {words(error)}; give an NPZ file with an array "

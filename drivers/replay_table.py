@@ -22,13 +22,16 @@ ARRAY = ".npy"
 
 MOST_COLUMNS = 4096
 
+COLUMNS = "drivers.replay_table:columns"
+"""What is called in the other process."""
+
 
 class TableError(Exception):
     """A table cannot be read; says why."""
 
 
 def read_columns(
-    path: Path, wanted: Sequence[str], limits: Limits
+    path: Path, wanted: Sequence[str], limits: Limits, reader: ConfinedProcess | None = None
 ) -> tuple[Sequence[str], dict[str, NDArray[np.float64]]]:
     """The names of all columns of an NPZ or CSV file, and those that are wanted and there.
 
@@ -36,15 +39,16 @@ def read_columns(
         path: the file.
         wanted: names of columns.
         limits: what reading it may take.
+        reader: reads it, and is closed then; unless given, one of its own.
 
     Raises:
         TableError: it cannot be read within the limits.
     """
     arguments = {"path": str(path), "wanted": list(wanted), "memory_bytes": limits.memory_bytes}
-    with ConfinedProcess() as process:
+    with reader or ConfinedProcess() as process:
         try:
             (there, found), arrays = process.call(
-                "drivers.replay_table:columns",
+                COLUMNS,
                 arguments,
                 memory_bytes=limits.memory_bytes,
                 cpu_s=limits.cpu_s(path.stat().st_size),

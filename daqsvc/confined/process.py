@@ -98,6 +98,7 @@ class ConfinedProcess:
     def __init__(self) -> None:
         self._lock = RLock()
         self._running: _Running | None = None
+        self._aborted = False
 
     def __enter__(self) -> Self:
         return self
@@ -126,6 +127,8 @@ class ConfinedProcess:
         }
         with self._lock:
             running = self._running = self._running or _begin()
+            if self._aborted:
+                raise ConfinedError("crash", "its reader was told to stop")
             until = time.monotonic() + _WALL_BASE_S + _WALL_PER_CPU * cpu_s
             try:
                 return _ask(running, request, memory_bytes, until)
@@ -139,9 +142,16 @@ class ConfinedProcess:
                 self._kill()
                 raise
 
+    def abort(self) -> None:
+        """Have the call of another thread end at once, and any other until `close`; does not block."""
+        self._aborted = True
+        if (running := self._running) is not None:
+            running.process.kill()
+
     def close(self) -> None:
-        """End the process."""
+        """End the process; the next call begins another."""
         with self._lock:
+            self._aborted = False
             if self._running is None:
                 return
             os.close(self._running.requests)

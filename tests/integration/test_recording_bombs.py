@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
 import tracemalloc
@@ -14,11 +15,13 @@ import pytest
 from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, OBJ_HEADER_BASE_STRUCT, BLFWriter
 from orbit_files import OPTIONS, Orbit
 
+from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
 from daqsvc.confined.limits import Limits
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, set_limits, shared, stop_reading
-from drivers.base import StreamSpec
+from drivers.base import BusPort, StreamSpec
+from drivers.replay import ReplayDriver
 from drivers.replay_can import CanLog
 from drivers.replay_files import ColumnLayout, SampleTable
 from drivers.replay_files import RecordingError as ReplayError
@@ -190,3 +193,20 @@ def test_a_can_log_of_nothing_but_other_lines_is_given_up(tmp_path):
     path.write_bytes(file_bombs.text_log_gz())
     with pytest.raises(ReplayError, match="100,000 lines in a row are no frames"):
         read_whole(path)
+
+
+async def test_a_table_that_takes_long_does_not_hold_up_the_end(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.zeros(100))
+    monkeypatch.setattr("drivers.replay_table.COLUMNS", "confined_work:spin_with")
+    spec = StreamSpec("s", COLUMNS, 1000.0)
+    port = BusPort("t", {"file": path}, [spec], SystemClock(), lambda _block: None)
+    driver = ReplayDriver(port)
+    running = asyncio.create_task(driver.run())
+    while driver._reader._running is None:
+        await asyncio.sleep(0.01)
+    child = driver._reader._running.process
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asyncio.wait_for(running, 60)
+    assert child.returncode is not None

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -86,6 +87,29 @@ def test_an_interrupted_call_leaves_nothing_to_be_mistaken_for_an_answer(process
         patched.setattr(os, "readv", interrupt)
         with pytest.raises(KeyboardInterrupt):
             call(process, "double", numbers=[1.0])
+    assert call(process, "double", numbers=[3.0]).arrays[0].tolist() == [6.0]
+
+
+def test_a_call_of_another_thread_can_be_aborted(process):
+    outcome = []
+
+    def work():
+        try:
+            call(process, "spin")
+        except ConfinedError as error:
+            outcome.append(error)
+
+    thread = Thread(target=work)
+    thread.start()
+    while process._running is None:
+        time.sleep(0.01)
+    process.abort()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert len(outcome) == 1
+    with pytest.raises(ConfinedError, match="told to stop"):
+        call(process, "double", numbers=[1.0])
+    process.close()
     assert call(process, "double", numbers=[3.0]).arrays[0].tolist() == [6.0]
 
 
