@@ -283,6 +283,27 @@ class Journal:
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
         self._mark.begin(self._next)
 
+    def _reconnect(self) -> None:
+        """Open the file again in the middle of a run.
+
+        The log may hold a commit that has failed. Its messages are still in memory and will be committed
+        under other numbers, so it must not come back.
+        """
+        begun = self._next
+        self._connect()
+        if not begun:
+            return
+        try:
+            connection = self._open_connection()
+            with _transaction(connection):
+                if connection.execute("DELETE FROM messages WHERE sequence >= ?", (begun,)).rowcount:
+                    connection.execute("DELETE FROM latest")
+                    connection.execute(FILL_LATEST)
+            self._prove()
+        except BaseException:
+            self._disconnect()
+            raise
+
     def _disconnect(self) -> None:
         if self._connection is not None:
             connection, self._connection = self._connection, None
@@ -459,7 +480,7 @@ class Journal:
         if self._connection is None:
             if self._lock is None:
                 raise OutboxError(f"outbox {self.path} is not open; call open() first")
-            self._connect()
+            self._reconnect()
         if self._connection is None:
             raise OutboxError(f"outbox {self.path} cannot be opened again")
         return self._connection

@@ -31,12 +31,11 @@ def refuse_unsafe(store: Path) -> None:
         OSError: it cannot be looked at.
     """
     _refuse_path(store)
-    for entry in os.scandir(store):
-        status = entry.stat(follow_symlinks=False)
-        if entry.name.startswith(JOURNAL):
-            _refuse_file(Path(entry.path), status)
-        elif entry.name.startswith(BESIDE) and status.st_uid not in _trusted():
-            raise OutboxError(_belongs(entry.path, status.st_uid, Path(entry.path)))
+    for path in store.iterdir():
+        if path.name.startswith(JOURNAL):
+            refuse_link(path)
+        elif path.name.startswith(BESIDE) and (owner := path.lstat().st_uid) not in _trusted():
+            raise OutboxError(_belongs(f"{path}", owner, path))
 
 
 def refuse_link(path: Path) -> None:

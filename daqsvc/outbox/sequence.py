@@ -114,7 +114,7 @@ class SequenceMark:
     @property
     def ended(self) -> bool:
         """Whether the run that wrote last came to a proper end, or this system has booted since."""
-        return self._told.ended or self._told.boot != self._here.boot
+        return not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
 
     @property
     def used(self) -> int:

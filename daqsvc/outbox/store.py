@@ -103,11 +103,10 @@ class Outbox:
     async def glimpse(self) -> list[OutboxMessage] | None:
         """`latest` of a journal that cannot be opened for now; None if it cannot even be looked at."""
         try:
-            view = await asyncio.to_thread(read_journal, self.directory, history=0)
-        except OutboxError as error:
+            return await asyncio.to_thread(_latest_of, self._journal.path)
+        except (OutboxError, OSError) as error:
             log.error("what the alarms were cannot be read yet: %s", error)  # noqa: TRY400
             return None
-        return [OutboxMessage(e.sequence, e.topic, e.payload, e.retain) for e in view.latest]
 
     def damage_is_told(self) -> None:
         """What has befallen the journal is told: it need not be told again after a restart."""
@@ -349,6 +348,14 @@ class _Books:
     def stopped(self, reason: str) -> None:
         """See `Reports.stopped`."""
         self.broken = reason
+
+
+def _latest_of(path: Path) -> list[OutboxMessage]:
+    """The latest retained message of each topic, of a journal that nobody has open; none of a new one."""
+    if not path.exists() or not path.stat().st_size:
+        return []
+    view = read_journal(path.parent, history=0)
+    return [OutboxMessage(e.sequence, e.topic, e.payload, e.retain) for e in view.latest]
 
 
 def telemetry_path(path: Path) -> Path:

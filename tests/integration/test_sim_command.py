@@ -69,7 +69,7 @@ async def test_run_counts_to_the_sample_what_sim_has_sent_and_spoilt(
     async with Consumer(mosquitto.port) as consumer:
         places = {
             "config/machines/virtual-rig.toml": machine,
-            "/tmp/daqsvc-virtual": tmp_path / "store",  # noqa: S108
+            "~/daqsvc-virtual": tmp_path / "store",
             "paper": bad_link,
         }
         with process(*documented("run", places)) as service:
