@@ -269,6 +269,8 @@ class Journal:
             raise
         self._connection = connection
         gone = self._mark.vanished(stored)
+        if is_new and self._mark.is_damaged:
+            gone = max(gone, 1)  # there was a journal, and nobody knows what was in it
         if gone:
             self.vanished += gone
             self._renewal.remember(Damage(self.quarantined, self.vanished))
@@ -377,11 +379,27 @@ class Journal:
             if trims:
                 self._trim(connection)
         if rows:
+            self._confirm(sequence - 1)
             self._next = sequence
-            self._mark.note(sequence - 1)
         if trims:
             self._tend(connection)
         return outcomes, max(marked, 0)
+
+    def _confirm(self, last: int) -> None:
+        """Note what was committed, and so see whether the disk still takes writes.
+
+        An ext4 that fails has been seen to confirm the sync that it failed in. The commit is undone then, by
+        `_reconnect`, and tried again.
+
+        Raises:
+            OSError: the disk takes no writes.
+        """
+        try:
+            self._mark.note(last)
+        except OSError:
+            self._has_failed = True
+            self._disconnect()
+            raise
 
     @contextlib.contextmanager
     def _committed(self, connection: sqlite3.Connection) -> Iterator[None]:

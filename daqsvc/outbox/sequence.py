@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import NS_PER_MS, overwrite_durably, read_whole, replace_durably, restrict
+from daqsvc.outbox.files import NS_PER_MS, is_full, overwrite_durably, read_whole, replace_durably, restrict
 
 if TYPE_CHECKING:
     from typing import BinaryIO
@@ -117,6 +117,11 @@ class SequenceMark:
         return not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
 
     @property
+    def is_damaged(self) -> bool:
+        """Whether a side file is damaged or missing, as far as that can be told."""
+        return self._damaged
+
+    @property
     def used(self) -> int:
         """The highest number that is known to have been used."""
         return self._told.used
@@ -168,18 +173,27 @@ class SequenceMark:
             self._write(replace(self._told, ceiling=max(last + STEP, self._told.ceiling)))
 
     def note(self, used: int) -> None:
-        """Tell that numbers up to ``used`` are in the journal."""
+        """Tell that numbers up to ``used`` are in the journal.
+
+        Raises:
+            OSError: the disk takes no writes any more, so that its word for the last sync is worth nothing.
+        """
         first = self._first if self._told.used < self._first else self._told.first
-        self._told = replace(self._told, used=used, first=first)
-        try:
-            self._sides[0].note(self._told.line())
-        except OSError as error:
-            # The message is on disk. Only the watch over a journal that forgets is poorer by this.
-            if self._noted:
-                log.warning("outbox mark %s cannot be written: %s", self._sides[0].path, error)
-            self._noted = False
-        else:
-            self._noted = True
+        told = replace(self._told, used=used, first=first)
+        errors: list[OSError] = []
+        for side in self._sides:
+            try:
+                side.note(told.line())
+            except OSError as error:
+                errors.append(error)
+            else:
+                break
+        if len(errors) == len(self._sides) and not is_full(errors[0]):
+            raise errors[0]
+        if errors and self._noted:
+            log.warning("outbox mark %s cannot be written: %s", self._sides[0].path, errors[0])
+        self._noted = not errors
+        self._told = told
 
     def settle(self, last: int) -> None:
         """Tell, durably, that ``last`` is the highest number in use and will stay so for now.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import random
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.outbox.reading import JOURNAL_NAME, read_journal
+from daqsvc.outbox.salvage import readable
 from daqsvc.outbox.store import Outbox
 
 TOPICS = ["daqsvc/lab/edge-1/rig/alarms/a", "daqsvc/lab/edge-1/rig/alarms/b"]
@@ -154,3 +157,66 @@ def test_a_flipped_bit_in_a_payload_costs_that_message_only(stores, tmp_path):
     pending, counters = asyncio.run(restarted(store, numbers))
     assert counters.quarantined == 1
     assert [m.sequence for m in pending[:-1]] == [n for n in numbers[COUNT // 2 :] if n != hit]
+
+
+def spoil(path, rng):
+    """Do to a file what disks, file systems and people do."""
+    content = bytearray(path.read_bytes())
+    match rng.choice(["flip", "flip", "flip", "cut", "zero", "noise", "grow", "delete"]):
+        case "flip" if content:
+            for _ in range(rng.choice([1, 1, 2, 8, 64])):
+                page = rng.randrange(len(content) // 4096 + 1) * 4096
+                at = page + rng.randrange(200) if rng.random() < 0.5 else rng.randrange(len(content))
+                content[at % len(content)] ^= 1 << rng.randrange(8)
+        case "cut":
+            del content[rng.randrange(len(content) + 1) :]
+        case "zero":
+            begin = rng.randrange(len(content) // 4096 + 1) * 4096
+            content[begin : begin + 4096] = bytes(len(content[begin : begin + 4096]))
+        case "noise":
+            content[:] = rng.randbytes(rng.randrange(5000))
+        case "grow":
+            content += rng.randbytes(rng.randrange(1, 5000))
+        case "delete":
+            path.unlink()
+            return
+    path.write_bytes(content)
+
+
+async def spoilt(stores, seed, caplog):
+    kept, numbers = stores
+    unsent = set(numbers[COUNT // 2 :])
+    rng = random.Random(seed)
+    with tempfile.TemporaryDirectory(dir=MEMORY) as scratch:
+        store = Path(scratch) / "store"
+        shutil.copytree(kept[rng.choice(sorted(kept))], store)
+        (store / f"{JOURNAL_NAME}-shm").unlink(missing_ok=True)
+        files = sorted(path for path in store.iterdir() if path.name != f"{JOURNAL_NAME}.lock")
+        hit = set(rng.sample(files, rng.choice([1, 1, 1, 2, 3])))
+        hit |= {store / JOURNAL_NAME} if rng.random() < 0.5 else set()
+        for path in sorted(hit):
+            spoil(path, rng)
+        whole = not {JOURNAL_NAME, f"{JOURNAL_NAME}-wal"} & {path.name for path in hit}
+        shutil.copytree(store, Path(scratch) / "read")
+        damaged = Path(scratch) / "read" / JOURNAL_NAME
+        readable_rows = list(readable(damaged)) if damaged.exists() else []
+        caplog.clear()
+        before = len(caplog.records)
+        pending, counters = await restarted(store, numbers)
+        found = {message.sequence for message in pending[:-1]}
+        wanted = unsent if whole else {row[0] for row in readable_rows if not row[4] and row[0] in unsent}
+        assert wanted <= found, f"seed {seed}: {[path.name for path in hit]}"
+        told = [r.getMessage() for r in caplog.records[before:] if r.levelno >= logging.WARNING]
+        if not unsent <= found:
+            assert counters.quarantined + counters.vanished > 0, f"seed {seed}: lost in silence"
+            assert any(str(store / JOURNAL_NAME) in sentence for sentence in told)
+        assert not [sentence for sentence in told if "Traceback" in sentence]
+        return counters.quarantined
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(40), pytest.param(range(1000, 2500), marks=pytest.mark.long)], ids=str
+)
+def test_whatever_is_spoilt_a_start_tells_the_truth_and_repeats_no_number(stores, seeds, caplog):
+    quarantined = [asyncio.run(spoilt(stores, seed, caplog)) for seed in seeds]
+    assert sum(map(bool, quarantined)) > len(seeds) // 8, "enough of it was damage"
