@@ -188,7 +188,7 @@ async def test_the_whole_service_watches_on_a_full_disk(disk):
     machine = for_recording(
         Recording(("accel",), samples[:, None], 2000.0, "test", 0),
         "g",
-        Setpoints(accel=(0.5, 5.0)),
+        Setpoints(accel=(0.5, 3.0)),
         "mqtt://127.0.0.1:1",
     )
     disk.fill()
