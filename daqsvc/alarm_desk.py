@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, RefusedError
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
@@ -128,6 +129,7 @@ class AlarmDesk:
             else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.obey)
         )
         self._clock = clock
+        self._log = AlarmLog(clock)
         self._conditions = conditions(mqtt, buses or {})
         self._bus_health = bus_health
         self._self_check = SelfCheck(store, limits.reserve_bytes)
@@ -255,6 +257,7 @@ class AlarmDesk:
         if self._falls_out_of_step():
             self._catching_up = True
             self._watch(asyncio.create_task(self._catch_up(), name="journal and alarms in step"))
+        self._log.sum_up()
         for event in self.manager.tick():
             self._post(event)
         for condition in self._self_check.look(self._vitals()):
@@ -418,8 +421,7 @@ class AlarmDesk:
         return CommandOutcome(accepted=False, reason=reason)
 
     def _post(self, event: AlarmEvent) -> asyncio.Future[int]:
-        loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
-        logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
+        self._log.say(event)
         return self._submit(event)
 
     def _submit(self, event: AlarmEvent) -> asyncio.Future[int]:

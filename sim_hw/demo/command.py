@@ -112,7 +112,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     start_logging(verbose=False)
     # Every alarm comes back from the broker and is shown; the service's log would say it twice.
-    logging.getLogger("daqsvc.alarm_desk").setLevel(logging.ERROR)
+    logging.getLogger("daqsvc.alarm_log").setLevel(logging.ERROR)
     kernel_cache.prepare()
     try:
         import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?

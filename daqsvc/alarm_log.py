@@ -1,0 +1,62 @@
+"""Alarm events in the log of the service: each, until they come faster than anybody reads.
+
+A line for each event of a flood would fill the log of the system, and a log that is written to slowly would
+hold up the event loop. All events are in the journal, whatever the log says.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.states import Level
+
+if TYPE_CHECKING:
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.events import AlarmEvent
+
+logger = logging.getLogger(__name__)
+
+LINES = 100
+LINE_EVERY_NS = NS_PER_S // 5
+"""So many events are logged one by one, and one more for each of these times that pass."""
+
+
+class AlarmLog:
+    """Logs alarm events.
+
+    Args:
+        clock: for how fast they come.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._left = LINES
+        self._earned_ns = clock.monotonic_ns()
+        self._left_out = 0
+
+    def say(self, event: AlarmEvent) -> None:
+        """Log an event, or count it."""
+        if not self._may_say():
+            self._left_out += 1
+            return
+        self._left -= 1
+        loud = logging.WARNING if event.to_level is not Level.NORMAL else logging.INFO
+        logger.log(loud, "alarm %s %s: %s", event.alarm, event.kind, event.message)
+
+    def sum_up(self) -> None:
+        """Say how many events were only counted since the last time; about once a second."""
+        if self._left_out:
+            logger.warning(
+                "%d alarm events came too fast for this log; daqsvc alarms --history shows them all",
+                self._left_out,
+            )
+            self._left_out = 0
+
+    def _may_say(self) -> bool:
+        now_ns = self._clock.monotonic_ns()
+        earned, rest_ns = divmod(now_ns - self._earned_ns, LINE_EVERY_NS)
+        self._left = min(self._left + earned, LINES)
+        self._earned_ns = now_ns - rest_ns
+        return self._left > 0
