@@ -14,6 +14,8 @@ from daqsvc.diagnosis.partial_levels import (
     MOST_ERROR,
     MOST_MISSING,
     level_bounds,
+    not_judged,
+    nothing_known,
     partly_missing,
 )
 from daqsvc.diagnosis.record import silence_reason
@@ -129,7 +131,7 @@ class LevelDetector:
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
-        said: list[Diagnosis] = []
+        said = [self._skipped(channel, window) for channel in self._channels if window.skipped]
         self._next_index = window.first_index + len(window.samples)
         block = len(window.samples) if window.snapshot else self.block
         for start in range(0, len(window.samples), block):
@@ -146,6 +148,18 @@ class LevelDetector:
         reason = silence_reason(self.stream, silence_s)
         nothing = Evidence(self._next_index, self._next_index, t_ns)
         return [self._state(c, nothing, {}, "missing", reason) for c in self._channels]
+
+    def _skipped(self, channel: LevelChannel, window: Window) -> Diagnosis:
+        """Nobody has seen what lies between two windows: no delay goes on over it."""
+        first = window.first_index - window.skipped
+        t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
+        unseen = Evidence(first, window.first_index, t_ns)
+        measures = ["mean", "rms", "peak", "crest_factor"]
+        measures += ["gap_voltage"] * (channel.gap is not None) + ["velocity_rms"] * (
+            channel.unit in _TO_VELOCITY
+        )
+        reason = not_judged(channel.sensor, window.skipped)
+        return self._state(channel, unseen, {}, "missing", reason, 1.0, nothing_known(measures))
 
     def _judge(
         self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int

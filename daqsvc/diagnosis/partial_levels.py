@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from daqsvc.dsp.levels import Levels
 
@@ -50,6 +50,16 @@ def level_bounds(
         "peak": (0.5 * (highest - lowest), math.inf),
         "crest_factor": (0.0, math.inf),
     }
+
+
+def nothing_known(measures: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Bounds of measures of which nothing is known."""
+    return dict.fromkeys(measures, (-math.inf, math.inf))
+
+
+def not_judged(sensor: str, samples: int) -> str:
+    """Why measures of a sensor are held that were there and not looked at, in words for a person."""
+    return f"{samples} samples of {sensor} were not judged: this computer was too slow, or they were lost"
 
 
 def partly_missing(sensor: str, missing: int, count: int, held: Bounds) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.diagnosis.level_statements import Evidence, LevelStatements
-from daqsvc.diagnosis.partial_levels import MOST_MISSING, partly_missing
+from daqsvc.diagnosis.partial_levels import MOST_MISSING, not_judged, nothing_known, partly_missing
 from daqsvc.diagnosis.record import silence_reason
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class TrendDetector:
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
-        said: list[Diagnosis] = []
+        said = [self._skipped(channel, window) for channel in self._channels if window.skipped]
         self._next_index = window.first_index + len(window.samples)
         block = len(window.samples) if window.snapshot else self.block
         for start in range(0, len(window.samples), block):
@@ -106,6 +106,22 @@ class TrendDetector:
         reason = silence_reason(self.stream, silence_s)
         nothing = Evidence(self._next_index, self._next_index, t_ns)
         return [self._missing(channel, nothing, reason) for channel in self._channels]
+
+    def _skipped(self, channel: TrendChannel, window: Window) -> Diagnosis:
+        """Nobody has seen what lies between two windows: no delay goes on over it."""
+        t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
+        unseen = Evidence(window.first_index - window.skipped, window.first_index, t_ns)
+        return self._statements.state(
+            channel.sensor,
+            channel.limits,
+            unseen,
+            {},
+            {},
+            "missing",
+            not_judged(channel.sensor, window.skipped),
+            1.0,
+            nothing_known([VALUE]),
+        )
 
     def _judge(
         self, channel: TrendChannel, samples: NDArray[np.float32], evidence: Evidence

@@ -36,13 +36,13 @@ class Watched:
         self.said = []
         self.taken = 0
 
-    def take(self, samples):
-        self.taken += len(samples)
-        self.rig.clock.advance(len(samples) / RATE_HZ)
+    def take(self, samples, skipped=0):
+        self.taken += skipped + len(samples)
+        self.rig.clock.advance((skipped + len(samples)) / RATE_HZ)
         period_ns = SECOND_NS / RATE_HZ
         first = self.taken - len(samples)
         column = samples.astype(np.float32).reshape(-1, 1)
-        window = Window(first, column, self.rig.clock.t_ns, period_ns)
+        window = Window(first, column, self.rig.clock.t_ns, period_ns, skipped)
         events = []
         for diagnosis in self.detector.process(window):
             self.said.append(diagnosis)
@@ -206,3 +206,15 @@ def test_a_sensor_that_lacks_samples_votes_for_what_is_sure_and_never_against():
     assert take("b", 10.0, 8.0, 90.0) == []
     assert rig.rms(10.0, sensor="c") == []  # b may still be beyond the limit
     assert kinds(rig.rms(10.0, sensor="b")) == [("high", "returned")]
+
+
+def test_no_delay_goes_on_over_samples_that_nobody_looked_at():
+    rng = np.random.default_rng(11)
+    watched = Watched("rms", ACCELEROMETER, Setpoint(alert=1.0, off_delay_ns=4 * SECOND_NS))
+    assert ("high", "raised") in watched.take(3.0 * machine(rng, WINDOW))
+    for _ in range(4):
+        assert watched.take(0.3 * machine(rng, WINDOW), skipped=int(5 * RATE_HZ)) == []
+    skipped = watched.said[-2]
+    assert (skipped.decision, skipped.missing_share) == ("normal", 1.0)
+    assert "10000 samples of a were not judged" in skipped.reason
+    assert ("high", "returned") in watched.take(0.3 * machine(rng, 9 * WINDOW))
