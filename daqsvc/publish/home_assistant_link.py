@@ -34,6 +34,8 @@ PAUSE_S = 0.2
 SUMMARY_BYTES_PER_S = 100_000
 """What summaries may take of the way to the broker: that of 1000 alarms goes out every 2 s."""
 
+_SHOWN = 200
+
 
 class HomeAssistantLink:
     """Publishes the discovery message and the summary of the alarms.
@@ -66,7 +68,7 @@ class HomeAssistantLink:
                 message.sequence,
                 message.topic,
                 self._settings.machine,
-                error,
+                " ".join(str(error).split())[:_SHOWN],  # of pydantic: several lines
             )
 
     def take(self, message: Incoming) -> bool:
