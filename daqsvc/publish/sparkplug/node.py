@@ -62,6 +62,7 @@ class EdgeNode:
         self._name = name
         self._seq = 0
         self._aliases: dict[tuple[str | None, str], int] = {}
+        self._names: dict[int, tuple[str | None, str]] = {}
         self._born: dict[str | None, frozenset[str]] = {}
 
     @property
@@ -203,6 +204,7 @@ class EdgeNode:
         if metric.name is None or metric.name in {BDSEQ, REBIRTH}:
             raise OrderError(f"a metric cannot be named {metric.name!r}")
         alias = self._aliases.setdefault((device, metric.name), len(self._aliases) + 1)
+        self._names[alias] = device, metric.name
         return replace(metric, alias=alias)
 
     def _aliased(self, device: str | None, metric: Metric) -> Metric:
@@ -213,9 +215,9 @@ class EdgeNode:
         """A metric as a host has written it, with the name that its alias stands for."""
         if metric.name is not None or metric.alias is None:
             return metric
-        for (owner, name), alias in self._aliases.items():
-            if owner == device and alias == metric.alias:
-                return replace(metric, name=name)
+        owner, name = self._names.get(metric.alias, (None, None))
+        if name is not None and owner == device:
+            return replace(metric, name=name)
         raise PayloadError(f"alias {metric.alias} stands for no metric of {device or self._name}")
 
     def _demand(self, owner: str | None) -> None:
