@@ -56,6 +56,8 @@ COMMIT_S = 5.0
 """How long an answer waits for the disk before it says that the disk has not got it yet."""
 MOST_COMMANDS = 64
 """Commands that may wait at a time; further ones are refused."""
+GRACE_S = 0.1
+"""What those who publish may take beyond their deadline before they are left behind."""
 FORGOTTEN = "the journal was damaged and no longer knows how it stood; it begins anew"
 STOPPING = "the service is stopping; ask again when it runs"
 
@@ -322,7 +324,7 @@ class AlarmDesk:
         }
         if not stopping:
             return
-        ended, hanging = await asyncio.wait(stopping, timeout=2 * deadline_s)
+        ended, hanging = await asyncio.wait(stopping, timeout=deadline_s + GRACE_S)
         for task in hanging:
             task.cancel()
         for task in ended:

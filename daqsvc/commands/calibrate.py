@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from daqsvc.commands.calibrate_bearing import (
     shared_misuse,
 )
 from daqsvc.commands.option_types import SpeedOption
+from daqsvc.commands.signals import signals_to_end
 
 if TYPE_CHECKING:
     import argparse
@@ -211,7 +211,7 @@ def _live(machine: MachineFile, arguments: argparse.Namespace) -> CalibrationRec
     async def listen(progress: Callable[[int, int], None]) -> Calibration:
         listening = asyncio.current_task()
         assert listening is not None  # noqa: S101 - this is one
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in signals_to_end():
             asyncio.get_running_loop().add_signal_handler(number, listening.cancel)
         return await calibrate_live(
             machine,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc import kernel_cache
 from daqsvc.commands.option_types import positive
+from daqsvc.commands.signals import signals_to_end
 
 if TYPE_CHECKING:
     import argparse
@@ -141,7 +141,7 @@ def _logs(log: Path) -> set[Path]:
 async def _run_until_stopped(driver: Driver, duration_s: float | None) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in signals_to_end():
         loop.add_signal_handler(number, stop.set)
     running = asyncio.create_task(driver.run(), name="record")
     stopped = asyncio.create_task(stop.wait(), name="stop")

@@ -413,9 +413,11 @@ class Connection:
     def _reach(self, reached: asyncio.Future[Exception | None]) -> None:
         """The blocking part, on a thread of its own."""
         told = _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
-        error: Exception | None = None
+        # Said unless something else is known: whatever ends the thread, nobody waits for it in vain.
+        error: Exception | None = OSError("the thread that connects was lost")
         try:
             self._client.connect(*self._address, properties=told)
+            error = None
         except OSError as failure:  # before ValueError, which unverified certificates are, too
             error = failure
         except UnicodeError:
@@ -425,11 +427,12 @@ class Connection:
             error = OSError(f"the connection cannot be made: {failure}")
         except Exception as failure:  # noqa: BLE001  whatever it is, the caller shall see it
             error = failure
-        try:
-            self._loop.call_soon_threadsafe(self._settle, reached, error)
-        except RuntimeError:
-            # A closed loop means that the process ends and nobody waits for the connection any more.
-            self._shut()
+        finally:
+            try:
+                self._loop.call_soon_threadsafe(self._settle, reached, error)
+            except RuntimeError:
+                # A closed loop means that the process ends and nobody waits for the connection any more.
+                self._shut()
 
     def _settle(self, reached: asyncio.Future[Exception | None], error: Exception | None) -> None:
         wire = self._wire

@@ -16,6 +16,8 @@ import pytest
 from brokers import free_port
 from can_recordings import numbers
 
+from daqsvc.commands.record import ENDINGS
+from daqsvc.commands.signals import signals_to_end
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
@@ -91,7 +93,7 @@ def send_until_it_is_recorded(bus: UnixBus, log: Path) -> int:
     return sent
 
 
-@pytest.mark.parametrize("ending", [".blf", ".asc", ".log"])
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_what_is_recorded_is_printed_when_it_is_stopped(
     bus: UnixBus, machine: Path, tmp_path: Path, ending: str
 ) -> None:
@@ -100,7 +102,8 @@ def test_what_is_recorded_is_printed_when_it_is_stopped(
         sent = send_until_it_is_recorded(bus, log)
         send(bus, 1, FRAMES)
         eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
-        process.send_signal(signal.SIGTERM)
+        # All of them end it alike; SIGHUP comes when its terminal goes.
+        process.send_signal(signals_to_end()[ENDINGS.index(ending) % len(signals_to_end())])
         output, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, said
     summary = json.loads(output)

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daqsvc.acquisition.supervisor import Link
+from drivers import keeping
 from drivers.base import BusPort, DeviceAbsentError
-from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
+from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -77,6 +78,47 @@ async def test_the_wait_grows_unless_something_came_over_the_link() -> None:
         _, waits_ns, _ = await _kept([outcome] * MANY + [None])
         longest_ns[outcome] = max(waits_ns)
     assert longest_ns[USEFUL] <= FIRST_CEILING_NS < min(longest_ns[ABSENT], longest_ns[USELESS])
+
+
+async def test_an_attempt_that_fails_unforeseen_is_said_once_and_tried_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    made = 0
+
+    async def attempt() -> Attempt | None:
+        nonlocal made
+        made += 1
+        if made < 4:
+            raise KeyError("a mistake")
+        return None
+
+    link = Link("CAN bus 'can0'")
+    await keep_up(link, _port(_NotedWaits(), "error"), attempt)
+    assert made == 4
+    assert [record.levelname for record in caplog.records].count("ERROR") == 1
+    assert link.reason == "its driver failed: 'a mistake'"
+
+
+async def test_a_driver_that_is_started_again_tries_what_was_there_before() -> None:
+    link, left = Link("CAN bus 'can0'"), iter([ABSENT, None])
+    link.up()
+
+    async def attempt() -> Attempt | None:
+        return next(left)
+
+    await keep_up(link, _port(_NotedWaits(), "error"), attempt)
+    assert next(left, "none") == "none", "it was not given up"
+
+
+async def test_a_reader_whose_thread_is_gone_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeping, "LOOK_S", 0.01)
+    reason: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    reader = threading.Thread(target=lambda: None)
+    reader.start()
+    async with asyncio.timeout(20):
+        assert await ended(reason, reader) == "its reader has ended without a word"
+    reason.set_result("it was closed")
+    assert await ended(reason, reader) == "it was closed"
 
 
 async def test_an_absent_device_is_an_error_only_at_the_start_and_only_where_that_is_asked_for() -> None:
