@@ -14,6 +14,7 @@ from daqsvc.publish.settings import STALE_S, CommandSettings, HomeAssistantSetti
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.self_check import conditions
+from daqsvc.settings.alarms import DiagnosisAlarm
 from daqsvc.settings.broker_url import host_of, is_tls, port_of
 from daqsvc.settings.models import (
     BEARING,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from daqsvc.settings.alarms import Alarm
     from daqsvc.settings.models import MachineFile, Sensor
 
 
@@ -114,7 +116,24 @@ def _home_assistant(machine: MachineFile, mqtt: MqttSettings) -> HomeAssistantSe
         readings=tuple(_readings(machine)),
         prefix=given.prefix,
         enabled=given.enabled,
+        rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
+        findings=tuple(
+            name for name in machine.detectors if name in {ROTOR_BANK, ROTOR_SYNCHRONOUS, BEARING}
+        ),
+        buttons=()
+        if mqtt.commands is None
+        else tuple(verb for verb in (Verb.ACKNOWLEDGE, Verb.RESET) if verb in mqtt.commands.allow),
+        every_s=given.every_s,
+        deadband_percent=given.deadband_percent,
     )
+
+
+def _rests_on(alarm: Alarm) -> Iterator[str]:
+    """The alarms about sensors and detectors without which nobody can say that this one is not raised."""
+    if isinstance(alarm, DiagnosisAlarm):
+        yield f"detector-ok/{alarm.detector}"
+    else:
+        yield from (f"sensor-ok/{sensor}" for sensor in alarm.watched)
 
 
 def _services(machine: MachineFile, mqtt: MqttSettings | None) -> Iterator[str]:

@@ -297,6 +297,7 @@ class Service:
                 self.publisher.telemetry(
                     f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload
                 )
+                self.publisher.report(diagnosis)
 
     def _bus_health(self) -> dict[str, BusHealth]:
         found: dict[str, BusHealth] = {}

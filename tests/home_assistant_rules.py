@@ -32,6 +32,8 @@ ENTITY = {
 PLATFORMS = {
     "binary_sensor": ENTITY | {"payload_on", "payload_off", "off_delay"},
     "sensor": ENTITY | {"unit_of_measurement", "state_class", "options", "suggested_display_precision"},
+    "button": ENTITY - {"state_topic", "value_template", "expire_after", "force_update"}
+    | {"command_topic", "command_template", "payload_press", "retain"},
 }
 UNITS_OF_CLASS = {
     "voltage": {"V", "mV", "µV", "kV", "MV"},
@@ -40,7 +42,8 @@ UNITS_OF_CLASS = {
 }
 TEMPLATE = re.compile(
     r"\{\{ value_json(?P<path>(\.[a-z]\w*|\['[^'\\]+'\])*)"
-    r"(\.get\('(?P<last>[^'\\]+)'\))?(?P<json> \| tojson)? \}\}"
+    r"(\.get\('(?P<last>[^'\\]+)'\))?(?P<json> \| tojson)?"
+    r"( if value_json(?P=path)\.get\('(?P<given>[^'\\]+)'\) else None)? \}\}"
 )
 
 
@@ -51,6 +54,8 @@ def rendered(template, payload):
     value = payload
     for dotted, bracketed in re.findall(r"\.([a-z]\w*)|\['([^'\\]+)'\]", found["path"]):
         value = value[dotted or bracketed]
+    if found["given"] and not value.get(found["given"]):
+        return "None"
     if found["last"]:
         value = value.get(found["last"])
     return json.dumps(value) if found["json"] else str(value)
@@ -78,6 +83,9 @@ def check_discovery(topic, payload):
 
 def _check_entity(entity):
     assert set(entity) <= PLATFORMS[entity["platform"]], entity
+    if entity["platform"] == "button":
+        assert not set(entity["command_topic"]) & set("+#")
+        return
     assert not set(entity["state_topic"]) & set("+#")
     assert TEMPLATE.fullmatch(entity["value_template"])
     if entity["platform"] == "binary_sensor":

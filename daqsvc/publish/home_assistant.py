@@ -8,12 +8,16 @@ consumer reads too; the templates only pick keys.
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import daqsvc
-from daqsvc.alarms.states import Level
+from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.publish.home_assistant_readings import digits_of
+from daqsvc.publish.settings import STALE_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,24 +31,17 @@ _UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F
 _CLASSES = {"mm/s": "speed", "V": "voltage", "degC": "temperature", "degF": "temperature"}
 """Device classes of Home Assistant that know the unit; it has none for micrometres or g."""
 
+_ABOUT = {"sensor-ok/": "sensor fault", "detector-ok/": "detector fault"}
+"""Alarms that are called after what is well while they are not raised, and what a person reads instead."""
 
-_DIGITS = {
-    "um": 1,
-    "mil": 2,
-    "mm": 4,
-    "g": 3,
-    "m/s2": 2,
-    "mm/s": 2,
-    "V": 2,
-    "rpm": 1,
-    "deg": 1,
-    "degC": 1,
-    "degF": 1,
-}
-"""Decimal places by unit, so that the levels of a smooth machine still show two figures or so."""
+_MISSED = 2.5
+"""A figure is no longer true when so many of its turns to be told have passed without it."""
 
-_DIGITS_OF_A_NUMBER = 3
-"""Decimal places of a probability, and of what has no unit or an unknown one."""
+_BUTTONS = {Verb.ACKNOWLEDGE: "mdi:check", Verb.RESET: "mdi:restore"}
+"""What can be done with an alarm by one press, and how that is drawn."""
+
+_COMMAND_ID = "ha-{{ utcnow().timestamp() }}-{{ '%05d' % (range(100000) | random) }}"
+"""A template for an id that no other press has."""
 
 MOST_REMOVED = 1000
 """Entities of an earlier message that are removed at a time."""
@@ -77,11 +74,12 @@ class Discovery:
 
     def payload(self) -> dict[str, Any]:
         """The device with all its entities."""
-        settings, machine = self.settings, self.settings.machine
+        settings = self.settings
         return {
             "device": {
                 "identifiers": [self._id],
-                "name": machine,
+                # Entities are called after it, and two boxes may both watch a "pump".
+                "name": f"{settings.machine} ({self.topics.site}/{self.topics.box})",
                 "manufacturer": "daqsvc",
                 "model": settings.description or "rotating machine",
                 "sw_version": daqsvc.__version__,
@@ -137,8 +135,12 @@ class Discovery:
         for alarm in self.settings.alarms:
             made[f"alarm/{alarm}"] = self._problem(alarm)
             made[f"level/{alarm}"] = self._level(alarm)
+            made[f"state/{alarm}"] = self._state(alarm)
+            made |= {f"{verb}/{alarm}": self._button(verb, alarm) for verb in self.settings.buttons}
         for alarm in self.settings.services:
             made[f"alarm/{alarm}"] = {**self._problem(alarm), "entity_category": "diagnostic"}
+        for detector in self.settings.findings:
+            made[f"finding/{detector}"] = self._finding(detector)
         for reading in self.settings.readings:
             made[f"{reading.kind}/{reading.detector}/{reading.key}"] = self._sensor(reading)
         return {
@@ -150,7 +152,7 @@ class Discovery:
         summary = self.topics.summary(self.settings.machine)
         return {
             "platform": "binary_sensor",
-            "name": alarm,
+            "name": _in_words(alarm),
             "device_class": "problem",
             "state_topic": summary,
             "value_template": _pick("alarms", alarm, "problem"),
@@ -165,18 +167,58 @@ class Discovery:
             "device_class": "enum",
             "options": [level.label for level in Level],
             "state_topic": self.topics.summary(self.settings.machine),
-            "value_template": _pick("alarms", alarm, "level"),
+            # The level of an alarm that is covered, or that nobody can judge, is not "normal" but unknown.
+            "value_template": _pick("alarms", alarm, "level", given="problem"),
         }
+
+    def _state(self, alarm: str) -> dict[str, Any]:
+        return {
+            "platform": "sensor",
+            "name": f"{alarm} alarm state",
+            "device_class": "enum",
+            "options": [state.value for state in AlarmState],
+            "state_topic": self.topics.summary(self.settings.machine),
+            "value_template": _pick("alarms", alarm, "state"),
+        }
+
+    def _button(self, verb: Verb, alarm: str) -> dict[str, Any]:
+        command = {
+            "schema": "daqsvc.command/1",
+            "id": _COMMAND_ID,
+            "alarm": alarm,
+            "by": "Home Assistant",
+            "issued_at": "{{ utcnow().isoformat() }}",
+        }
+        return {
+            "platform": "button",
+            "name": f"{verb} {alarm}",
+            "icon": _BUTTONS[verb],
+            "command_topic": self.topics.command(self.settings.machine, verb),
+            "command_template": json.dumps(command),
+        }
+
+    def _finding(self, detector: str) -> dict[str, Any]:
+        return {
+            "platform": "sensor",
+            "name": f"{detector} finding",
+            "icon": "mdi:stethoscope",
+            "state_topic": self.topics.readings(self.settings.machine, detector),
+            "value_template": _pick("finding"),
+            "expire_after": self._stale_s(STALE_S),
+        }
+
+    def _stale_s(self, stale_s: int) -> int:
+        return max(stale_s, math.ceil(_MISSED * self.settings.every_s))
 
     def _sensor(self, reading: Reading) -> dict[str, Any]:
         made: dict[str, Any] = {
             "platform": "sensor",
             "name": f"{reading.detector} {reading.key.replace('_', ' ')}",
             "state_class": "measurement",
-            "state_topic": self.topics.diagnosis(self.settings.machine, reading.detector),
+            "state_topic": self.topics.readings(self.settings.machine, reading.detector),
             "value_template": _pick(reading.kind, reading.key),
-            "expire_after": reading.stale_s,
-            "suggested_display_precision": _DIGITS.get(reading.unit, _DIGITS_OF_A_NUMBER),
+            "expire_after": self._stale_s(reading.stale_s),
+            "suggested_display_precision": digits_of(reading.unit),
         }
         made |= _in_home_assistant(reading.unit)
         return made
@@ -195,11 +237,26 @@ def _in_home_assistant(unit: str) -> Mapping[str, str]:
     return {**named, "device_class": _CLASSES[unit]} if unit in _CLASSES else named
 
 
-def _pick(*keys: str, as_json: bool = False) -> str:
-    """A template for one key below others; ``None`` where there is none, which is shown as unknown."""
+def _pick(*keys: str, as_json: bool = False, given: str = "") -> str:
+    """A template for one key below others; ``None`` where there is none, which is shown as unknown.
+
+    Args:
+        keys: the way to it.
+        as_json: pick what is a group of keys itself.
+        given: a key beside it without which there is nothing to show.
+    """
     *above, last = keys
-    found = "value_json" + "".join(f"[{_quoted(key)}]" for key in above) + f".get({_quoted(last)})"
-    return f"{{{{ {found}{' | tojson' if as_json else ''} }}}}"
+    group = "value_json" + "".join(f"[{_quoted(key)}]" for key in above)
+    condition = f" if {group}.get({_quoted(given)}) else None" if given else ""
+    return f"{{{{ {group}.get({_quoted(last)}){' | tojson' if as_json else ''}{condition} }}}}"
+
+
+def _in_words(alarm: str) -> str:
+    """What an alarm is called where *problem* stands beside it."""
+    for prefix, what in _ABOUT.items():
+        if alarm.startswith(prefix):
+            return f"{alarm.removeprefix(prefix)} {what}"
+    return alarm
 
 
 def _quoted(key: str) -> str:

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 
 from daqsvc.publish.errors import PublishRefusedError
 from daqsvc.publish.home_assistant import Discovery
+from daqsvc.publish.home_assistant_readings import Readings
 from daqsvc.publish.summary import Summary
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.settings import HomeAssistantSettings
@@ -27,6 +29,9 @@ BIRTH_DELAY_S = 5.0
 
 EARLIER_S = 1.0
 """How long an earlier discovery message that is retained at the broker may take to arrive."""
+
+LOOK_S = 1.0
+"""How often it is looked whether figures have moved."""
 
 PAUSE_S = 0.2
 """What lies between two summaries at least; what comes meanwhile is in the next."""
@@ -51,7 +56,10 @@ class HomeAssistantLink:
         self._topics = topics
         self._clock = clock
         self._discovery = Discovery(settings, topics)
-        self._summary = Summary(settings.machine, (*settings.alarms, *settings.services), topics)
+        self._summary = Summary(
+            settings.machine, (*settings.alarms, *settings.services), topics, settings.rests_on
+        )
+        self._readings = Readings(settings, topics, clock)
         self._changed = asyncio.Event()
         self._born = asyncio.Event()
         self._earlier: asyncio.Future[bytes] | None = None
@@ -70,6 +78,17 @@ class HomeAssistantLink:
                 self._settings.machine,
                 " ".join(str(error).split())[:_SHOWN],  # of pydantic: several lines
             )
+
+    def report(self, diagnosis: Diagnosis) -> None:
+        """Take in what a detector says."""
+        self._readings.note(diagnosis)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Where something is retained at the broker while the machine is told; empty if it is not."""
+        if not self._settings.enabled:
+            return ()
+        return (self._discovery.topic, self._topics.summary(self._settings.machine))
 
     def take(self, message: Incoming) -> bool:
         """Take in a message from the broker; whether it was meant for this link."""
@@ -115,14 +134,16 @@ class HomeAssistantLink:
         changed = asyncio.create_task(self._changed.wait())
         try:
             while True:
-                await asyncio.wait({born, changed}, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({born, changed}, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+                for topic, payload in self._readings.due():
+                    await connection.deliver(topic, payload, retain=False)
                 if born.done():
                     # Spreads the load on one broker, it keeps no secret.
                     await asyncio.sleep(random.uniform(0, BIRTH_DELAY_S))  # noqa: S311
                     self._born.clear()
                     await self._tell(connection)
                     born = asyncio.create_task(self._born.wait())
-                else:
+                elif changed.done():
                     await self._summarise(connection)
                     # A summary tells of all alarms. For each event of a flood anew, it would be the flood.
                     await asyncio.wait({born}, timeout=self._pause_s)
@@ -147,6 +168,7 @@ class HomeAssistantLink:
             await connection.deliver(self._discovery.topic, _json(told), retain=True)
 
     async def _tell(self, connection: Connection) -> None:
+        self._readings.forget()
         await connection.deliver(self._discovery.topic, _json(self._discovery.payload()), retain=True)
         await self._summarise(connection)
 

@@ -27,6 +27,7 @@ from daqsvc.publish.errors import (
 )
 from daqsvc.publish.faults import Faults
 from daqsvc.publish.home_assistant_link import HomeAssistantLink
+from daqsvc.publish.home_assistant_memory import ToldTopics
 from daqsvc.publish.outage import Outage, has_expired, in_words
 from daqsvc.publish.payloads import availability_payload
 from daqsvc.publish.session import CredentialsReplacedError, Session
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.credentials import Credentials
 
@@ -106,6 +108,9 @@ class MqttPublisher:
         self._home_assistant: HomeAssistantLink | None = None
         if settings.home_assistant is not None:
             self._home_assistant = HomeAssistantLink(settings.home_assistant, self.topics, clock)
+        self._told = ToldTopics(
+            outbox.directory, () if self._home_assistant is None else self._home_assistant.topics
+        )
         self._expiry: dict[str, int] = {}
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._quick_losses = 0
@@ -171,6 +176,11 @@ class MqttPublisher:
         self._outbox.telemetry(
             f"{self.topics.base}/{topic}", payload, expiry_s=self._settings.telemetry_expiry_s
         )
+
+    def report(self, diagnosis: Diagnosis) -> None:
+        """Take in what a detector says, for those who look at figures now and then; never waits."""
+        if self._home_assistant is not None:
+            self._home_assistant.report(diagnosis)
 
     @property
     def refused(self) -> Mapping[str, str]:
@@ -350,6 +360,7 @@ class MqttPublisher:
             faults=self._faults,
             intake=self._intake,
             home_assistant=self._home_assistant,
+            told=self._told,
             ends_soon=self._ends_soon,
             stopping=self._stopping,
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.home_assistant_readings import ReadingsPayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.publish.summary import SummaryPayload
 
@@ -24,6 +25,7 @@ PAYLOADS: Mapping[str, type[BaseModel]] = {
     "daqsvc.availability/1": AvailabilityPayload,
     "daqsvc.command/1": CommandPayload,
     "daqsvc.diagnosis/1": DiagnosisPayload,
+    "daqsvc.readings/1": ReadingsPayload,
     "daqsvc.response/1": ResponsePayload,
     "daqsvc.status/1": StatusPayload,
     "daqsvc.summary/1": SummaryPayload,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from daqsvc.publish.credentials import Credentials
     from daqsvc.publish.faults import Faults
     from daqsvc.publish.home_assistant_link import HomeAssistantLink
+    from daqsvc.publish.home_assistant_memory import ToldTopics
     from daqsvc.publish.settings import MqttSettings
     from daqsvc.publish.topics import Topics
 
@@ -57,6 +58,7 @@ class Session:
         faults: takes mistakes of this program.
         intake: takes commands; None if there are none over MQTT.
         home_assistant: None to leave Home Assistant alone.
+        told: what it was told before.
         ends_soon: whether the certificate that the broker has shown, or the one behind it, ends soon.
         stopping: ends the deliveries as soon as nothing is left.
     """
@@ -74,6 +76,7 @@ class Session:
         faults: Faults,
         intake: CommandIntake | None,
         home_assistant: HomeAssistantLink | None,
+        told: ToldTopics,
         ends_soon: Callable[[], bool],
         stopping: asyncio.Event,
     ) -> None:
@@ -87,6 +90,7 @@ class Session:
         self._faults = faults
         self._intake = intake
         self._home_assistant = home_assistant
+        self._told = told
         self._ends_soon = ends_soon
         self._stopping = stopping
         self._said_refused: set[str] = set()
@@ -120,10 +124,8 @@ class Session:
             asyncio.create_task(self._listen(), name="mqtt-listen"),
             asyncio.create_task(self._look_after_credentials(), name="mqtt-credentials"),
             asyncio.create_task(self._stopping.wait(), name="mqtt-stopping"),
+            asyncio.create_task(self._tell_home_assistant(), name="mqtt-home-assistant"),
         }
-        if self._home_assistant is not None:
-            telling = self._tell_home_assistant(self._home_assistant)
-            others.add(asyncio.create_task(telling, name="mqtt-home-assistant"))
         try:
             await self._until_stopped(deliveries, others)
             await self._hand_over(deliveries, others, left_s)
@@ -178,9 +180,14 @@ class Session:
                 reason,
             )
 
-    async def _tell_home_assistant(self, link: HomeAssistantLink) -> None:
-        # What the broker has known for long is not told again in time: the summary must not begin without it.
+    async def _tell_home_assistant(self) -> None:
+        link = self._home_assistant
         try:
+            await self._take_away_left_over()
+            if link is None:
+                return
+            # What the broker has known for long is not told again in time: the summary must not begin
+            # without it.
             for message in await self._outbox.retained():
                 link.note(message)
             await link.run(self._connection)
@@ -188,6 +195,23 @@ class Session:
             raise
         except Exception as error:  # noqa: BLE001  alarms matter more than discovery
             self._faults.note("Home Assistant is told nothing more until the next connection", error)
+
+    async def _take_away_left_over(self) -> None:
+        """Take away what an earlier start has told Home Assistant and this one does not."""
+        refused = []
+        for topic in await asyncio.to_thread(self._told.left_over):
+            try:
+                await self._connection.deliver(topic, b"", retain=True)
+                log.info("taken away from Home Assistant, as the machine file no longer has it: %s", topic)
+            except PublishRefusedError as error:
+                refused.append(topic)
+                log.warning(
+                    "Home Assistant keeps showing what the machine file no longer has: %s; take the retained "
+                    "message away from %s at the broker, or allow this client to",
+                    error,
+                    topic,
+                )
+        await asyncio.to_thread(self._told.remember, refused)
 
     async def _telemetry(self) -> None:
         delivery = TelemetryDelivery(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from daqsvc.alarms.commands import Verb
@@ -65,6 +66,11 @@ class HomeAssistantSettings:
         readings: the figures to show.
         prefix: Home Assistant's discovery prefix.
         enabled: False to take away what an earlier start has told.
+        rests_on: by alarm, the alarms about sensors and detectors that say whether it can be judged at all.
+        findings: the detectors whose decision is shown.
+        buttons: what a person may do with an alarm from there: the commands that the box obeys.
+        every_s: how often figures are told that do not move.
+        deadband_percent: by how much a figure must move to be told before its time.
     """
 
     machine: str
@@ -74,6 +80,11 @@ class HomeAssistantSettings:
     readings: tuple[Reading, ...] = ()
     prefix: str = "homeassistant"
     enabled: bool = True
+    rests_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
+    buttons: tuple[Verb, ...] = ()
+    every_s: float = 60.0
+    deadband_percent: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)

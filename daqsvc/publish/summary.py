@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, Field
@@ -12,7 +13,7 @@ from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the
 from daqsvc.publish.payloads import Payload, Stamped, stamp_now
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.store import OutboxMessage
@@ -28,8 +29,8 @@ class StandingPayload(Payload):
     """How one alarm stands."""
 
     problem: Literal["ON", "OFF"] | None = Field(
-        description="ON from raising to return or reset; null while the alarm is covered: suppressed, "
-        "shelved or out of service"
+        description="ON from raising to return or reset; null while the alarm is covered (suppressed, "
+        "shelved or out of service), or is not raised and what it rests on is not OK: nobody can say then"
     )
     state: AlarmState
     level: Severity
@@ -66,12 +67,27 @@ class Summary:
         machine: name of the machine.
         alarms: those that are normal until something else is said.
         topics: the box.
+        rests_on: by alarm, the alarms about sensors and detectors; while one of them is active, nobody can
+            say that there is no problem.
     """
 
-    def __init__(self, machine: str, alarms: Iterable[str], topics: Topics) -> None:
+    def __init__(
+        self,
+        machine: str,
+        alarms: Iterable[str],
+        topics: Topics,
+        rests_on: Mapping[str, Iterable[str]] = MappingProxyType({}),
+    ) -> None:
         self._machine = machine
         self._topics = topics
         self._alarms: dict[str, bytes] = {}
+        self._standings: dict[str, StandingPayload] = {}
+        self._rests_on = {alarm: frozenset(services) for alarm, services in rests_on.items()}
+        self._resting: dict[str, list[str]] = {}
+        for alarm, services in self._rests_on.items():
+            for service in services:
+                self._resting.setdefault(service, []).append(alarm)
+        self._not_ok: set[str] = set()
         for name in alarms:
             self._put(name, _untold())
 
@@ -96,6 +112,11 @@ class Summary:
                 message=told.message,
             ),
         )
+        if told.alarm in self._resting:
+            (self._not_ok.discard if told.state in _GONE else self._not_ok.add)(told.alarm)
+            for alarm in self._resting[told.alarm]:
+                if alarm in self._standings:
+                    self._put(alarm, self._standings[alarm])
         return True
 
     def to_json(self, clock: Clock) -> bytes:
@@ -105,6 +126,9 @@ class Summary:
         return empty.removesuffix(_NO_ALARMS) + b'"alarms":{' + b",".join(self._alarms.values()) + b"}}"
 
     def _put(self, name: str, standing: StandingPayload) -> None:
+        self._standings[name] = standing
+        if standing.problem == "OFF" and self._rests_on.get(name, frozenset()) & self._not_ok:
+            standing = standing.model_copy(update={"problem": None})
         self._alarms[name] = json.dumps(name, ensure_ascii=False).encode() + b":" + standing.to_json()
 
 

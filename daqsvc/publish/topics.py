@@ -71,6 +71,10 @@ class Topics:
         """Every diagnosis of one detector."""
         return f"{self.base}/{_safe(machine)}/diagnosis/{_safe(detector)}"
 
+    def readings(self, machine: str, detector: str) -> str:
+        """Rounded figures of one detector, now and then, for people to look at."""
+        return f"{self.base}/{_safe(machine)}/readings/{_safe(detector)}"
+
     def summary(self, machine: str) -> str:
         """How all alarms of a machine stand; retained."""
         return f"{self.base}/{_safe(machine)}/summary"

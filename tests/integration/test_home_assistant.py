@@ -12,6 +12,8 @@ from home_assistant_rules import check_discovery, rendered
 from mqtt_publishing import publishing
 from test_mqtt_commands import say
 
+from daqsvc.alarms.commands import Verb
+from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.settings import HomeAssistantSettings, Reading
 
 pytestmark = pytest.mark.mosquitto
@@ -20,14 +22,18 @@ RIG = HomeAssistantSettings(
     alarms=("rotor-fault",),
     services=("sensor-ok/probe-x",),
     readings=(Reading("levels/probe-x", "statistics", "rms", "um"),),
+    rests_on={"rotor-fault": ("sensor-ok/probe-x",)},
+    findings=("rotor-bank",),
+    buttons=(Verb.ACKNOWLEDGE, Verb.RESET),
 )
+LEVEL = Diagnosis("rig", "levels/probe-x", 0, "shaft", 0, 320, "normal", statistics={"rms": 41.2487})
 CONFIG = "homeassistant/device/daqsvc_2flab_2fedge-1_2frig/config"
 SUMMARY = "daqsvc/lab/edge-1/rig/summary"
 
 
-def alarm(state, level, occurrence="o-1"):
+def alarm(state, level, occurrence="o-1", name="rotor-fault"):
     told = {
-        "alarm": "rotor-fault",
+        "alarm": name,
         "state": state,
         "level": level,
         "occurrence": occurrence,
@@ -81,13 +87,40 @@ async def test_alarms_show_up_and_follow(mosquitto, outbox, protocol):
             await outbox.append(topic, alarm(state, level), retain=True)
             await eventually(lambda: standing(live)["state"] == state, state)  # noqa: B023  awaited here
             assert entity(live, "alarm/rotor-fault") == shown
-            assert entity(live, "level/rotor-fault") == level
-        publisher.telemetry(
-            "rig/diagnosis/levels/probe-x", json.dumps({"statistics": {"rms": 41.25}}).encode()
-        )
-        await eventually(lambda: live.on("/diagnosis/"), "the level arrives")
-        assert entity(live, "levels/probe-x/rms") == "41.25"
+            assert entity(live, "level/rotor-fault") == ("None" if shown == "None" else level)
+            assert entity(live, "state/rotor-fault") == state
+        publisher.report(LEVEL)
+        await eventually(lambda: live.on("/readings/"), "the level arrives")
+        assert entity(live, "levels/probe-x/rms") == "41.2"
         assert len(await retained(mosquitto.port, SUMMARY)) == 1
+
+
+async def test_without_good_data_no_alarm_is_said_to_be_off(mosquitto, outbox):
+    async with (
+        Consumer(mosquitto.port) as live,
+        publishing(outbox, mosquitto.port, home_assistant=RIG) as publisher,
+    ):
+        await eventually(lambda: live.on("/summary"), "the machine is told")
+        sensor = publisher.topics.alarm("rig", "sensor-ok/probe-x")
+        fault = publisher.topics.alarm("rig", "rotor-fault")
+
+        async def shown(topic, told, expected):
+            await outbox.append(topic, told, retain=True)
+            await eventually(
+                lambda: (entity(live, "alarm/rotor-fault"), entity(live, "level/rotor-fault")) == expected,
+                f"{expected} is shown",
+            )
+
+        silent = alarm("active_unacknowledged", "alert", name="sensor-ok/probe-x")
+        back = alarm("normal", "normal", name="sensor-ok/probe-x")
+        await shown(sensor, silent, ("None", "None"))
+        assert entity(live, "alarm/sensor-ok/probe-x") == "ON"
+        await shown(sensor, back, ("OFF", "normal"))
+        # What is raised stays raised: missing data clears nothing.
+        await shown(fault, alarm("active_unacknowledged", "danger"), ("ON", "danger"))
+        await outbox.append(sensor, silent, retain=True)
+        await shown(fault, alarm("active_acknowledged", "danger"), ("ON", "danger"))
+        await shown(fault, alarm("normal", "normal"), ("None", "None"))
 
 
 async def test_a_restart_knows_how_the_alarms_stand_before_anything_happens(mosquitto, outbox):
@@ -156,6 +189,29 @@ async def test_switched_off_the_machine_is_taken_away(mosquitto, outbox):
         await eventually(lambda: mosquitto.log_text.count("Received PUBLISH") > 3, "it is taken away")
         assert await retained(mosquitto.port, CONFIG) == []
         assert await retained(mosquitto.port, SUMMARY) == []
+
+
+async def test_without_its_section_the_machine_is_taken_away_too(mosquitto, outbox):
+    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+        await eventually_told(mosquitto, "rotor-fault")
+    async with publishing(outbox, mosquitto.port) as publisher:
+        await eventually(lambda: publisher.counters.connected, "connected")
+        await eventually(lambda: mosquitto.log_text.count(CONFIG) > 1, "it is taken away")
+        await eventually(lambda: not publisher._told.left_over(), "that is remembered")
+    assert await retained(mosquitto.port, CONFIG) == []
+    assert await retained(mosquitto.port, SUMMARY) == []
+
+
+async def test_under_another_prefix_the_old_one_is_taken_away(mosquitto, outbox):
+    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+        await eventually_told(mosquitto, "rotor-fault")
+    moved = replace(RIG, prefix="ha2")
+    async with publishing(outbox, mosquitto.port, home_assistant=moved) as publisher:
+        await eventually(lambda: not publisher._told.left_over(), "the old one is taken away")
+        async with Consumer(mosquitto.port, "ha2/#") as live:
+            await eventually(lambda: live.messages, "it is told under the new one")
+    assert await retained(mosquitto.port, CONFIG) == []
+    assert len(await retained(mosquitto.port, SUMMARY)) == 1
 
 
 async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, outbox, caplog):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from machine_files import LAVAL, MACHINES
 
 from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarms.events import Identity
 from daqsvc.assembly_mqtt import mqtt_settings
 from daqsvc.diagnosis.detector import Window
+from daqsvc.publish.command_payloads import CommandPayload
 from daqsvc.publish.home_assistant import Discovery
-from daqsvc.publish.payloads import diagnosis_payload
+from daqsvc.publish.home_assistant_readings import Readings
 from daqsvc.publish.settings import HomeAssistantSettings, Reading
 from daqsvc.publish.topics import Topics
 from daqsvc.settings import parse_machine_file
@@ -88,7 +89,7 @@ def test_names_that_differ_stay_apart():
     told = {Discovery(HomeAssistantSettings(name), topics).topic for name in ("a.b", "a-b", "a_b", "a_2eb")}
     assert len(told) == 4
     settings = HomeAssistantSettings("rig", alarms=("a.b", "a-b", "a_b", "a_2eb"))
-    assert len(Discovery(settings, topics).payload()["components"]) == 8
+    assert len(Discovery(settings, topics).payload()["components"]) == 12
 
 
 @pytest.mark.parametrize(
@@ -108,28 +109,64 @@ def said():
     x, y = (um + 2.0 * rng.standard_normal(len(um)) for um in motion.in_um(100.0))
     samples = np.column_stack((x, y, keyphasor_voltage(motion.revolution))).astype(np.float32)
     period_ns = 1e9 / 640.0
-    identity, clock = Identity(rig.site, rig.box, rig.machine.name), SystemClock()
-    topics = Topics("daqsvc", rig.site, rig.box)
-    last = {}
+    readings = Readings(mqtt_settings(rig).home_assistant, Topics("daqsvc", rig.site, rig.box), SystemClock())
+    units = {}
     for detector in assembly.detectors(rig):
         detector.warm()
         for begin in range(0, len(samples) - detector.block + 1, detector.block):
             part = samples[begin : begin + detector.block]
             window = Window(begin, part, round((begin + len(part) - 1) * period_ns), period_ns)
             for diagnosis in detector.process(window):
-                payload = diagnosis_payload(identity, diagnosis, clock)
-                last[topics.diagnosis(rig.machine.name, diagnosis.detector)] = json.loads(payload.to_json())
-    return last
+                readings.note(diagnosis)
+                units |= {(diagnosis.detector, key): unit for key, unit in diagnosis.units.items()}
+    return {topic: json.loads(payload) for topic, payload in readings.due()}, units
 
 
 def test_every_figure_of_the_example_rig_is_one_that_its_detectors_tell(said):
+    told, units = said
     entities = discovery(LAVAL).payload()["components"].values()
-    figures = [entity for entity in entities if "/diagnosis/" in entity["state_topic"]]
+    figures = [entity for entity in entities if "state_class" in entity]
     assert len(figures) > 6
     for entity in figures:
-        shown = rendered(entity["value_template"], said[entity["state_topic"]])
+        payload = told[entity["state_topic"]]
+        shown = rendered(entity["value_template"], payload)
         assert math.isfinite(float(shown)), entity
         if "unit_of_measurement" in entity:
             key = entity["unique_id"].rpartition("/")[2]
-            unit = said[entity["state_topic"]]["units"][key]
-            assert entity["unit_of_measurement"] in {unit, "µm"}
+            assert entity["unit_of_measurement"] in {units[payload["detector"], key], "µm"}
+    (finding,) = [entity for entity in entities if "/finding/" in entity["unique_id"]]
+    assert rendered(finding["value_template"], told[finding["state_topic"]]) == "N"
+
+
+def test_buttons_ask_for_what_the_box_would_obey():
+    rig = machine(LAVAL)
+    entities = discovery(LAVAL).payload()["components"].values()
+    buttons = [entity for entity in entities if entity["platform"] == "button"]
+    allowed = {verb for verb in ("acknowledge", "reset") if verb in rig.mqtt.commands.allow}
+    assert rig.mqtt.commands.enabled
+    assert len(buttons) == len(allowed) * len(rig.alarms) > 0
+    for button in buttons:
+        # The templates in it, as Home Assistant fills them.
+        text = button["command_template"].replace("{{ utcnow().isoformat() }}", "2026-11-22T08:00:00+00:00")
+        text = text.replace("{{ utcnow().timestamp() }}", "1795331234.123456")
+        text = text.replace("{{ '%05d' % (range(100000) | random) }}", "00042")
+        command = CommandPayload.model_validate_json(text)
+        verb = button["command_topic"].rpartition("/")[2]
+        assert button["command_topic"] == f"daqsvc/{rig.site}/{rig.box}/{rig.machine.name}/commands/{verb}"
+        assert verb in allowed
+        assert button["unique_id"].endswith(f"/{verb}/{command.alarm}")
+    silent = replace(mqtt_settings(rig).home_assistant, buttons=())
+    none = Discovery(silent, Topics("daqsvc", rig.site, rig.box)).payload()["components"]
+    assert not [entity for entity in none.values() if entity["platform"] == "button"]
+
+
+def test_names_read_right_beside_problem_and_boxes_stay_apart():
+    settings = HomeAssistantSettings(
+        "pump", alarms=("shaking",), services=("sensor-ok/probe-x", "detector-ok/bearing", "store/disk")
+    )
+    told = [Discovery(settings, Topics("daqsvc", "lab", box)).payload() for box in ("one", "two")]
+    assert [payload["device"]["name"] for payload in told] == ["pump (lab/one)", "pump (lab/two)"]
+    problems = {e["name"] for e in told[0]["components"].values() if e["platform"] == "binary_sensor"}
+    assert problems == {"shaking", "probe-x sensor fault", "bearing detector fault", "store/disk"}
+    ids = [{e["unique_id"] for e in payload["components"].values()} for payload in told]
+    assert ids[0].isdisjoint(ids[1])

@@ -1,0 +1,65 @@
+"""What Home Assistant was told and stays retained at the broker, remembered over restarts.
+
+A machine that is taken out of the machine file, renamed or told under another prefix would stand there as it
+was last seen, healthy for ever.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from typing import TYPE_CHECKING, Final
+
+from daqsvc.outbox.files import replace_durably
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+FILE: Final = "home-assistant.json"
+_MOST_BYTES = 65_536
+
+
+class ToldTopics:
+    """Topics that hold a retained message of this box for Home Assistant.
+
+    Args:
+        directory: where they are remembered.
+        now: those that are told from now on.
+    """
+
+    def __init__(self, directory: Path, now: Iterable[str]) -> None:
+        self.now = frozenset(now)
+        self._path = directory / FILE
+
+    def left_over(self) -> list[str]:
+        """Those that were told by an earlier start and are not any more; blocks."""
+        return sorted(self._read() - self.now)
+
+    def remember(self, left_over: Iterable[str] = ()) -> None:
+        """Write down what is told from now on, and what could not be taken away; blocks."""
+        topics = self.now | set(left_over)
+        if topics == self._read():
+            return
+        try:
+            replace_durably(self._path, json.dumps({"topics": sorted(topics)}).encode())
+        except OSError as error:
+            log.warning(
+                "%s cannot be written: %s; what Home Assistant is told now may stay there when the machine "
+                "file no longer has it",
+                self._path,
+                error,
+            )
+
+    def _read(self) -> frozenset[str]:
+        try:
+            with self._path.open("rb") as file:
+                told = json.loads(file.read(_MOST_BYTES))
+            return frozenset(topic for topic in told["topics"] if isinstance(topic, str) and topic)
+        except FileNotFoundError:
+            return frozenset()
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            log.warning("%s is of no use: %s", self._path, error)
+            return frozenset()
