@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, TypeGuard, Union, get_args, get_origin
 
@@ -35,6 +36,7 @@ def value_at(document: Any, path: KeyPath) -> Any:
     return value
 
 
+_MOST_HOMES = 2
 _field_types: dict[int, Any] = {}
 _adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}
 """Both by the identity of what they belong to, fields and types of the models, which live as long as this."""
@@ -78,6 +80,35 @@ def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
         else:
             return None
     return declared
+
+
+@cache
+def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
+    """Every key of the format, with the tables that can hold it."""
+    found: dict[str, list[str]] = {}
+
+    def walk(declared: Any, path: str) -> None:
+        kinds, bare = kinds_of(declared), _bare(declared)
+        element = _element_type(declared)
+        if kinds is not None or _is_section(bare):
+            for section in kinds.sections if kinds is not None else (bare,):
+                for name, field in section.model_fields.items():
+                    places = found.setdefault(name, [])
+                    if path and path not in places:
+                        places.append(path)
+                    walk(field_type(field), f"{path}.{name}" if path else name)
+        elif element is not None:
+            several = f"{path}.NAME" if get_origin(bare) is dict else f"[{path}]"
+            walk(element, path if "." in path and get_origin(bare) is tuple else several)
+
+    walk(root, "")
+    return {name: tuple(places) for name, places in found.items()}
+
+
+def homes_of(root: type[Section], key: str) -> tuple[str, ...]:
+    """The tables that can hold a key, as people write them; none where there are many or none."""
+    places = _homes(root).get(key, ())
+    return tuple(f"[{place}]" for place in places) if len(places) <= _MOST_HOMES else ()
 
 
 def only_follows(error: ErrorDetails, document: Any) -> bool:

@@ -7,7 +7,8 @@ import re
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-from daqsvc.settings.schema import declared_at, kinds_of, section_of, value_at
+from daqsvc.settings.aliases import meant_key
+from daqsvc.settings.schema import declared_at, homes_of, kinds_of, section_of, value_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -45,10 +46,7 @@ def is_secret(path: KeyPath) -> bool:
 
 def suggested_key(section: type[Section], table: Mapping[str, Any], key: str) -> str | None:
     """The key of ``section`` that an unknown ``key`` was probably meant to be."""
-    free = [name for name in section.model_fields if name not in table]
-    without_unit = [name for name in free if name.startswith(f"{key.lower()}_")]
-    close = without_unit or get_close_matches(key.lower(), free, n=1, cutoff=0.7)
-    return close[0] if close else None
+    return meant_key(key, [name for name in section.model_fields if name not in table])
 
 
 def _shown(limit: float) -> str:
@@ -95,16 +93,20 @@ class Words:
             raise LookupError(path)
         kinds = kinds_of(declared)
         others = [other.kind for other in (kinds.sections if kinds else ()) if key in other.model_fields]
-        if others:
+        meant = None if is_secret(path) else suggested_key(section, table, key)
+        needed = meant is not None and section.model_fields[meant].is_required()
+        if others and not needed:
             return f"belongs to {' or '.join(others)}, but this is {section.kind}", "remove it"
         if is_secret(path):
             return (
                 "does not belong into a machine file",
                 "write it into a file that only the service can read and name that in password_file",
             )
-        meant = suggested_key(section, table, key)
         if meant is not None:
             return "unknown key", f"did you mean {meant}?"
+        homes = homes_of(self._root, key)
+        if homes:
+            return "unknown key", f"move it to {' or '.join(homes)}, where it belongs"
         free = sorted(name for name in section.model_fields if name not in table)
         keys = f"; possible here: {', '.join(free)}" if free else ""
         return "unknown key", f"remove it{keys}"
