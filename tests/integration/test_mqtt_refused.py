@@ -96,6 +96,7 @@ async def test_what_is_too_large_for_the_broker_holds_up_no_other(tmp_path, outb
             await append(outbox, GOOD, size=2000)
             others = await append(outbox, BAD, 3)
             await eventually(lambda: sequences(live, BAD) == others, "the smaller ones have passed")
+            await eventually(lambda: GOOD in publisher.refused, "the large one is kept")
             assert "raise the largest packet there" in publisher.refused[GOOD]
             publisher.telemetry("status", b"x" * 1000)
             await eventually(lambda: publisher.counters.telemetry_refused == 1, "telemetry is dropped")
@@ -202,6 +203,7 @@ async def test_a_disk_that_takes_no_refused_messages_keeps_them_in_the_journal(
         good = await append(outbox, GOOD, 2)
         async with publishing(outbox, broker.port):
             await eventually(lambda: broker.sequences(GOOD) == good, "the rest goes on")
+            await eventually(lambda: outbox.counters.depth == 2, "the journal knows")
             assert [message.sequence for message in await outbox.pending(0, 10)] == bad
             assert "waits in the journal" in caplog.text
             path.rmdir()
