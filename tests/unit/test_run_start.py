@@ -1,0 +1,37 @@
+"""What `daqsvc run` does once the service is ready."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+from types import SimpleNamespace
+
+import daqsvc.service
+from daqsvc.commands import run
+
+
+async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(monkeypatch, tmp_path):
+    frozen = []
+
+    class Service:
+        def __init__(self, *_, **__):
+            self.ready = asyncio.Event()
+            self.desk = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
+
+        async def run(self, stop):
+            frozen.append(gc.get_freeze_count())
+            self.ready.set()
+            while gc.get_freeze_count() == frozen[0] and not stop.is_set():
+                await asyncio.sleep(0)
+            frozen.append(gc.get_freeze_count())
+
+    monkeypatch.setattr(daqsvc.service, "Service", Service)
+    guard = SimpleNamespace(
+        stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda: None
+    )
+    machine = SimpleNamespace(machine=SimpleNamespace(name="rig"))
+    try:
+        await asyncio.wait_for(run._run_until_stopped(machine, tmp_path, guard), 10.0)
+    finally:
+        gc.unfreeze()
+    assert frozen[1] > frozen[0] + 1000
