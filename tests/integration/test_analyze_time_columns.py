@@ -1,0 +1,43 @@
+"""A recording's own times decide: neither another rate nor missing rows make a machine healthy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from race_signals import RATE_HZ, SPEED_RPM, strikes
+
+OPTIONS = ("--channels", "de", "--speed-rpm", SPEED_RPM, "--bearing", "6205-2RS")
+
+
+def save(path, rows):
+    """A damaged inner race with the times of its samples, without some of its rows."""
+    signal = strikes("inner")
+    t = np.arange(len(signal)) / RATE_HZ
+    table = np.column_stack([t, signal])[rows]
+    np.savetxt(path, table, fmt=("%.6f", "%.5g"), delimiter=",", header="time,de", comments="")
+    return path
+
+
+def test_another_rate_is_refused(analyze, tmp_path):
+    path = save(tmp_path / "run.csv", slice(None))
+    code, (found,), _ = analyze(path, *OPTIONS)
+    assert (code, found["verdict"]) == (0, "inner")
+    code, (found,), _ = analyze(path, *OPTIONS, "--fs", 48_000)
+    assert (code, found["verdict"]) == (3, None)
+    assert (
+        "is 12000 Hz (time column 'time', read as seconds) by the file and 48000 Hz as given"
+        in found["refused"]
+    )
+
+
+@pytest.mark.parametrize("lost", [0.02, 0.1, 0.3])
+def test_missing_rows_are_gaps(analyze, tmp_path, lost):
+    """Frames of ten samples are lost at random; joined, the rest would have no lines at all."""
+    kept = np.repeat(np.random.default_rng(4).random(len(strikes("inner")) // 10) >= lost, 10)
+    code, (found,), _ = analyze(save(tmp_path / "run.csv", kept), *OPTIONS)
+    assert found["verdict"] != "normal"
+    assert (code == 3) == (found["refused"] is not None)
+    if found["refused"] is None:
+        assert found["verdict"] == "inner"
+        missing = found["data_quality"]["missing"]["de"]
+        assert missing == pytest.approx(lost * len(kept), rel=0.1)
