@@ -7,8 +7,6 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.settings.problems import choice
-
 if TYPE_CHECKING:
     import argparse
     from importlib.resources.abc import Traversable
@@ -91,6 +89,9 @@ class ExampleCommand:
             return EXIT_OK
         name = arguments.name.removesuffix(".toml")
         if name not in known:
+            # Only here: with the settings comes most of what a start of any verb would take.
+            from daqsvc.settings.problems import choice  # noqa: PLC0415
+
             print(f"daqsvc example: there is no {name!r}; {choice(name, known)}", file=sys.stderr)  # noqa: T201
             return EXIT_BAD_NAME
         if arguments.out is None:
