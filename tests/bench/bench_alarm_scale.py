@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import gc
 import logging
 import os
 import sys
@@ -168,6 +169,7 @@ async def to_the_broker(directory: Path, port: int, seconds: float, targets: Tar
         while not (desk.publisher and desk.publisher.counters.connected):
             await asyncio.sleep(0.1)
         await rig.flood(FLOOD_EVENTS_PER_S, 2.0)
+        gc.freeze()  # as daqsvc run does once it is ready
         rig.lag.forget()
         begun_s, spent_s, before = time.perf_counter(), time.process_time(), desk.manager.counters.events
         await rig.flood(FLOOD_EVENTS_PER_S, seconds)
