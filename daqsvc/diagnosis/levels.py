@@ -86,7 +86,7 @@ class LevelChannel:
 
 
 class LevelDetector:
-    """RMS, peak, crest factor and band velocity of every sensor of a stream, window by window.
+    """RMS, peak, peak-to-peak, crest factor and band velocity of every sensor of a stream, window by window.
 
     Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``. A snapshot is a window by
     itself, whatever its length.
@@ -154,7 +154,7 @@ class LevelDetector:
         first = window.first_index - window.skipped
         t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
         unseen = Evidence(first, window.first_index, t_ns)
-        measures = ["mean", "rms", "peak", "crest_factor"]
+        measures = ["mean", "rms", "peak", "peak_to_peak", "crest_factor"]
         measures += ["gap_voltage"] * (channel.gap is not None) + ["velocity_rms"] * (
             channel.unit in _TO_VELOCITY
         )
@@ -217,6 +217,7 @@ class LevelDetector:
             "mean": found.mean,
             "rms": found.rms,
             "peak": found.peak,
+            "peak_to_peak": found.peak_to_peak,
             "crest_factor": found.crest_factor,
         }
         if channel.gap is not None:

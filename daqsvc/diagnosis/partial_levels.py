@@ -48,6 +48,7 @@ def level_bounds(
         "mean": (found.mean - off, found.mean + off),
         "rms": (found.rms * math.sqrt(1.0 - share), math.inf),
         "peak": (0.5 * (highest - lowest), math.inf),
+        "peak_to_peak": (highest - lowest, math.inf),
         "crest_factor": (0.0, math.inf),
     }
 

@@ -24,12 +24,15 @@ class Levels(NamedTuple):
         rms: root mean square about the mean, same unit.
         peak: largest deviation from the mean, same unit.
         crest_factor: peak over RMS; 0 if nothing moves.
+        peak_to_peak: from the lowest to the highest value, same unit; so are the limits of shaft vibration
+            (ISO 20816-3, annex; API 670).
     """
 
     mean: float
     rms: float
     peak: float
     crest_factor: float
+    peak_to_peak: float
 
 
 def levels(samples: NDArray[np.float32]) -> Levels:
@@ -43,7 +46,7 @@ def levels(samples: NDArray[np.float32]) -> Levels:
     swing = there - mean
     rms = float(np.sqrt(np.mean(swing**2)))
     peak = float(np.abs(swing).max())
-    return Levels(mean, rms, peak, peak / rms if rms > 0 else 0.0)
+    return Levels(mean, rms, peak, peak / rms if rms > 0 else 0.0, float(np.ptp(there)))
 
 
 @lru_cache(maxsize=64)

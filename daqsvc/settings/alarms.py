@@ -8,7 +8,7 @@ from pydantic import Field
 
 from daqsvc.settings.section import MOST, DelayS, Kinds, Name, Nats, Quantity, Section, Text
 
-Measure = Literal["rms", "peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
+Measure = Literal["rms", "peak", "peak_to_peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
 
 
 class BaseAlarm(Section):

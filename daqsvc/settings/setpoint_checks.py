@@ -112,6 +112,14 @@ def _measure(alarm: SetpointAlarm, sensor: Sensor, at: KeyPath) -> Iterator[Find
                 f'write measure = "value", with setpoints in {sensor.unit}',
             )
         return
+    if measure == "peak" and isinstance(sensor, ProximityProbe):
+        yield Finding(
+            here,
+            "is from the mean to the farthest point; the limits of shaft vibration in ISO 20816 and API 670 "
+            "are peak to peak, about twice that",
+            'write measure = "peak_to_peak", with setpoints from peak to peak',
+            fatal=False,
+        )
     instead = f'write measure = "rms" or "peak", with setpoints in {sensor.unit}'
     if measure == "value":
         yield Finding(

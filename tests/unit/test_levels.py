@@ -55,7 +55,7 @@ def test_velocity_in_the_detector_is_in_mm_per_s() -> None:
     (said,) = detector(unit="g").process(window(acceleration_g))
     expected = 0.1 * 9.80665 / (2 * np.pi * 100) / 2**0.5 * 1000
     assert said.statistics["velocity_rms"] == pytest.approx(expected, rel=0.01)
-    assert said.units == {"mean": "g", "rms": "g", "peak": "g", "velocity_rms": "mm/s"}
+    assert said.units == {"mean": "g", "rms": "g", "peak": "g", "peak_to_peak": "g", "velocity_rms": "mm/s"}
 
 
 def test_each_window_is_held_against_the_setpoints() -> None:
@@ -112,3 +112,14 @@ def test_infinities_count_as_missing() -> None:
     (said,) = detector(unit="g").process(window(samples))
     assert said.quality == "good"
     assert np.isfinite(list(said.statistics.values())).all()
+
+
+def test_peak_to_peak_is_the_whole_range_also_of_what_is_not_symmetric() -> None:
+    samples = np.zeros(100, np.float32)
+    samples[[3, 50]] = 30.0, -10.0
+    samples[7] = np.nan
+    found = levels(samples)
+    assert found.peak_to_peak == 40.0
+    assert found.peak == pytest.approx(30.0, abs=0.5)
+    watching = detector(limits=[Limits("peak_to_peak", 35.0, 50.0, None, None)])
+    assert watching.process(window(20.0 * np.sin(2 * np.pi * 50 * T[:500])))[0].severity == "alert"

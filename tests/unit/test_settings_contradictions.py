@@ -160,6 +160,13 @@ WARNINGS = [
         "hardly any sensor has",
         "200 mV/mil are sensitivity_mv_per_unit = 7.874",
     ),
+    (
+        LAVAL,
+        [('measure = "rms" ', 'measure = "peak" ')],
+        "alarms[0].measure",
+        "the limits of shaft vibration in ISO 20816 and API 670 are peak to peak",
+        'measure = "peak_to_peak"',
+    ),
     (LAVAL, [("zero_v = -10.0 ", "")], "sensors[0]", "has no zero_v", "zero_v = -10"),
     (
         LAVAL,
@@ -391,3 +398,8 @@ def test_the_rings_of_all_streams_are_added_up(monkeypatch):
     assert outcome(LAVAL.read_text())[0] == {}
     monkeypatch.setattr("daqsvc.settings.memory_checks.memory_bytes", lambda: 400_000)
     assert "0.00023 GB" in outcome(LAVAL.read_text())[0]["pipeline.ring_s"].message
+
+
+def test_a_peak_to_peak_limit_of_a_probe_is_no_contradiction():
+    text, _ = changed(LAVAL, ('measure = "rms" ', 'measure = "peak_to_peak" '))
+    assert outcome(text) == ({}, {})
