@@ -186,8 +186,6 @@ class SequenceMark:
                 side.note(told.line())
             except OSError as error:
                 errors.append(error)
-            else:
-                break
         if len(errors) == len(self._sides) and not is_full(errors[0]):
             raise errors[0]
         if errors and self._noted:

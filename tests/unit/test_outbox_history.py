@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import subprocess
+import zlib
 from pathlib import Path
 
 import pytest
@@ -146,6 +148,10 @@ def test_a_file_of_the_first_version_is_taken_over(tmp_path, wall):
     assert journal.quarantined == 0
     journal.close()
     assert kept(path) == [5, 6, 7, next_number]
+    with sqlite3.connect(path) as other:
+        unguarded = other.execute("SELECT count(*) FROM messages WHERE checksum IS NULL").fetchone()
+    other.close()
+    assert unguarded == (0,), "what has no checksum cannot be saved from a corrupt file"
 
 
 def test_a_journal_that_is_an_older_copy_is_told_and_gives_no_number_again(tmp_path, wall, caplog):
@@ -195,17 +201,59 @@ def test_a_log_that_is_lost_brings_no_number_back(tmp_path, wall, monkeypatch, b
     journal.close()
 
 
+@pytest.mark.parametrize("which", ["sequence", "sequence.twin"])
 @pytest.mark.parametrize("damage", ["", "no number", "17", "00000000000000000017 what boot", "\xff\xff"])
-def test_a_damaged_side_file_costs_nothing_while_the_journal_is_whole(tmp_path, wall, damage):
+def test_a_damaged_side_file_costs_nothing_while_the_journal_is_whole(tmp_path, wall, damage, which):
     path = tmp_path / "outbox.sqlite"
     journal = opened(path, wall)
     last = append(journal, 3)[-1]
     journal.close()
-    path.with_name("outbox.sqlite.sequence").write_text(damage, encoding="latin-1")
+    path.with_name(f"outbox.sqlite.{which}").write_text(damage, encoding="latin-1")
     journal = opened(path, wall)
     assert journal.quarantined == journal.vanished == 0
     [after] = append(journal, 1)
-    assert after > last
+    assert after > last + sequence.LEAP, "nobody knows what the damaged one knew"
+    journal.close()
+    journal = opened(path, wall)
+    assert append(journal, 1) == [after + 1], "both are sound again"
+    journal.close()
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_side_file_of_an_earlier_version_is_understood(tmp_path, wall, caplog, ended):
+    """It stood alone, and said nothing of the place."""
+    path = tmp_path / "outbox.sqlite"
+    journal = opened(path, wall)
+    last = append(journal, 3)[-1]
+    journal.close()
+    mark = path.with_name("outbox.sqlite.sequence")
+    mark.with_name(mark.name + ".twin").unlink()
+    told = f"{last if ended else last + 500:020d} {last:020d} {sequence.boot_id()}"
+    mark.write_text(f"{told} {zlib.crc32(told.encode()):08x}\n")
+    journal = opened(path, wall)
+    assert append(journal, 1) == [last + 1 if ended else last + 501]
+    assert "damaged" not in caplog.text
+    journal.close()
+
+
+@pytest.mark.parametrize("put_back", [False, True])
+def test_a_copy_of_a_store_goes_on_at_the_clock(tmp_path, wall, put_back):
+    """On another box or in the place of the original: what that has used since is below."""
+    store, backup = tmp_path / "store", tmp_path / "backup"
+    journal = opened(store / "outbox.sqlite", wall)
+    append(journal, 3)
+    journal.close()
+    subprocess.run(["cp", "-a", store, backup], check=True)
+    journal = opened(store / "outbox.sqlite", wall)
+    last = append(journal, 50)[-1]
+    journal.close()
+    if put_back:
+        shutil.rmtree(store)
+        subprocess.run(["cp", "-a", backup, store], check=True)
+    wall.ns += 10**9
+    journal = opened((store if put_back else backup) / "outbox.sqlite", wall)
+    assert append(journal, 1) == [wall() // files.NS_PER_MS + 1]
+    assert append(journal, 1)[0] > last
     journal.close()
 
 
