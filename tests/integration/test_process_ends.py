@@ -22,6 +22,8 @@ import pytest
 from brokers import free_port
 from machine_files import LAVAL
 
+from daqsvc.commands import process_guard
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
+PATIENT_TURNS = 200
+"""In place of two seconds, where a stop in order is looked for: this machine may have much else to do."""
 HANGS_S = 60.0
 """How long the faults hang: whoever is gone long before did not wait for them."""
 
@@ -47,6 +51,7 @@ def once_ready(do):
         await before(self, stop, first)
     Service._until_stopped = until_stopped
 
+process_guard.STOP_TURNS = {turns}
 {fault}
 sys.exit(main(sys.argv[1:]))
 """
@@ -85,16 +90,19 @@ def rig(tmp_path: Path) -> Path:
     return file
 
 
-def command(tmp_path: Path, fault: str = "") -> list[str]:
+def command(tmp_path: Path, fault: str = "", turns: int = PATIENT_TURNS) -> list[str]:
     store = str(tmp_path / "store")
-    return [sys.executable, "-c", MAIN.format(fault=fault), "run", str(rig(tmp_path)), "--store", store, "-v"]
+    main = MAIN.format(fault=fault, turns=turns)
+    return [sys.executable, "-c", main, "run", str(rig(tmp_path)), "--store", store, "-v"]
 
 
 @contextlib.contextmanager
-def service(tmp_path: Path, fault: str = "", **options: Any) -> Iterator[subprocess.Popen[str]]:
+def service(
+    tmp_path: Path, fault: str = "", turns: int = PATIENT_TURNS, **options: Any
+) -> Iterator[subprocess.Popen[str]]:
     """A service that is ready, with a fault in it; killed at the end if need be."""
     process = subprocess.Popen(
-        command(tmp_path, fault),
+        command(tmp_path, fault, turns),
         stderr=subprocess.PIPE,
         text=True,
         # The tests themselves may run under nohup.
@@ -130,7 +138,7 @@ def closed(tmp_path: Path) -> bool:
 
 @pytest.mark.parametrize("hangs", ["loop", "task", *(_long(name) for name in ("busy loop", "thread"))])
 def test_a_stop_is_obeyed_whatever_hangs_and_the_journal_is_closed(hangs: str, tmp_path: Path) -> None:
-    with service(tmp_path, FAULTS[hangs]) as process:
+    with service(tmp_path, FAULTS[hangs], process_guard.STOP_TURNS) as process:
         time.sleep(0.5)
         begun_s = time.monotonic()
         process.send_signal(signal.SIGTERM)
