@@ -285,7 +285,7 @@ def _opened(path: Path) -> int | None:
 
 def _understood(line: bytes) -> _Told | None:
     told = line.split()
-    if len(told) not in {4, 7} or _hexadecimal(told[-1]) != zlib.crc32(line[: line.rindex(b" ")]):
+    if len(told) not in {4, 7} or _hexadecimal(told[-1]) != zlib.crc32(line[: line.rfind(b" ")]):
         return None
     try:
         words = [word.decode("ascii") for word in told[:-1]]

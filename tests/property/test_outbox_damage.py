@@ -215,7 +215,9 @@ async def spoilt(stores, seed, caplog):
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(40), pytest.param(range(1000, 2500), marks=pytest.mark.long)], ids=str
+    "seeds",
+    [range(40), pytest.param(range(1000, 2500), marks=[pytest.mark.long, pytest.mark.timeout(900)])],
+    ids=str,
 )
 def test_whatever_is_spoilt_a_start_tells_the_truth_and_repeats_no_number(stores, seeds, caplog):
     quarantined = [asyncio.run(spoilt(stores, seed, caplog)) for seed in seeds]

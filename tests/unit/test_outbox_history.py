@@ -202,7 +202,9 @@ def test_a_log_that_is_lost_brings_no_number_back(tmp_path, wall, monkeypatch, b
 
 
 @pytest.mark.parametrize("which", ["sequence", "sequence.twin"])
-@pytest.mark.parametrize("damage", ["", "no number", "17", "00000000000000000017 what boot", "\xff\xff"])
+@pytest.mark.parametrize(
+    "damage", ["", "no number", "17", "1\n2\n3\n4", "00000000000000000017 what boot", "\xff\xff"]
+)
 def test_a_damaged_side_file_costs_nothing_while_the_journal_is_whole(tmp_path, wall, damage, which):
     path = tmp_path / "outbox.sqlite"
     journal = opened(path, wall)
