@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.standing import tell_nobody
 from daqsvc.settings.bus_checks import DRIVERS
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.acquisition.standing import Tell
     from daqsvc.settings.modbus import RegisterChannel, SampleChannel
     from daqsvc.settings.models import Channel, DbcChannel, MachineFile
     from drivers.base import Driver
@@ -225,14 +227,19 @@ def _valid_raw(channels: Sequence[Channel | DbcChannel]) -> dict[str, tuple[floa
     return {c.name: c.valid_raw for c in channels if c.valid_raw is not None}
 
 
-def drivers(machine: MachineFile, clock: Clock, deliver: Callable[[SampleBlock], None]) -> list[Driver]:
-    """One driver per bus, found by its entry point.
+def drivers(
+    machine: MachineFile,
+    clock: Clock,
+    deliver: Callable[[SampleBlock], None],
+    tell: Tell = tell_nobody,
+) -> list[Driver]:
+    """One driver per bus, found by its entry point; see `bus_driver`.
 
     Raises:
         AssemblyError: a driver cannot be loaded, or cannot use an option.
         LayoutError: see `frame_layout`.
     """
-    return [bus_driver(machine, name, clock, deliver) for name in machine.buses]
+    return [bus_driver(machine, name, clock, deliver, tell=tell) for name in machine.buses]
 
 
 def bus_driver(
@@ -241,6 +248,7 @@ def bus_driver(
     clock: Clock,
     deliver: Callable[[SampleBlock], None],
     changed: Mapping[str, Any] | None = None,
+    tell: Tell = tell_nobody,
 ) -> Driver:
     """The driver of one bus.
 
@@ -250,6 +258,7 @@ def bus_driver(
         clock: the service's clock.
         deliver: see `drivers.base.BusPort`.
         changed: options that are other than in the machine file.
+        tell: see `drivers.base.BusPort`.
 
     Raises:
         AssemblyError, LayoutError: see `drivers`.
@@ -270,7 +279,7 @@ def bus_driver(
         for stream_name, stream in machine.streams.items()
         if stream.bus == name
     ]
-    port = BusPort(name, {**options, **(changed or {})}, streams, clock, deliver, bus.start)
+    port = BusPort(name, {**options, **(changed or {})}, streams, clock, deliver, bus.start, tell)
     point = next(iter(entry_points(group=DRIVERS, name=bus.driver)))  # settings/bus_checks.py
     return _driver(point, port, f"{machine.path}: buses.{name}")
 

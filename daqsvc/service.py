@@ -15,6 +15,7 @@ from daqsvc import assembly, assembly_drivers
 from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.standing import Standing
 from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
@@ -132,9 +133,11 @@ class Service:
         self._identity = identity(machine)
         detectors = assembly.detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
+        self._grids = grids
+        self._standings = dict.fromkeys(machine.streams, Standing())
         self.rings = {grid.name: _ring(machine, grid, detectors) for grid in grids}
         self.alignment = alignment(machine, self.clock, self._deliver)
-        self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver)
+        self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver, self._stand)
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
         self.pipeline = Pipeline(
             self.rings,
@@ -286,6 +289,16 @@ class Service:
             self.rings[block.stream].write(block)
             self.alignment.accept(block)
 
+    def _stand(self, stream: str, standing: Standing) -> None:
+        """Tell the pipeline how a stream stands, and every grid that it is on: that is no better."""
+        self._standings[stream] = standing
+        for grid in self._grids:
+            if stream in grid.streams:
+                standings = [self._standings[name] for name in grid.streams]
+                doubts = [one.doubt for one in standings if one.doubt]
+                proven = all(one.proven for one in standings)
+                self.pipeline.stand(grid.name, Standing(doubts[0] if doubts else "", proven))
+
     def _report(self, diagnosis: Diagnosis) -> None:
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
@@ -326,7 +339,7 @@ class Service:
 
     def figures(self) -> dict[str, Any]:
         """The service's figures by what they belong to: streams, buses, detectors, alarms, outbox, MQTT."""
-        streams: dict[str, Mapping[str, float]] = {}
+        streams: dict[str, Mapping[str, float | str]] = {}
         buses: dict[str, Mapping[str, Any]] = {}
         for driver in self.drivers:
             counted = asdict(driver.counters)
@@ -336,6 +349,8 @@ class Service:
                 ring = self.rings[name]
                 streams[name] = {
                     **asdict(counters),
+                    "rate_hz": base.rate_hz,
+                    "doubt": base.doubt,
                     "drift_ppm": base.drift_ppm,
                     "jitter_ms": base.jitter_ns / 1e6,
                     "time_settled": int(base.settled),

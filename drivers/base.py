@@ -11,12 +11,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
+from daqsvc.acquisition.standing import tell_nobody
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
+    from daqsvc.acquisition.standing import Tell
     from daqsvc.acquisition.supervisor import Link
     from daqsvc.acquisition.timebase import TimeBaseState
 
@@ -72,6 +75,8 @@ class BusPort:
         clock: the service's clock.
         deliver: called with each block, on the event loop.
         start: what to do if the device is absent at start: fail, try again, or go on without it.
+        tell: called, on the event loop, when it changes whether anything can be judged by a stream's samples;
+            `StreamAssembler` does so.
     """
 
     name: str
@@ -80,6 +85,7 @@ class BusPort:
     clock: Clock
     deliver: Callable[[SampleBlock], None]
     start: StartPolicy = "retry"
+    tell: Tell = tell_nobody
 
 
 @dataclass(slots=True)

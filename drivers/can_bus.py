@@ -219,6 +219,7 @@ def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
         counts_per_frame=spec.layout.counts_per_frame,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
+        tell=port.tell,
     )
 
 

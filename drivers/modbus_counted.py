@@ -12,6 +12,7 @@ from daqsvc.acquisition.assembler import StreamCounters
 from daqsvc.acquisition.books import note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.acquisition.standing import QUIET_NS, StreamStanding
 from daqsvc.acquisition.timebase import TimeBase
 from drivers.modbus_layouts import Fifo, Ring
 from drivers.modbus_reading import PollingReader
@@ -32,6 +33,9 @@ AT_ONCE_NS = NS_PER_S
 
 STANDSTILL_NS = 2 * NS_PER_S
 """A count that falls behind the clock by more than this has stood still, or has begun again."""
+
+STILL_PERIODS = 4
+"""A count that is seen to stay for longer than that, and than so many samples or looks, stands still."""
 
 LEAST_SLACK = 16
 """Samples by which a count may be off the clock, however slow the device is."""
@@ -86,11 +90,41 @@ class CountedRows:
             spec.rate_hz, spec.layout.count.bits, samples_per_frame=1, counts_per_frame=1, reorder_window_ns=0
         )
         self._next: int | None = None
+        self._standing = StreamStanding(spec.name, port.tell)
+        looks_ns = max(round(NS_PER_S / spec.rate_hz), spec.layout.poll_ns)
+        self._still_ns = max(STANDSTILL_NS, STILL_PERIODS * looks_ns)
+        self._still = ""
+        self._count: int | None = None
+        self._count_since_ns = self._looked_ns = 0
+        self._anew_said_ns: int | None = None
 
     @property
     def time_base(self) -> TimeBaseState:
         """What is known about the clock of the samples."""
-        return self._time.state
+        return self._time.state._replace(doubt=self._still or self._time.rate_doubt)
+
+    def look(self, count: int, seen_ns: int) -> None:
+        """See whether the device counts at all.
+
+        Args:
+            count: its count, as sent.
+            seen_ns: when it was seen, host monotonic.
+        """
+        listened = seen_ns - self._looked_ns < self._still_ns
+        self._looked_ns = seen_ns
+        if count != self._count or not listened:
+            self._count, self._count_since_ns, self._still = count, seen_ns, ""
+        elif seen_ns - self._count_since_ns >= self._still_ns:
+            self._still = f"the device's counter stands still at {count}; check the device"
+        self._stand(seen_ns)
+
+    def flush(self) -> None:
+        """Nothing more comes for now."""
+        self._standing.give_up_waiting()
+
+    def _stand(self, now_ns: int) -> None:
+        doubt = self._still or self._time.rate_doubt
+        self._standing.take(doubt, now_ns, known=self._time.rate_known)
 
     def hand_on(self, first: int, rows: bytes, seen_ns: int, *, restarted: bool) -> None:
         """Make a block of consecutive samples.
@@ -104,7 +138,10 @@ class CountedRows:
         raw = np.frombuffer(rows, np.uint8).reshape(-1, 2 * self._record.registers)
         samples = np.ascontiguousarray(self._record.decode(raw))
         index = first + np.arange(len(samples), dtype=np.int64)
-        if self._time.learn(index, np.full(len(samples), seen_ns, np.int64), restarted=restarted):
+        anew = self._time.learn(index, np.full(len(samples), seen_ns, np.int64), restarted=restarted)
+        self._stand(seen_ns)
+        if anew and (self._anew_said_ns is None or seen_ns - self._anew_said_ns >= QUIET_NS):
+            self._anew_said_ns = seen_ns
             logger.warning(
                 "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
                 self._name,
@@ -149,6 +186,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
         self._next: int | None = None
         self._index = 0
         self._restarted = False
+        self._restart_said_ns: int | None = None
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -164,11 +202,14 @@ class CountedReader(PollingReader, Generic[CountedT]):
 
     def _begin_again(self, index: int) -> None:
         """Go on at an index that is estimated from the clock, since the count tells it no more."""
-        logger.warning(
-            "stream %r: the device has restarted its count, or has not counted for a while; how many samples "
-            "are missing is estimated from the clock",
-            self._name,
-        )
+        now_ns = self._clock.monotonic_ns()
+        if self._restart_said_ns is None or now_ns - self._restart_said_ns >= QUIET_NS:
+            self._restart_said_ns = now_ns
+            logger.warning(
+                "stream %r: the device has restarted its count, or has not counted for a while; how many "
+                "samples are missing is estimated from the clock",
+                self._name,
+            )
         self._index = max(self._index, index)
         self._restarted = True
 

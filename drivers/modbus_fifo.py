@@ -70,6 +70,7 @@ class FifoReader(CountedReader[Fifo]):
         if self._held and self._gap(self._held[0]) is not None:
             self._go_on_with(self._held)
         self._reject_held()
+        self._rows.flush()
 
     async def _look(self, line: ModbusLine) -> None:
         reply = await self._read(line)
@@ -90,7 +91,9 @@ class FifoReader(CountedReader[Fifo]):
             return None
         if not taken:
             return None
-        return _Reply(layout.count.decode(raw), raw[head:], taken, asked_ns, self._clock.monotonic_ns())
+        reply = _Reply(layout.count.decode(raw), raw[head:], taken, asked_ns, self._clock.monotonic_ns())
+        self._rows.look(reply.first, reply.seen_ns)
+        return reply
 
     async def _acknowledge(self, line: ModbusLine, address: int) -> None:
         """Tell the device how far its queue has been taken."""

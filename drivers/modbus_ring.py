@@ -68,7 +68,8 @@ class RingReader(CountedReader[Ring]):
         await super().run(line)
 
     def flush(self) -> None:
-        """Nothing is ever held back."""
+        """No sample is ever held back."""
+        self._rows.flush()
 
     async def _look(self, line: ModbusLine) -> None:
         look = await self._believable(line)
@@ -136,7 +137,9 @@ class RingReader(CountedReader[Ring]):
     async def _count(self, line: ModbusLine) -> _Look:
         layout = self._layout
         reading = await line.poll(layout.unit, FUNCTIONS[layout.table], layout.count.run, self._what)
-        return _Look(layout.count.decode(reading.registers), reading.asked_ns, reading.answered_ns)
+        written = layout.count.decode(reading.registers)
+        self._rows.look(written, reading.answered_ns)
+        return _Look(written, reading.asked_ns, reading.answered_ns)
 
     def _follows(self, first: _Look, second: _Look) -> bool:
         return (second.written - first.written) % self._modulus < self._modulus // 2

@@ -25,7 +25,7 @@ from drivers.can_adapter import batch_of
 from drivers.can_batches import FrameSorter
 from drivers.frames import FrameLayout
 from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
-from drivers.replay_can import CanLog
+from drivers.replay_can import STEP_BACK_NS, CanLog
 from drivers.replay_channel import ChannelChoice
 from drivers.replay_files import (
     TABLE_COUNTER_BITS,
@@ -57,6 +57,9 @@ UNPACED_SPAN_NS = NS_PER_S
 REMAP_NS = 2 * NS_PER_S
 """A growing log whose times are off by more than this is from another clock than before."""
 
+LEAP_NS = 3600 * NS_PER_S
+"""A recording whose time leaps ahead by more is played on at once: nobody waits for a damaged time stamp."""
+
 REMEMBERED_IDS = 64
 END_OF_FILE = "end of file"
 
@@ -68,12 +71,14 @@ class ReplayCounters(BusCounters):
     Attributes:
         frames_malformed: lines of a log that are no frames.
         frames_other_channel: frames of other channels than the one that is played.
+        time_leaps: how often the recorded time has leapt back, or ahead by more than an hour.
         passes: how often the recording has been played to its end.
         passes_damaged: how often it has been played as far as it could be read, which was not its end.
     """
 
     frames_malformed: int = 0
     frames_other_channel: int = 0
+    time_leaps: int = 0
     passes: int = 0
     passes_damaged: int = 0
 
@@ -259,8 +264,10 @@ class ReplayDriver:
         now_ns = clock.monotonic_ns()
         first_ns = min(int(frames.arrival_ns[0]) for frames in piece.frames)
         last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames)
-        if self._shift_ns is None or (
-            self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS
+        if (
+            self._shift_ns is None
+            or (self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS)
+            or self._leaps(first_ns + self._shift_ns)
         ):
             self._shift_ns = self._next_ns(now_ns) - first_ns
         due_ns = last_ns + self._shift_ns
@@ -276,6 +283,20 @@ class ReplayDriver:
             self._assemblers[frames.stream].accept(
                 decoded.counter, decoded.samples, decoded.intact, arrival_ns
             )
+
+    def _leaps(self, due_ns: int) -> bool:
+        """Whether the recorded time has leapt, and what comes now is to be played at once."""
+        if self._at_end == "wait" or self._newest_ns is None:
+            return False
+        leap_ns = due_ns - self._newest_ns
+        if -STEP_BACK_NS <= leap_ns <= LEAP_NS:
+            return False
+        self.counters.time_leaps += 1
+        self._say_once(
+            "its time stamps leap back, or ahead by more than an hour; such leaps are counted (time_leaps) "
+            "and it is played on without a pause"
+        )
+        return True
 
     def _next_ns(self, now_ns: int) -> int:
         """When the first frame of what is played now comes: never before what was played has ended."""
@@ -310,4 +331,5 @@ def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> S
         counts_per_frame=counts,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
+        tell=port.tell,
     )

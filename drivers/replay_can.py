@@ -12,6 +12,7 @@ import numpy as np
 from can.io import MESSAGE_READERS, ASCReader, BLFReader, SqliteReader
 from can.io.generic import BinaryIOMessageReader, TextIOMessageReader
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import UNBOUNDED, Budget, CountedFile
 from drivers.replay_blf import BlfFile
 from drivers.replay_files import RecordingError, words
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
 
     Sort = Callable[[list[can.Message], NDArray[np.int64]], Sorted]
 
-PIECE_FRAMES = 2048
+PIECE_FRAMES = 512
+STEP_BACK_NS = 2 * NS_PER_S
+"""Logs of several interfaces may step back a little; more than that is a leap in time."""
 
 _CHANNELS_FROM_0: Final = (ASCReader, BLFReader)
 """Readers that give the channels that a file calls 1, 2, ... as 0, 1, ..."""
@@ -119,7 +122,7 @@ class CanLog:
             if message is None:
                 break
             at_ns = recorded_ns(message)
-            if t_ns and at_ns - t_ns[0] > span_ns:
+            if t_ns and (at_ns - t_ns[0] > span_ns or at_ns < t_ns[-1] - STEP_BACK_NS):
                 self._ahead = message
                 break
             messages.append(message)

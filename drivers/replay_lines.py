@@ -27,6 +27,8 @@ LONGEST_LINE = 4096
 MOST_WITHOUT_FRAME = 100_000
 """Lines in a row that are no frames, after which a log is given up: a thread waits for the next frame."""
 _SHOWN = 60
+LATEST_S = 9e9
+"""No recording is of so long after 1970, the year 2255; nanoseconds of it still are integers of 64 bits."""
 
 _NEVER = re.compile(r"(?!)")
 _IN_HEADER: Final[dict[type[TextIOMessageReader], re.Pattern[str]]] = {
@@ -151,8 +153,8 @@ def whole(message: can.Message) -> can.Message:
     Raises:
         ValueError: its time stamp is beyond all times, or it has more or fewer bytes than it says.
     """
-    if not abs(message.timestamp) < 1e10:
-        raise ValueError(f"time stamp {message.timestamp}")
+    if not abs(message.timestamp) < LATEST_S:
+        raise ValueError(f"a time stamp of {message.timestamp:.10g} s, which is no time")
     length = len(message.data)
     if length > 64:
         raise ValueError(f"{length} bytes of data")

@@ -251,6 +251,8 @@ def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
         counts_per_frame=layout.counts_per_frame,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
+        stamped=timed,
+        tell=port.tell,
     )
 
 

@@ -14,10 +14,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.acquisition.arrival_rate import ArrivalRate
 from daqsvc.acquisition.books import note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from daqsvc.acquisition.timebase import TimeBase, TimeBaseState
+from daqsvc.acquisition.standing import QUIET_NS, StreamStanding, tell_nobody
+from daqsvc.acquisition.timebase import TimeBase, TimeBaseState, rate_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,10 +28,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.samples import Samples
+    from daqsvc.acquisition.standing import Tell
 
 logger = logging.getLogger(__name__)
 
 REMEMBERED_GAPS = 256
+ASK_AGAIN_NS = NS_PER_S // 20
+"""How often frames that wait for what comes after them are looked at again."""
 
 
 @dataclass(slots=True)
@@ -42,6 +48,8 @@ class StreamCounters:
         frames_reordered: of those, overtaken by a later frame and put back in order.
         frames_late: of those, arriving after their samples had been declared lost.
         frames_rejected: of those, with a counter that fits nothing.
+        frames_set_aside: of those, come while the stream could not be placed: its counter stood still or made
+            no sense, or far more frames came than the file says.
         frames_wrong_length: frames of the stream's id that are shorter or longer than its layout.
         samples_received: samples handed on.
         samples_lost: samples declared missing, by the device's counter, or by time if it sends none.
@@ -56,6 +64,7 @@ class StreamCounters:
     frames_reordered: int = 0
     frames_late: int = 0
     frames_rejected: int = 0
+    frames_set_aside: int = 0
     frames_wrong_length: int = 0
     samples_received: int = 0
     samples_lost: int = 0
@@ -75,6 +84,9 @@ class StreamAssembler:
         counts_per_frame: by how much the counter grows from frame to frame.
         deliver: called with each block, in order, from the thread that calls `accept`.
         reorder_window_ns: how long a gap may wait for an overtaken frame, in time of the samples.
+        stamped: whether the counter is made of the device's time stamps with the nominal rate, and so tells
+            nothing of its rate.
+        tell: called when it changes whether anything can be judged by the samples.
     """
 
     def __init__(
@@ -87,6 +99,8 @@ class StreamAssembler:
         counts_per_frame: int,
         deliver: Callable[[SampleBlock], None],
         reorder_window_ns: int = 10_000_000,
+        stamped: bool = False,
+        tell: Tell = tell_nobody,
     ) -> None:
         self.stream = stream
         self.counters = StreamCounters()
@@ -105,11 +119,28 @@ class StreamAssembler:
         self._gaps: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_GAPS)
         self._after_restart = False
         self._unplaced: list[tuple[NDArray[np.int64], Samples, NDArray[np.int64]]] = []
+        self._asked_ns = 0
+        self._advanced_ns = 0
+        frame_rate_hz = rate_hz / samples_per_frame
+        self._sense = CounterSense(counter_bits, counts_per_frame, frame_rate_hz)
+        self._arrivals = ArrivalRate(frame_rate_hz) if self._counts_arrivals or stamped else None
+        self._rate_hz = rate_hz
+        self._standing = StreamStanding(stream, tell)
+        self._said: dict[str, int] = {}
 
     @property
     def time_base(self) -> TimeBaseState:
         """What is known about the device's clock."""
-        return self._time.state
+        return self._time.state._replace(doubt=self.doubt)
+
+    @property
+    def doubt(self) -> str:
+        """Why nothing can be judged by the samples; empty if nothing is known against them."""
+        if self._sense.doubt or self._arrivals is None:
+            return self._sense.doubt or self._time.rate_doubt
+        if self._arrivals.rate_hz is None or self._arrivals.fits:
+            return ""
+        return rate_in_words(self._arrivals.rate_hz * self._per_frame, NS_PER_S / self._rate_hz)
 
     @property
     def frames_lost(self) -> int:
@@ -143,8 +174,33 @@ class StreamAssembler:
             counter, samples, arrival_ns = counter[intact], samples[intact], arrival_ns[intact]
         if not len(counter):
             return
+        self._look(counter, samples, arrival_ns)
+        known = self._time.rate_known if self._arrivals is None else self._arrivals.known
+        self._standing.take(self.doubt, int(arrival_ns[-1]), known=known)
+
+    def _look(self, counter: NDArray[np.int64], samples: Samples, arrival_ns: NDArray[np.int64]) -> None:
+        """Place frames, or set them aside."""
+        if self._arrivals is not None:
+            self._arrivals.take(arrival_ns)
+        was_aside = bool(self._sense.doubt)
+        if self._sense.look(counter, arrival_ns):
+            if not was_aside:
+                self._place()
+                self._release(everything=True)
+            self.counters.frames_set_aside += len(counter)
+            if not self._sense.doubt:
+                self._go_on(int(arrival_ns[-1]))
+            return
         self._unplaced.append((counter, samples, arrival_ns))
         self._place(until_sure=True)
+
+    def _go_on(self, now_ns: int) -> None:
+        """The frames after those that were set aside can be placed: where they belong, the clock tells."""
+        if self._highest is None:
+            return
+        away = round((now_ns - self._advanced_ns) / self._time.period_ns / self._per_frame)
+        self._time.begin_afresh(self._highest + max(away + 1, 1) * self._per_frame)
+        self._after_restart = True
 
     def tick(self, now_ns: int) -> None:
         """Give up waiting for what nothing has come to tell for a while; call every now and then.
@@ -163,12 +219,16 @@ class StreamAssembler:
 
         Its first frame takes the next index, whatever its counter is: nothing is lost. Its times are its own.
         """
-        self.flush()
+        self._hand_over()
         if self._next is not None:
             self._time.begin_afresh(self._next)
 
     def flush(self) -> None:
         """Hand over what is held back: the link is gone, or the service stops."""
+        self._hand_over()
+        self._standing.give_up_waiting()
+
+    def _hand_over(self) -> None:
         self._place()
         self._release(everything=True)
 
@@ -176,31 +236,29 @@ class StreamAssembler:
         """Place what has come, unless more has to come before that can be done for sure."""
         if not self._unplaced:
             return
+        newest_ns = int(self._unplaced[-1][2][-1])
+        if until_sure and len(self._unplaced) > 1 and 0 <= newest_ns - self._asked_ns < ASK_AGAIN_NS:
+            return
         counter, samples, arrival_ns = self._unplaced[0]
         if len(self._unplaced) > 1:
             counter, samples, arrival_ns = map(np.concatenate, zip(*self._unplaced, strict=True))
         if until_sure and self._time.wants_more(counter, arrival_ns):
+            self._asked_ns = newest_ns
             return
         self._unplaced = []
         placed = self._time.place(counter, arrival_ns)
-        rejected = int((~placed.kept).sum())
-        if rejected and not self.counters.frames_rejected:
-            logger.warning(
-                "stream %r: a frame's counter fits neither the sequence nor a restart; "
-                "such frames are counted and left out",
-                self.stream,
-            )
-        self.counters.frames_rejected += rejected
-        for _ in placed.restarts:
-            logger.warning(
+        before = self.counters.frames_rejected
+        self._reject(int((~placed.kept).sum()))
+        if placed.restarts:
+            self._say(
                 "stream %r: the device has restarted its counter, or has not counted for a while; "
                 "how many samples are missing is estimated from the clock",
-                self.stream,
+                newest_ns,
             )
         if placed.anew:
-            logger.warning(
+            self._say(
                 "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
-                self.stream,
+                newest_ns,
             )
         start = 0
         for restart in [*placed.restarts, len(counter)]:
@@ -211,41 +269,69 @@ class StreamAssembler:
                 self._release(everything=True)
                 self._after_restart = True
             start = restart
+        self._sense.placed(len(counter), self.counters.frames_rejected - before, newest_ns)
+
+    def _reject(self, frames: int) -> None:
+        if frames and not self.counters.frames_rejected:
+            logger.warning(
+                "stream %r: a frame's counter fits neither the sequence nor a restart; "
+                "such frames are counted and left out",
+                self.stream,
+            )
+        self.counters.frames_rejected += frames
+
+    def _say(self, message: str, now_ns: int) -> None:
+        """Log what may happen again and again, but not as often."""
+        if message not in self._said or now_ns - self._said[message] >= QUIET_NS:
+            self._said[message] = now_ns
+            logger.warning(message, self.stream)
 
     def _merge(self, index: NDArray[np.int64], samples: Samples, arrival_ns: int) -> None:
         if not len(index):
             return
-        self._count_overtaken(index)
+        self._arrival_ns = arrival_ns
+        fresh = self._count_overtaken(index)
+        index, samples = index[fresh], samples[fresh]
         if self._held is not None:
             index = np.concatenate([self._held_index, index])
             samples = np.concatenate([self._held, samples])
         else:
             self._waiting_since_ns = arrival_ns
-        self._arrival_ns = arrival_ns
         if (np.diff(index) <= 0).any():
-            index, first = np.unique(index, return_index=True)
-            samples = samples[first]
-        self._held_index, self._held = index, samples
+            order = np.argsort(index, kind="stable")
+            index, samples = index[order], samples[order]
+        self._hold(index, samples)
         self._release()
 
-    def _count_overtaken(self, index: NDArray[np.int64]) -> None:
-        """Tell frames that were overtaken from repeats and from those that come too late."""
+    def _count_overtaken(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell frames that were overtaken from repeats and from those that come too late.
+
+        Returns:
+            bool ``[n]``, False for the latter two.
+        """
+        fresh = np.ones(len(index), np.bool_)
         floor = index[0] - 1 if self._highest is None else self._highest
         before = np.maximum.accumulate(np.concatenate(([floor], index[:-1])))
-        self._highest = max(int(floor), int(index.max()))
+        highest = max(int(floor), int(index.max()))
+        if highest > floor:
+            self._advanced_ns = self._arrival_ns
+        self._highest = highest
         behind = index <= before
         if not behind.any():
-            return
+            return fresh
         known = set(self._held_index.tolist())
         seen_at = {i: k for k, i in reversed(list(enumerate(index.tolist())))}
         for place in np.flatnonzero(behind).tolist():
             at = int(index[place])
             if self._next is not None and at < self._next:
+                fresh[place] = False
                 self._count_too_late(at)
             elif at in known or seen_at[at] < place:
+                fresh[place] = False
                 self.counters.frames_duplicate += 1
             else:
                 self.counters.frames_reordered += 1
+        return fresh
 
     def _count_too_late(self, at: int) -> None:
         for k, (start, end) in enumerate(self._gaps):
@@ -258,25 +344,29 @@ class StreamAssembler:
         self.counters.frames_duplicate += 1
 
     def _release(self, *, everything: bool = False) -> None:
-        while self._held is not None:
-            index = self._held_index
-            newest = int(index[-1])
-            if self._next is None:
-                # The first frame may have been overtaken too: wait as long as for any gap.
-                if not everything and newest - int(index[0]) < self._window:
-                    return
-                self._next = int(index[0])
-            keep = index >= self._next
-            if not keep.all():
-                self._hold(index[keep], self._held[keep])
-                continue
-            lost = int(index[0]) - self._next
-            if lost and not everything and newest - self._next < self._window:
+        if self._held is None:
+            return
+        index, held = self._held_index, self._held
+        newest = int(index[-1])
+        if self._next is None:
+            # The first frame may have been overtaken too: wait as long as for any gap.
+            if not everything and newest - int(index[0]) < self._window:
                 return
-            run = index - index[0] == self._per_frame * np.arange(len(index))
-            length = len(run) if run.all() else int(np.argmin(run))
-            self._emit(int(index[0]), self._held[:length], lost)
-            self._hold(index[length:], self._held[length:])
+            self._next = int(index[0])
+        at = 0
+        for end in [*(np.flatnonzero(np.diff(index) != self._per_frame) + 1).tolist(), len(index)]:
+            # No count of a device is of a frame that another one has a part of.
+            overlapping = int(np.searchsorted(index[at:end], self._next))
+            self._reject(overlapping)
+            at += overlapping
+            if end == at:
+                continue
+            lost = int(index[at]) - self._next
+            if lost and not everything and newest - self._next < self._window:
+                break
+            self._emit(int(index[at]), held[at:end], lost)
+            at = end
+        self._hold(index[at:], held[at:])
 
     def _hold(self, index: NDArray[np.int64], samples: Samples) -> None:
         self._held_index = index

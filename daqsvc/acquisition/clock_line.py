@@ -77,33 +77,49 @@ class ClockLine(NamedTuple):
     error_ns: float
 
 
-def clock_line(buckets: Sequence[Bucket] | Floats, nominal_ns: float, max_slope_ns: float) -> ClockLine:
+def clock_line(
+    buckets: Sequence[Bucket] | Floats, nominal_ns: float, slopes_ns: tuple[float, float]
+) -> ClockLine | None:
     """The better of the two lines.
 
     Args:
-        buckets: at least two, with different sample counts; also as float64 ``[n, 5]``.
+        buckets: at least one; also as float64 ``[n, 5]``. Of those with the same sample count the earliest is
+            taken: a count that comes again says nothing of the clock.
         nominal_ns: nominal time between samples.
-        max_slope_ns: bound of the slope's magnitude.
+        slopes_ns: least and greatest slope, ns per sample beyond the nominal period.
+
+    Returns:
+        None if all buckets have the same sample count, or have come at the same time: no line can be told.
     """
-    table = np.asarray(buckets, np.float64)
-    table = table[np.argsort(table[:, 0], kind="stable")]
-    late = table[:, 1] - table[:, 0] * nominal_ns
+    table = _one_for_each_count(np.asarray(buckets, np.float64))
+    span_ns = float(np.ptp(table[:, 1]))
     # From the window's beginning on: a device may have counted for months.
     begin = float(table[0, 0])
     x, arrivals, mean_x, mean_late = table[:, 0] - begin, table[:, 2], table[:, 3] - begin, table[:, 4]
-    slope = float(np.clip(_support_slope(x, late), -max_slope_ns, max_slope_ns))
-    along = (table[:, 1] - table[:, 1].min()) / np.ptp(table[:, 1])
+    if not (x[-1] > 0.0 and span_ns > 0.0):
+        return None
+    late = table[:, 1] - table[:, 0] * nominal_ns
+    slope = float(np.clip(_support_slope(x, late), *slopes_ns))
+    along = (table[:, 1] - table[:, 1].min()) / span_ns
     offset, gap, missed = _touching(x, late, along, slope)
     behind = mean_late - slope * mean_x
     behind -= behind.min()
     usual = behind <= _STALLED * np.median(behind)
     mean_slope, spread_ns = _mean_slope(arrivals[usual], mean_x[usual], mean_late[usual])
-    if usual.sum() < _LEAST_USUAL or spread_ns > SOFT * gap or abs(mean_slope) > max_slope_ns:
+    if usual.sum() < _LEAST_USUAL or spread_ns > SOFT * gap or mean_slope != np.clip(mean_slope, *slopes_ns):
         return ClockLine(slope, offset - slope * begin, _SUPPORT_ERROR[0] * gap + _SUPPORT_ERROR[1] * missed)
     offset, gap, missed = _touching(x, late, along, mean_slope)
     return ClockLine(
         mean_slope, offset - mean_slope * begin, spread_ns + _MEAN_ERROR[0] * gap + _MEAN_ERROR[1] * missed
     )
+
+
+def _one_for_each_count(table: Floats) -> Floats:
+    """Buckets ``[n, 5]`` in the order of their sample counts, the earliest of each."""
+    table = table[np.lexsort((table[:, 1], table[:, 0]))]
+    first = np.ones(len(table), np.bool_)
+    first[1:] = table[1:, 0] != table[:-1, 0]
+    return table[first]
 
 
 def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[float, float, float]:
@@ -138,16 +154,23 @@ def _touching(x: Floats, late: Floats, along: Floats, slope: float) -> tuple[flo
 
 
 def _support_slope(x: Floats, late: Floats) -> float:
-    """Slope of the edge of the lower convex hull that spans the mean of ``x``, which rises."""
-    split = int(np.searchsorted(x, x.mean(), side="right"))
+    """Slope of the edge of the lower convex hull that spans the mean of ``x``.
+
+    Args:
+        x: float64 ``[n]``, rising, at least two.
+        late: float64 ``[n]``.
+    """
+    split = min(max(int(np.searchsorted(x, x.mean(), side="right")), 1), len(x) - 1)
     left, right = 0, len(x) - 1
-    while True:
+    slope = 0.0
+    # Each step lowers the line where the sides meet, and there are only so many points.
+    for _ in range(len(x)):
         slope = float((late[right] - late[left]) / (x[right] - x[left]))
         lowest = int(np.argmin(late - slope * x))
-        # Each step lowers the line where the sides meet, and there are only so many points.
         if late[lowest] - late[left] >= slope * (x[lowest] - x[left]) - _TOUCHES_NS:
-            return slope
+            break
         left, right = (lowest, right) if lowest < split else (left, lowest)
+    return slope
 
 
 def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float]:
@@ -158,9 +181,11 @@ def _mean_slope(arrivals: Floats, x: Floats, late: Floats) -> tuple[float, float
     weight = arrivals / arrivals.sum()
     centred = x - (weight * x).sum()
     moment = (weight * centred**2).sum()
+    reach = float(centred[-1] - centred[0])
+    if not (moment > 0.0 and reach > 0.0):
+        return 0.0, np.inf
     slope = float((weight * centred * late).sum() / moment)
     left = late - (weight * late).sum() - slope * centred
-    reach = float(centred[-1] - centred[0])
     parts = np.minimum((centred - centred[0]) * (2 * PARTS / reach), 2 * PARTS - 1).astype(np.int64)
     share = np.bincount(parts, weight, 2 * PARTS)
     means = np.bincount(parts, weight * left, 2 * PARTS)[share > 0] / share[share > 0]

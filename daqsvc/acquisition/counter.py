@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.counter_kernels import COUNT, RAW, SEEN_NS, Rules, advance, follow
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,6 +31,8 @@ DOUBT_NS = NS_PER_S // 2
 WATCH_NS = NS_PER_S
 """How long frames that have fallen behind are watched: those that were delayed catch up, others do not."""
 
+
+_DOUBT, _RATE, _DRIFT = (Rules._fields.index(name) for name in ("doubt", "rate", "drift"))
 
 LEAST_BITS, MOST_BITS = 4, 64
 """How wide a counter may be: one of fewer bits wraps within a few frames, and tells nothing of a gap."""
@@ -81,23 +84,33 @@ class CounterUnwrapper:
             raise ValueError(f"a counter has {LEAST_BITS} to {MOST_BITS} bits, not {bits}")
         if not 0 < step < 2 ** (bits - 2):
             raise ValueError(f"a {bits}-bit counter cannot tell frames of {step} counts apart; make it wider")
-        self._modulus = 2**bits
         self._unused_bits = MOST_BITS - bits
         self._step = step
-        self._nominal_rate = self._rate = rate_hz / NS_PER_S
-        self._drift = DRIFT
-        self._doubt_ns = max(DOUBT_NS, round(2 * step / self._rate))
-        self.watch_ns = max(WATCH_NS, round(2 * step / self._rate))
-        self._back = min(reorder_counts, self._modulus // 4)
-        self._ahead = min(JITTER_NS * self._rate, self._modulus / 4)
+        self._nominal_rate = rate_hz / NS_PER_S
+        self._doubt_ns = max(DOUBT_NS, round(2 * step / self._nominal_rate))
+        self.watch_ns = max(WATCH_NS, round(2 * step / self._nominal_rate))
+        """How long a batch that `wants_more` may have to wait for what comes after it."""
+        modulus = 2**bits
+        self._nominal_rules = Rules(
+            step=step,
+            back=min(reorder_counts, modulus // 4),
+            ahead=min(JITTER_NS * self._nominal_rate, modulus / 4),
+            modulus=modulus,
+            doubt=self._doubt_ns * self._nominal_rate,
+            rate=self._nominal_rate,
+            drift=DRIFT,
+            watch_ns=self.watch_ns,
+        )
+        self._rules = np.array(self._nominal_rules, np.float64)
         self._started = False
         self._first: int | None = None
-        self._raw = 0
-        self._count = 0
-        self._seen_ns = 0
-        self._late = 0.0
-        self._highest = 0
-        self._suspect: int | None = None
+        self._last = np.zeros(6, np.int64)
+        self._late = np.zeros(1)
+
+    @property
+    def last_count(self) -> int:
+        """Where the last frame was placed."""
+        return int(self._last[COUNT])
 
     def measured(self, rate_hz: float, drift: float) -> None:
         """Take the device's rate as it has been measured.
@@ -106,12 +119,15 @@ class CounterUnwrapper:
             rate_hz: counts per second.
             drift: how far it may be off, relative; `DRIFT` is the most that is believed.
         """
-        self._rate = rate_hz / NS_PER_S
-        self._drift = min(drift, DRIFT)
+        rate = rate_hz / NS_PER_S
+        if abs(rate / self._rules[_RATE] - 1.0) > DRIFT:
+            self._late[0] = 0.0  # that was against another rate
+        rules = self._nominal_rules._replace(rate=rate, drift=min(drift, DRIFT), doubt=self._doubt_ns * rate)
+        self._rules = np.array(rules, np.float64)
 
     def forget_rate(self) -> None:
         """Go by the nominal rate again."""
-        self._rate, self._drift = self._nominal_rate, DRIFT
+        self._rules = np.array(self._nominal_rules, np.float64)
 
     def wants_more(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> bool:
         """Whether a batch has fallen behind the clock, and only the frames after it can tell why.
@@ -120,18 +136,20 @@ class CounterUnwrapper:
             raw: int64 ``[n]``, counters as sent.
             arrival_ns: int64 ``[n]``, host monotonic arrival times, not decreasing.
         """
-        if not self._started or arrival_ns[-1] - self._seen_ns <= self._doubt_ns:
+        if not self._started or arrival_ns[-1] - self._last[SEEN_NS] <= self._doubt_ns:
             return False
         steps, elapsed, late = self._lags(raw, arrival_ns)
-        fallen = np.flatnonzero(np.diff(late) > self._doubt_ns * self._rate)
+        doubt = self._rules[_DOUBT]
+        fallen = np.flatnonzero(np.diff(late) > doubt)
         if not len(fallen):
             return False
         at = int(fallen[0])
         since = float(elapsed[at])
-        if steps[at] != self._step and self._advance(int(steps[at]), since, since * self._drift):
+        unsure = since * self._rules[_DRIFT]
+        if steps[at] != self._step and advance(int(steps[at]), since, unsure, self._rules):
             return False  # wraps explain it
         watched_ns = int(arrival_ns[-1] - arrival_ns[at])
-        return watched_ns < self.watch_ns and float(late[-1] - late[at]) > self._doubt_ns * self._rate
+        return watched_ns < self.watch_ns and float(late[-1] - late[at]) > doubt
 
     def begin_afresh(self, first: int) -> None:
         """Take the next frame as the first one of a sender that begins anew, whatever its counter is.
@@ -140,7 +158,7 @@ class CounterUnwrapper:
             first: the count of that frame.
         """
         self._started, self._first = False, first
-        self._late = 0.0
+        self._late[0] = 0.0
         self.forget_rate()
 
     def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
@@ -153,106 +171,38 @@ class CounterUnwrapper:
         n = len(raw)
         count = np.zeros(n, np.int64)
         kept = np.ones(n, np.bool_)
-        restarts: list[int] = []
+        restarts = np.zeros(n, np.int64)
         at = 0
         if n and not self._started:
             first = int(raw[0]) % 2**_FIRST_BITS if self._first is None else self._first
-            self._accept(int(raw[0]), first, int(arrival_ns[0]))
-            self._highest = count[0] = first
+            self._started = True
+            self._last[:] = raw[0], first, arrival_ns[0], first, 0, 0
+            count[0] = first
             at = 1
-        while at < n:
-            at += self._follow(raw[at:], arrival_ns[at:], count[at:])
-            if at < n:
-                self._decide(at, int(raw[at]), int(arrival_ns[at]), count, kept, restarts)
-                at += 1
-        return Placement(count, kept, restarts)
-
-    def _follow(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64], count: NDArray[np.int64]) -> int:
-        """Place the longest beginning of a batch that continues the sequence; returns its length."""
-        steps, elapsed, late = self._lags(raw, arrival_ns)
-        unsure = self._ahead + 2 * self._drift * late[:-1]
-        sane = (steps >= -self._back) & (steps <= elapsed + late[:-1] + unsure)
-        # After half a wrap of silence a small step may hide whole wraps, unless it is the very next frame.
-        sane &= (elapsed + late[:-1] < self._modulus / 2) | (steps == self._step)
-        for at in np.flatnonzero(np.diff(late) > self._doubt_ns * self._rate).tolist():
-            sane[at] &= self._catches_up(late[at:], arrival_ns[at:])
-        good = len(raw) if sane.all() else int(np.argmin(sane))
-        if good:
-            self._late = float(late[good])
-            count[:good] = self._count + np.cumsum(steps[:good])
-            self._highest = max(self._highest, int(count[:good].max()))
-            self._accept(int(raw[good - 1]), int(count[good - 1]), int(arrival_ns[good - 1]))
-        return good
+        found = follow(
+            np.ascontiguousarray(raw[at:], np.int64),
+            np.ascontiguousarray(arrival_ns[at:], np.int64),
+            self._last,
+            self._late,
+            self._rules,
+            self._unused_bits,
+            count[at:],
+            kept[at:],
+            restarts,
+        )
+        return Placement(count, kept, (restarts[:found] + at).tolist())
 
     def _lags(
         self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Steps of the counter and of the clock from frame to frame ``[n]``; how late each is ``[n + 1]``."""
-        steps = self._signed(raw - np.concatenate(([self._raw], raw[:-1])))
-        elapsed: NDArray[np.float64] = np.diff(arrival_ns, prepend=self._seen_ns) * self._rate
-        # What lags by no more than the drift is a slow device, and not read late.
-        return steps, elapsed, _lateness(self._late, elapsed * (1 - self._drift) - steps)
-
-    def _catches_up(self, late: NDArray[np.float64], arrival_ns: NDArray[np.int64]) -> bool:
-        """Whether frames that have fallen behind were delayed: they come faster than they were sent.
-
-        Args:
-            late: ``[n + 1]``, how late they are, in counts; first the frame before them.
-            arrival_ns: int64 ``[n]``.
-        """
-        end = int(np.searchsorted(arrival_ns, arrival_ns[0] + self.watch_ns, side="right"))
-        if late[end] - late[0] <= self._doubt_ns * self._rate:
-            return True
-        # Some are always held in a buffer when a link comes up: what counts is that it goes on.
-        half = int(np.searchsorted(arrival_ns, (arrival_ns[0] + arrival_ns[end - 1]) // 2))
-        return bool(late[1 + half] - late[end] > self._ahead)
-
-    def _decide(
-        self,
-        at: int,
-        raw: int,
-        arrival_ns: int,
-        count: NDArray[np.int64],
-        kept: NDArray[np.bool_],
-        restarts: list[int],
-    ) -> None:
-        """Place one frame that the sequence does not explain."""
-        step = int(self._signed(np.array([raw], np.int64) - self._raw)[0])
-        since = (arrival_ns - self._seen_ns) * self._rate
-        # Either this frame is as late as the one before it, or it has not waited at all.
-        advance = self._advance(step, since, since * self._drift) or self._advance(
-            step, since + self._late, (since + 2 * self._late) * self._drift
-        )
-        if advance:
-            count[at] = self._count + advance
-            self._late = max(self._late + since - advance, 0.0)
-        elif self._suspect is not None and 0 < (raw - self._suspect) % self._modulus <= 4 * self._step:
-            # Never before anything placed already: two samples cannot share an index.
-            count[at] = max(self._count + round(since + self._late), self._highest + self._step)
-            restarts.append(at)
-            self._late = 0.0
-        else:
-            self._suspect = raw
-            kept[at] = False
-            return
-        self._highest = max(self._highest, int(count[at]))
-        self._accept(raw, int(count[at]), arrival_ns)
-
-    def _advance(self, step: int, elapsed: float, unsure: float) -> int:
-        """Counts from the last frame to one that is ``step`` ahead but for wraps; 0 if none fits the time."""
-        advance = step + round((elapsed - step) / self._modulus) * self._modulus
-        fits = advance > 0 and abs(advance - elapsed) <= self._ahead + unsure
-        return advance if fits else 0
-
-    def _accept(self, raw: int, count: int, arrival_ns: int) -> None:
-        self._started = True
-        self._raw, self._count, self._seen_ns = raw, count, arrival_ns
-        self._suspect = None
-
-    def _signed(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
+        steps = raw - np.concatenate((self._last[RAW : RAW + 1], raw[:-1]))
         # The counter's bits alone, the highest of them the sign: that holds even where a step overflows.
-        signed: NDArray[np.int64] = (steps << self._unused_bits) >> self._unused_bits
-        return signed
+        steps = (steps << self._unused_bits) >> self._unused_bits
+        elapsed: NDArray[np.float64] = np.diff(arrival_ns, prepend=self._last[SEEN_NS]) * self._rules[_RATE]
+        # What lags by no more than the drift is a slow device, and not read late.
+        falling_behind = elapsed * (1 - self._rules[_DRIFT]) - steps
+        return steps, elapsed, _lateness(float(self._late[0]), falling_behind)
 
 
 def _lateness(before: float, falling_behind: NDArray[np.floating]) -> NDArray[np.float64]:

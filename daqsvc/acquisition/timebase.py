@@ -10,6 +10,9 @@ stays in.
 Where all arrivals contradict the line it was wrong, or the device's clock has stepped, and the line begins
 anew: at once when they are early, for nothing comes before its time; after some seconds when they are late
 and do not catch up, for they may have been delayed.
+
+A device whose clock is off by more than 5 % has another rate than the nominal one. The line then follows the
+rate that it has, and `TimeBase.rate_doubt` says so.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import numpy as np
 
 from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.clock_line import PARTS, Bucket, clock_line
+from daqsvc.acquisition.clock_line import PARTS, Bucket, ClockLine, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
 
 if TYPE_CHECKING:
@@ -39,6 +42,20 @@ LATE_NS = 20_000_000
 """By how much all arrivals of a while must be late, likewise, for the line to be in doubt."""
 CONTRADICTED_NS = 4 * NS_PER_S
 """How long late arrivals must contradict the line until it is given up."""
+FELL_BEHIND_NS = 10 * NS_PER_S
+"""How long arrivals must be later and later until the device is taken to be slower than it was."""
+RATE_SURE_NS = 3 * NS_PER_S
+"""Of how much time the arrivals must agree on another rate than the nominal one."""
+PLAUSIBLE, PLAUSIBLE_NS = 0.15, 2 * NS_PER_S // 5
+"""The nominal rate is taken for the device's if the first arrivals of so long are so close to it."""
+STRAIGHT = 1.0 / 20.0
+"""How far they may lie off a line of that rate, as a share of what they are off one of the nominal rate."""
+BEND, BEND_BUCKETS = 0.85, 30
+"""Arrivals of so many buckets that take a smaller part of their time are of a faster device."""
+AS_BEFORE = 0.1
+"""Another rate that differs by less from the last one is the same."""
+MOST_RATIO = 1000.0
+"""How many times its nominal rate a device may seem to send, and the other way round."""
 CLOCK_DRIFT = 300e-6
 """How far a device's rate may be off the measured one an outage later."""
 _NO_BUCKETS = np.empty((0, len(Bucket._fields)))
@@ -55,6 +72,7 @@ class TimeBaseState(NamedTuple):
         restarts: how often the device has restarted its counter.
         error_ns: 95th percentile of the error of `TimeBase.time_of` for what arrives now, beside the constant
             part of the delay; infinite until it has settled.
+        doubt: why nothing can be judged by the stream's samples; empty if they can.
     """
 
     period_ns: float
@@ -63,6 +81,12 @@ class TimeBaseState(NamedTuple):
     settled: bool
     restarts: int
     error_ns: float = math.inf
+    doubt: str = ""
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second, as estimated."""
+        return NS_PER_S / self.period_ns
 
 
 class Placed(NamedTuple):
@@ -139,6 +163,11 @@ class TimeBase:
         self._settled = False
         self._contradiction_ns = CONTRADICTION_NS + 2 * samples_per_frame * self._nominal_ns
         self._late: deque[Late] = deque()
+        self.rate_doubt = ""
+        """Why the device's rate is not the nominal one, in words; empty if it is, or nobody knows yet."""
+        self._doubted_hz = 0.0
+        self.rate_known = False
+        """Whether the device's rate has been measured, or seems to be the nominal one."""
 
     @property
     def state(self) -> TimeBaseState:
@@ -151,6 +180,7 @@ class TimeBase:
             settled=self._settled,
             restarts=self._restarts,
             error_ns=max(self._error_ns, self._doubt_ns),
+            doubt=self.rate_doubt,
         )
 
     @property
@@ -244,9 +274,9 @@ class TimeBase:
         return max(self._line_error(index - self._origin[0]), self._doubt_ns)
 
     def _line_error(self, x: int) -> float:
-        first, last = float(self._buckets[0, 0]), float(self._buckets[-1, 0])
+        first, last = float(self._buckets[:, 0].min()), float(self._buckets[:, 0].max())
         ahead = max(0.0, x - last)
-        return self._error_ns * (1.0 + 2.0 * ahead / (last - first))
+        return self._error_ns * (1.0 + 2.0 * ahead / max(last - first, 1.0))
 
     def _forget(self) -> None:
         self._origin = self._bucket_best = None
@@ -268,7 +298,7 @@ class TimeBase:
         x = index + self._last_in_frame - self._origin[0]
         y = arrival_ns - self._origin[1]
         delay = y - (x * self._period_ns + self._offset_ns)
-        self._delays.extend(delay.tolist()[-RECENT_DELAYS:])
+        self._delays.extend(delay[-RECENT_DELAYS:].tolist())
         earliest = int(np.argmin(delay))
         point = (int(x[earliest]), int(y[earliest]))
         if self._bucket_best is None or self._residual(point) < self._residual(self._bucket_best):
@@ -302,22 +332,41 @@ class TimeBase:
             self._late.clear()
         else:
             self._late.append(Late(bucket, off_ns))
-            while len(self._late) > PARTS and bucket.y_ns - self._late[1].bucket.y_ns >= CONTRADICTED_NS:
+            while len(self._late) > PARTS and bucket.y_ns - self._late[1].bucket.y_ns >= FELL_BEHIND_NS:
                 self._late.popleft()
         if off_ns <= self._contradiction_ns + may_err_ns:
             self._buckets = np.vstack([self._buckets[1 - WINDOW_BUCKETS :], bucket])
+            self.rate_known = self.rate_known or self._is_plausible()
+            if self._is_faster():
+                self._begin_anew([Bucket(*row) for row in self._buckets[-BEND_BUCKETS:].tolist()])
+                return True
             self._support()
-        elif self._late_for(CONTRADICTED_NS):
-            self._begin_anew([late.bucket for late in self._late])
+        elif late := self._late_for(CONTRADICTED_NS) or self._ever_later():
+            self._begin_anew([one.bucket for one in late])
             return True
         return False
 
-    def _late_for(self, duration_ns: int) -> bool:
-        """Whether all arrivals have been late for a while, by about as much: delayed ones catch up."""
-        first, last = self._late[0], self._late[-1]
-        span_ns = last.bucket.y_ns - first.bucket.y_ns
-        steady = abs(last.off_ns - first.off_ns) <= MAX_DRIFT * span_ns
-        return steady and span_ns >= duration_ns and len(self._late) >= PARTS
+    def _late_for(self, duration_ns: int) -> list[Late]:
+        """The arrivals of so long, if all were late by about as much: delayed ones catch up."""
+        last = self._late[-1]
+        first = next(
+            (k for k, one in enumerate(reversed(self._late), 1) if _apart(one, last) >= duration_ns), 0
+        )
+        late = list(self._late)[-first:] if first >= PARTS else []
+        steady = late and abs(last.off_ns - late[0].off_ns) <= MAX_DRIFT * _apart(late[0], last)
+        return late if steady else []
+
+    def _ever_later(self) -> list[Late]:
+        """The latest arrivals, if they have fallen behind all the time: so do those of a slower device."""
+        late = list(self._late)
+        if _apart(late[0], late[-1]) < FELL_BEHIND_NS or len(late) < 2 * PARTS:
+            return []
+        off = np.array([one.off_ns for one in late])
+        t = np.array([one.bucket.y_ns - late[0].bucket.y_ns for one in late], np.float64)
+        growth = off[-1] - off[0]
+        straight = np.abs(off - off[0] - growth * t / t[-1]).max() <= growth / 8.0
+        counted = late[-1].bucket.x > late[0].bucket.x
+        return late if counted and straight and growth > MAX_DRIFT * t[-1] else []
 
     @property
     def _doubt_ns(self) -> float:
@@ -326,7 +375,7 @@ class TimeBase:
             return 0.0
         if self._late[-1].off_ns > self._contradiction_ns:
             return self._late[-1].off_ns
-        return min(late.off_ns for late in self._late) if self._late_for(CONTRADICTED_NS // 2) else 0.0
+        return min((late.off_ns for late in self._late_for(CONTRADICTED_NS // 2)), default=0.0)
 
     def _begin_anew(self, buckets: list[Bucket]) -> None:
         origin = self._origin
@@ -342,13 +391,97 @@ class TimeBase:
 
     def _support(self) -> None:
         """Lay the line under the window's arrivals."""
-        if self._buckets[-1, 1] - self._buckets[0, 1] < SETTLING_NS:
+        if np.ptp(self._buckets[:, 1]) < SETTLING_NS:
             return
-        line = clock_line(self._buckets, self._nominal_ns, MAX_DRIFT * self._nominal_ns)
+        drift_ns = MAX_DRIFT * self._nominal_ns
+        line = self._line_of_any_rate() or clock_line(self._buckets, self._nominal_ns, (-drift_ns, drift_ns))
+        off = line is not None and abs(line.slope_ns) > drift_ns
+        if line is None or (off and np.ptp(self._buckets[:, 1]) < RATE_SURE_NS):
+            return
         self._period_ns = self._nominal_ns + line.slope_ns
         self._offset_ns, self._error_ns = line.offset_ns, line.error_ns
         self._settled = True
-        if abs(line.slope_ns) < MAX_DRIFT * self._nominal_ns:
-            span_ns = float(self._buckets[-1, 0] - self._buckets[0, 0]) * self._nominal_ns
-            drift = CLOCK_DRIFT + 2.0 * line.error_ns / span_ns
+        if off or abs(line.slope_ns) < drift_ns:
+            self._note_rate(nominal=not off)
+            counted_ns = float(np.ptp(self._buckets[:, 0])) * self._period_ns
+            drift = CLOCK_DRIFT + 2.0 * line.error_ns / counted_ns
             self._unwrapper.measured(NS_PER_S / self._period_ns / self._samples_per_count, drift)
+
+    def _line_of_any_rate(self) -> ClockLine | None:
+        """The line, if the arrivals are those of a device with a rate of its own, whatever that is.
+
+        None if they are of a stall, or of frames that were held up: such tell no rate. Where the device has
+        had another rate before, the arrivals of that time are forgotten.
+        """
+        drift_ns = MAX_DRIFT * self._nominal_ns
+        any_slope = (self._nominal_ns / MOST_RATIO - self._nominal_ns, self._nominal_ns * MOST_RATIO)
+        line = clock_line(self._buckets, self._nominal_ns, any_slope)
+        if line is None or abs(line.slope_ns) <= drift_ns or np.ptp(self._buckets[:, 1]) < RATE_SURE_NS:
+            return line
+        if self._is_straight(line, self._buckets, self._nominal_ns):
+            return line
+        recent = self._buckets[-BEND_BUCKETS:]
+        if np.ptp(recent[:, 1]) < SETTLING_NS:
+            return None
+        line = clock_line(recent, self._nominal_ns, any_slope)
+        if line is None or abs(line.slope_ns) > drift_ns:
+            return None
+        self._buckets = recent
+        return line
+
+    def _note_rate(self, *, nominal: bool) -> None:
+        self.rate_known = True
+        rate_hz = NS_PER_S / self._period_ns
+        if nominal:
+            self.rate_doubt, self._doubted_hz = "", 0.0
+        elif abs(rate_hz - self._doubted_hz) > AS_BEFORE * rate_hz:
+            self.rate_doubt, self._doubted_hz = rate_in_words(rate_hz, self._nominal_ns), rate_hz
+
+    def _is_faster(self) -> bool:
+        """Whether the latest arrivals are those of a faster device than the line's, which they only bend."""
+        recent = self._buckets[-BEND_BUCKETS:]
+        if not self._settled or len(self._buckets) < 2 * BEND_BUCKETS or recent[-1, 0] <= recent[0, 0]:
+            return False
+        if np.ptp(recent[:, 1]) > BEND * float(np.ptp(recent[:, 0])) * self._period_ns:
+            return False
+        limit_ns = self._nominal_ns * MOST_RATIO
+        line = clock_line(recent, self._nominal_ns, (-self._nominal_ns, limit_ns))
+        return line is not None and self._is_straight(line, recent, self._period_ns)
+
+    def _is_plausible(self) -> bool:
+        x, y_ns = self._buckets[-1, :2] - self._buckets[0, :2]
+        return bool(y_ns >= PLAUSIBLE_NS and abs(x * self._nominal_ns / y_ns - 1.0) <= PLAUSIBLE)
+
+    def _is_straight(self, line: ClockLine, buckets: NDArray[np.float64], period_ns: float) -> bool:
+        """Whether arrivals lie along a line, as those of a device do that has another rate.
+
+        Args:
+            line: through them.
+            buckets: float64 ``[n, 5]``.
+            period_ns: of the rate that they are not of.
+        """
+        x = buckets[:, 0]
+        found_ns = self._nominal_ns + line.slope_ns
+        late = buckets[:, 1] - x * found_ns - line.offset_ns
+        return float(np.percentile(late, 90)) <= STRAIGHT * abs(found_ns - period_ns) * float(np.ptp(x))
+
+
+def rate_in_words(rate_hz: float, nominal_ns: float) -> str:
+    """What to tell of a device whose rate is not the nominal one.
+
+    Args:
+        rate_hz: what it sends, samples per second.
+        nominal_ns: nominal time between samples.
+    """
+    return (
+        f"the device sends {_rounded(rate_hz)} Hz, the file says {_rounded(NS_PER_S / nominal_ns)}; correct "
+        "rate_hz in the machine file, or the device's setting"
+    )
+
+
+def _rounded(rate_hz: float) -> str:
+    return f"{float(f'{rate_hz:.4g}'):.12g}"
+
+
+def _apart(one: Late, other: Late) -> int:
+    return other.bucket.y_ns - one.bucket.y_ns

@@ -22,7 +22,7 @@ class Window:
         t_end_ns: monotonic time of the last sample.
         period_ns: time between samples.
         skipped: samples between the previous window and this one that the detector was too slow
-            for (they were overwritten); 0 in normal operation.
+            for (they were overwritten), or that were withheld from it; 0 in normal operation.
         snapshot: whether the samples are one block that was taken by itself. Between it and the window before
             nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
     """

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
+from daqsvc.acquisition.standing import Standing
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.silence import Patience
@@ -33,6 +35,9 @@ MOST_BLOCKS = 64
 
 LOOK_NS = NS_PER_S // 2
 
+MOST_HELD = 4096
+"""Statements of a stream that wait for its rate to be known, at most; the oldest are dropped."""
+
 HANG_S = 30.0
 """A window that takes longer to process hangs; its detector is left alone with it, and the others go on."""
 
@@ -45,6 +50,7 @@ class DetectorCounters:
         windows: windows processed.
         samples: samples in them.
         samples_skipped: samples it was too slow for, exactly; what never arrived is none.
+        samples_withheld: samples that it was not given, since nothing could be judged by them.
         failures: windows in which it raised, against its contract.
         busy_ns: time its kernels took, on the host's clock.
     """
@@ -52,6 +58,7 @@ class DetectorCounters:
     windows: int = 0
     samples: int = 0
     samples_skipped: int = 0
+    samples_withheld: int = 0
     failures: int = 0
     busy_ns: int = 0
 
@@ -88,6 +95,10 @@ class Pipeline:
         self._settling_ns = settling_ns or {}
         self._patience = {name: Patience() for name in rings} | dict(patience or {})
         self._silent_until_ns = dict.fromkeys(rings, -1)
+        self._standings = dict.fromkeys(rings, Standing())
+        self._changes = dict.fromkeys(rings, 0)
+        self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
+        self._seen_changes = dict.fromkeys(self.counters, 0)
         self._report = report
         self._clock = clock
         self._supervisor = supervisor or Supervisor()
@@ -99,6 +110,41 @@ class Pipeline:
     def behind_samples(self) -> int:
         """Samples that the slowest detector has not read yet."""
         return max((reader.behind for reader in self._readers.values()), default=0)
+
+    def stand(self, stream: str, standing: Standing) -> None:
+        """Take in how a stream stands; call on the event loop.
+
+        While nothing can be judged by it its detectors get none of its samples, and hold what they have said.
+        What is said before its rate is known waits for that.
+        """
+        before, self._standings[stream] = self._standings[stream], standing
+        if standing.doubt != before.doubt:
+            self._changes[stream] += 1
+            self._held[stream].clear()
+            if standing.doubt:
+                self._say_doubt(stream, standing.doubt)
+        elif standing.proven:
+            self._let_go(stream)
+
+    def _say_doubt(self, stream: str, doubt: str) -> None:
+        now_ns = self._clock.monotonic_ns()
+        for detector in self.detectors:
+            if detector.stream == stream:
+                with self._supervisor.sparing_others(
+                    _part(detector), "the others say that nothing is judged"
+                ):
+                    for diagnosis in detector.silent(0.0, now_ns):
+                        self._report(replace(diagnosis, quality="missing", reason=doubt))
+
+    def _let_go(self, stream: str) -> None:
+        """Report what has waited for the rate of its stream."""
+        held = self._held[stream]
+        while held:
+            diagnosis = held.popleft()
+            with self._supervisor.sparing_others(
+                f"detector {diagnosis.detector}", "one statement of it is lost"
+            ):
+                self._report(diagnosis)
 
     async def warm(self) -> None:
         """Compile every kernel before the first sample comes.
@@ -165,8 +211,11 @@ class Pipeline:
                         self._patience[name].heard_after(now_ns - since_ns[name])
                     ends[name], since_ns[name] = ring.end_index, now_ns
                     said.discard(name)
+                elif self._standings[name].doubt:
+                    since_ns[name] = now_ns  # its detectors have said why
                 elif name not in said and now_ns - since_ns[name] >= self._patience[name].ns:
                     said.add(name)
+                    self._let_go(name)
                     self._silent_until_ns[name] = now_ns
                     silence_s = (now_ns - since_ns[name]) / NS_PER_S
                     for detector in self.detectors:
@@ -183,25 +232,37 @@ class Pipeline:
             if detector.name not in self._under_way:
                 window = await self._next_window(detector)
                 if window is None:
+                    self._let_go(detector.stream)
                     return
                 work = partial(_process, detector, window, self.counters[detector.name])
                 self._under_way[detector.name] = kernels.submit(work)
             job = self._under_way[detector.name]
             await self._until_made(detector, job, kernels)
             del self._under_way[detector.name]
-            for diagnosis in job.outcome.result():
-                # What lies before a silence that has been told is history: it must not speak after it.
-                if diagnosis.t_ns > self._silent_until_ns[detector.stream]:
-                    with self._supervisor.sparing_others(_part(detector), "one statement of it is lost"):
-                        self._report(diagnosis)
+            stream, said = detector.stream, job.outcome.result()
+            if self._changes[stream] != self._seen_changes[detector.name]:
+                continue  # its samples may not have been what they seemed
+            # What lies before a silence that has been told is history: it must not speak after it.
+            self._held[stream] += (one for one in said if one.t_ns > self._silent_until_ns[stream])
+            if self._standings[stream].proven:
+                self._let_go(stream)
 
     async def _next_window(self, detector: Detector) -> Window | None:
         """The next samples for a detector; None if no more will come."""
         reader, counters = self._readers[detector.name], self.counters[detector.name]
-        try:
-            chunk = await reader.take(detector.block, MOST_BLOCKS)
-        except RingClosed:
-            return None
+        withheld = 0
+        while True:
+            try:
+                chunk = await reader.take(detector.block, MOST_BLOCKS)
+            except RingClosed:
+                return None
+            stream, changes = detector.stream, self._changes[detector.stream]
+            if not self._standings[stream].doubt and changes == self._seen_changes[detector.name]:
+                break
+            # What came before a doubt was over is not to be judged by, either.
+            self._seen_changes[detector.name] = changes
+            counters.samples_withheld += len(chunk.samples)
+            withheld += chunk.skipped + len(chunk.samples)
         if missed := chunk.skipped - chunk.lost:
             counters.samples_skipped += missed
             logger.warning(
@@ -211,7 +272,7 @@ class Pipeline:
                 detector.stream,
                 chunk.first_index - chunk.skipped,
             )
-        return _window(reader.ring, chunk)
+        return _window(reader.ring, chunk, withheld)
 
     async def _until_made(
         self, detector: Detector, job: Job[Sequence[Diagnosis]], kernels: KernelThreads
@@ -232,14 +293,14 @@ def _is_closed(ring: SampleRing) -> bool:
     return ring.is_closed
 
 
-def _window(ring: SampleRing, chunk: Chunk) -> Window:
+def _window(ring: SampleRing, chunk: Chunk, withheld: int) -> Window:
     last = chunk.first_index + len(chunk.samples) - 1
     return Window(
         chunk.first_index,
         chunk.samples,
         ring.time_of(last),
         ring.period_at(last),
-        chunk.skipped,
+        chunk.skipped + withheld,
         chunk.snapshot,
     )
 

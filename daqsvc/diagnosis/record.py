@@ -36,7 +36,8 @@ class Diagnosis:
         thresholds: limits that the statistics were held against, e.g. ``{"rms.alert": 0.11}``.
         evidence: log-likelihood ratios in nats, by name.
         revolutions: shaft revolutions since the detector started, where it follows the shaft.
-        quality: ``"good"``; ``"missing"`` if too many samples of the window are missing;
+        quality: ``"good"``; ``"missing"`` if too many samples of the window are missing, or nothing can be
+            judged by the stream (another rate than the file says, a counter that stands still);
             ``"not_ok"`` if a sensor is outside its OK limits, dead or clipped. Unless it is good,
             ``decision`` is held from before: missing data never clears anything. Only where ``bounds`` show
             that it must be worse whatever is missing it may rise.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from can_standin import frame_bytes
-from running_drivers import QuickClock, running, until
+from running_drivers import CountingDevice, QuickClock, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -144,17 +144,21 @@ async def test_a_link_that_goes_down_a_hundred_times_leaves_nothing_behind(vcan:
 
 async def test_an_adapter_that_is_unplugged_is_opened_again(vcan: VcanLink) -> None:
     driver = driver_on(vcan, [])
+    device = CountingDevice(3000.0, 3)
     async with running(driver):
         for k in range(1, 6):
             await until(lambda: driver.link.state == "up")
             with vcan.sender() as sender:
-                sender.send(frame_bytes(0x101, (3 * k).to_bytes(2, "big") + bytes(6)))
+                counter = 3 * device.frame() % 2**16
+                sender.send(frame_bytes(0x101, counter.to_bytes(2, "big") + bytes(6)))
             await until(lambda: driver.streams["s"][0].frames_received == k)  # noqa: B023
             await asyncio.to_thread(vcan.remove)
             await until(lambda: driver.link.losses == k and "No such device" in driver.link.reason)  # noqa: B023
             await asyncio.to_thread(vcan.add)
         await until(lambda: driver.link.state == "up")
-    assert driver.streams["s"][0].samples_lost == 0
+    counters, _ = driver.streams["s"]
+    assert (counters.samples_received, counters.frames_rejected) == (15, 0)
+    assert counters.samples_lost == device.samples_since_first - 15
 
 
 async def test_bus_off_takes_the_link_down_until_the_controller_restarts(vcan: VcanLink) -> None:

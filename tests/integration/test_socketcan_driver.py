@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from can_standin import StandInBus, frame_bytes
-from running_drivers import running, until
+from running_drivers import CountingDevice, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -114,13 +114,16 @@ async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
 
 async def test_an_adapter_that_is_unplugged_is_opened_again(bus: StandInBus) -> None:
     driver = driver_on(bus, [])
+    device = CountingDevice(3000.0, 3)
     async with running(driver):
-        bus.send([sample_frame(0)])
+        bus.send([sample_frame(device.frame())])
         await until(lambda: driver.streams["s"][0].frames_received == 1)
         bus.unplug()
         await until(lambda: driver.link.state == "down")
         bus.plug_in()
         await until(lambda: driver.link.state == "up")
-        bus.send([sample_frame(2)])
+        bus.send([sample_frame(device.frame())])
         await until(lambda: driver.streams["s"][0].frames_received == 2)
-    assert driver.streams["s"][0].samples_lost == 3
+    counters, _ = driver.streams["s"]
+    assert (counters.samples_received, counters.frames_rejected) == (6, 0)
+    assert counters.samples_lost == device.samples_since_first - 6

@@ -194,7 +194,8 @@ def test_the_line_supports_all_arrivals_and_fits_them_best(seed, n, begin, step)
     # One bucket outweighs the rest: its mean tells nothing, so that only the support is in question.
     wild = [(1, float(at), float(late)) for at, late in zip(x, rng.uniform(-1e12, 1e12, n), strict=True)]
     buckets = [Bucket(int(a), int(b), *rest) for a, b, rest in zip(x, arrival_ns, wild, strict=True)]
-    line = clock_line(buckets, nominal_ns, 1e9)
+    line = clock_line(buckets, nominal_ns, (-1e9, 1e9))
+    assert line is not None
     delay = late_ns - (x - begin) * line.slope_ns - (line.offset_ns + begin * line.slope_ns)
     tolerance_ns = 1e-3 + 1e-9 * begin * abs(line.slope_ns)
     assert delay.min() >= -tolerance_ns

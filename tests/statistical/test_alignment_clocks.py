@@ -88,6 +88,7 @@ def line_after(duration_s, delays, seed, rate_hz=6400.0):
         Bucket(int(x[k, i]), int(arrival_ns[k, i]), 10, float(x[k].mean()), float(late_ns[k].mean()))
         for k, i in enumerate(earliest)
     ]
-    line = clock_line(buckets, nominal_ns, 0.05 * nominal_ns)
+    line = clock_line(buckets, nominal_ns, (-0.05 * nominal_ns, 0.05 * nominal_ns))
+    assert line is not None
     error_ns = x[-1, -1] * (nominal_ns + line.slope_ns - true_ns) + line.offset_ns
     return error_ns / 1e3, line.error_ns / 1e3

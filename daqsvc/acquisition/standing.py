@@ -1,0 +1,93 @@
+"""Whether anything can be judged by a stream's samples, and why not: from its driver to whoever judges."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from daqsvc.acquisition.clock import NS_PER_S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+logger = logging.getLogger(__name__)
+
+QUIET_NS = 60 * NS_PER_S
+"""A stream whose standing changes again and again is told of no more often than this."""
+
+PROVING_NS = 5 * NS_PER_S
+"""Until then a stream's rate is either known, or it is not waited for."""
+
+
+class Standing(NamedTuple):
+    """How a stream stands.
+
+    Attributes:
+        doubt: why nothing can be judged by its samples; empty if nothing speaks against them.
+        proven: whether its rate seems to be the nominal one, or could not be found out in time.
+    """
+
+    doubt: str = ""
+    proven: bool = True
+
+
+Tell: TypeAlias = "Callable[[str, Standing], None]"
+"""Called with the name of a stream and its standing whenever that changes."""
+
+
+def tell_nobody(stream: str, standing: Standing) -> None:
+    """Nobody wants to know how a stream stands."""
+
+
+class StreamStanding:
+    """Keeps a stream's standing, tells it when it changes, and logs it.
+
+    Args:
+        stream: name of the stream.
+        tell: called when it changes.
+    """
+
+    def __init__(self, stream: str, tell: Tell) -> None:
+        self._stream = stream
+        self._tell = tell
+        self._now: Standing | None = None
+        self._begun_ns: int | None = None
+        self._logged_ns: int | None = None
+        self._logged = ""
+
+    def take(self, doubt: str, now_ns: int, *, known: bool) -> None:
+        """Take in how the stream stands.
+
+        Args:
+            doubt: see `Standing.doubt`.
+            now_ns: arrival of its newest frame.
+            known: whether its rate is known.
+        """
+        if self._begun_ns is None:
+            self._begun_ns = now_ns
+        proven = known or bool(doubt) or now_ns - self._begun_ns >= PROVING_NS
+        if self._now is not None:
+            proven = proven or self._now.proven
+        standing = Standing(doubt, proven)
+        if standing == self._now:
+            return
+        before, self._now = self._now, standing
+        if bool(doubt) != bool(before and before.doubt):
+            self._log(doubt, now_ns)
+        self._tell(self._stream, standing)
+
+    def give_up_waiting(self) -> None:
+        """Nothing more comes for now: what has come is to be judged as it is."""
+        if self._now is not None and not self._now.proven:
+            self._now = self._now._replace(proven=True)
+            self._tell(self._stream, self._now)
+
+    def _log(self, doubt: str, now_ns: int) -> None:
+        if doubt:
+            if self._logged_ns is not None and now_ns - self._logged_ns < QUIET_NS and doubt == self._logged:
+                return
+            self._logged_ns, self._logged = now_ns, doubt
+            logger.warning("stream %r: %s. Nothing is judged by it meanwhile", self._stream, doubt)
+        elif self._logged_ns is not None and self._logged:
+            self._logged = self._logged if now_ns - self._logged_ns < QUIET_NS else ""
+            logger.warning("stream %r: its samples can be judged by again", self._stream)

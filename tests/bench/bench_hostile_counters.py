@@ -1,0 +1,196 @@
+"""How late the event loop is while a device does its worst: counters that stand still or leap, and floods.
+
+Run by ``make bench``. Another process sends CAN frames over a local socket, or bytes over a pseudo-terminal,
+through the whole driver into a ring; a second, healthy CAN bus at 1 kHz runs beside it and must lose nothing.
+Each load lasts some seconds; memory is looked at before and after.
+"""
+
+# ruff: noqa: T201 - printing is what it is for
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pty
+import resource
+import socket
+import subprocess
+import sys
+import time
+import tty
+from typing import Any, NamedTuple
+
+import numpy as np
+from can_standin import frame_bytes
+from targets import Targets
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.acquisition.ring import SampleRing
+from drivers.base import BusPort, StreamSpec
+from drivers.can_bus import CanDriver
+from drivers.frames import FrameLayout
+from drivers.serial_lines import LineLayout
+from drivers.serial_port import SerialDriver
+from drivers.socketcan import SocketCan
+
+LOAD_S = 4.0
+TICK_S = 0.005
+LATE_MS = 20.0
+GROWTH_MB = 24.0
+RATE_HZ = 1000.0
+LAYOUT = FrameLayout.plain(
+    frame_id=0x101,
+    length=8,
+    channels=[("x", 16, "signed", 0.001, 0.0)],
+    samples_per_frame=1,
+    counter_byte=0,
+    counter_bits=32,
+    first_byte=4,
+)
+LINES = LineLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+
+
+class Load(NamedTuple):
+    """What a device sends: frames a second, and how it counts."""
+
+    bus: str
+    counter: str
+    frames_per_s: float
+
+
+LOADS = [
+    Load("can", "sound", 1000),
+    Load("can", "still", 1000),
+    Load("can", "random", 1000),
+    Load("can", "random", 4000),
+    Load("can", "random", 8000),
+    Load("can", "corrupt", 1000),
+    Load("can", "sound", 10_000),
+    Load("can", "sound", 100_000),
+    Load("lines", "still", 1000),
+    Load("lines", "random", 4000),
+    Load("lines", "sound", 10_000),
+    Load("lines", "sound", 100_000),
+]
+
+
+def counters(load: Load, first: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """The next counters of a device."""
+    sound = (first + np.arange(n)) % 2**32
+    if load.counter == "still":
+        return np.full(n, 77)
+    if load.counter == "random":
+        return rng.integers(0, 2**32, n)
+    if load.counter == "corrupt":
+        return np.where(rng.random(n) < 0.2, rng.integers(0, 2**32, n), sound)
+    return sound
+
+
+def send(load: Load, fd: int) -> None:
+    """Send at real time for `LOAD_S`; what the other end does not take is dropped, as on a wire."""
+    rng = np.random.default_rng(1)
+    os.set_blocking(fd, False)
+    sent, total = 0, round(LOAD_S * load.frames_per_s)
+    begun = time.monotonic()
+    while sent < total:
+        due = min(round((time.monotonic() - begun) * load.frames_per_s), total)
+        for count in counters(load, sent, due - sent, rng).tolist():
+            try:
+                if load.bus == "can":
+                    os.write(fd, frame_bytes(0x101, count.to_bytes(4, "little") + bytes(4)))
+                else:
+                    os.write(fd, b"%d,0.5\n" % count)
+            except BlockingIOError:
+                time.sleep(0.0005)
+        sent = due
+        time.sleep(0.001)
+
+
+def can_bus(name: str) -> tuple[CanDriver, int, list[socket.socket]]:
+    """A CAN bus, and the file descriptor to send on."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ring = SampleRing("s", ("x",), 100_000)
+    options = {"interface": "socketcan", "channel": name}
+    port = BusPort(name, options, [StreamSpec("s", LAYOUT, RATE_HZ)], SystemClock(), ring.write)
+    driver = CanDriver(port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
+    return driver, ours.fileno(), [ours]
+
+
+def serial_port() -> tuple[SerialDriver, int, list[Any]]:
+    """A serial port, and the file descriptor to send on."""
+    ours, theirs = pty.openpty()
+    tty.setraw(ours)
+    ring = SampleRing("s", ("x",), 100_000)
+    options = {"port": os.ttyname(theirs), "framing": "lines"}
+    port = BusPort("tty", options, [StreamSpec("s", LINES, RATE_HZ)], SystemClock(), ring.write)
+    return SerialDriver(port), ours, [ours, theirs]
+
+
+async def lateness(late_ms: list[float]) -> None:
+    """How late a timer of 5 ms is, until cancelled."""
+    loop = asyncio.get_running_loop()
+    while True:
+        due = loop.time() + TICK_S
+        await asyncio.sleep(TICK_S)
+        late_ms.append(1000.0 * (loop.time() - due))
+
+
+def sender(load: Load, fd: int) -> subprocess.Popen[bytes]:
+    """A process that sends."""
+    words = [sys.executable, __file__, "--send", *map(str, load), str(fd)]
+    return subprocess.Popen(words, pass_fds=[fd])
+
+
+async def under(load: Load) -> tuple[float, float, int, str]:
+    """99th percentile of lateness in ms, growth in MB, samples the healthy bus lost, what is said."""
+    hostile: CanDriver | SerialDriver
+    ends: list[Any]
+    hostile, fd, ends = can_bus("hostile") if load.bus == "can" else serial_port()
+    healthy, healthy_fd, more_ends = can_bus("healthy")
+    late_ms: list[float] = []
+    running = [asyncio.create_task(driver.run()) for driver in (hostile, healthy)]
+    while any(driver.link.state != "up" for driver in (hostile, healthy)):
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.5)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    senders = [sender(load, fd), sender(Load("can", "sound", RATE_HZ), healthy_fd)]
+    while not hostile.streams["s"][0].frames_received:
+        await asyncio.sleep(0.01)
+    watching = asyncio.create_task(lateness(late_ms))
+    while any(process.poll() is None for process in senders):
+        await asyncio.sleep(0.1)
+    watching.cancel()
+    growth = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    await asyncio.sleep(0.2)
+    for task in running:
+        task.cancel()
+    await asyncio.gather(*running, watching, return_exceptions=True)
+    counted = healthy.streams["s"][0]
+    lost = round(LOAD_S * RATE_HZ) - counted.samples_received
+    for end in ends + more_ends:
+        os.close(end) if isinstance(end, int) else end.close()
+    return float(np.percentile(late_ms, 99)), growth, lost, hostile.streams["s"][1].doubt
+
+
+def main() -> int:
+    """Measure and print; the first load is a healthy device, which says how busy the machine is by itself."""
+    targets = Targets()
+    at_most_ms = LATE_MS
+    for load in LOADS:
+        p99, growth, lost, doubt = asyncio.run(under(load))
+        at_most_ms = max(LATE_MS, 2.0 * p99) if load is LOADS[0] else at_most_ms
+        name = f"{load.bus}, {load.counter} counter, {load.frames_per_s:g}/s"
+        said = doubt or "fine"
+        print(f"{name:32} p99 {p99:5.1f} ms, memory +{growth:.1f} MB, healthy bus lost {lost}; {said}")
+        targets.ask(f"{name}: at most {at_most_ms:.0f} ms late", f"{p99:.1f} ms", at_most_ms / p99)
+        targets.ask(f"{name}: memory flat", f"{growth:.1f} MB", GROWTH_MB / max(growth, 1.0))
+        targets.ask(f"{name}: no sample of the healthy bus lost", f"{lost} lost", 0.0 if lost else 1.0)
+    return targets.exit_code
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--send"]:
+        bus, counter, rate, fd_ = sys.argv[2:]
+        send(Load(bus, counter, float(rate)), int(fd_))
+    else:
+        sys.exit(main())
