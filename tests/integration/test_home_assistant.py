@@ -166,7 +166,7 @@ async def test_what_the_machine_file_no_longer_has_disappears(mosquitto, outbox)
     removal, last = told
     old = RIG.alarms[0]
     gone = {name for name, entity in removal.items() if set(entity) == {"platform"}}
-    assert len(gone) == 2
+    assert len(gone) == 5, "alarm, level, state and two buttons"
     assert all(old in name.replace("_2f", "/") for name in gone)
     assert gone.isdisjoint(last)
     assert set(removal) == gone | set(last)
