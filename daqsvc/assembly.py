@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.settings.models import Levels, MachineFile, RotorSynchronous, Sensor
+    from daqsvc.settings.models import Levels, MachineFile, RotorBank, RotorSynchronous, Sensor
 
 __all__ = ["AssemblyError", "check_calibrations", "detectors"]
 
@@ -45,7 +45,7 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
         for stream in machine.streams:
             made += _levels(machine, machine.pipeline.levels, stream)
     if machine.pipeline.rotor_bank is not None:
-        made.append(rotor_bank(machine, machine.pipeline.rotor_bank))
+        made.append(_rotor_bank(machine, machine.pipeline.rotor_bank))
     if machine.pipeline.rotor_synchronous is not None:
         given = machine.pipeline.rotor_synchronous
         made.append(rotor_synchronous(machine, given, _healthy_rotor(machine, given), store))
@@ -81,6 +81,16 @@ def _levels(machine: MachineFile, given: Levels, stream: str) -> Iterator[Detect
         yield TrendDetector(name, stream, rate_hz, trends, window_s=given.window_s)
 
 
+def _rotor_bank(machine: MachineFile, given: RotorBank) -> Detector:
+    try:
+        return rotor_bank(machine, given)
+    except (ValueError, ArithmeticError) as error:
+        raise AssemblyError(
+            f"{machine.path}: pipeline.rotor_bank: its observers cannot be made of these figures ({error}); "
+            "correct noise_um, process_noise, modes, or [machine.rotor]"
+        ) from error
+
+
 def _bearing(machine: MachineFile, store: Path | None) -> Detector:
     from daqsvc.assembly_bearing import bearing_detector  # noqa: PLC0415 - brings SciPy's statistics
 
@@ -113,6 +123,8 @@ def check_calibrations(machine: MachineFile) -> None:
         AssemblyError: one cannot, or is not; the message names file, key, value and remedy.
     """
     pipeline = machine.pipeline
+    if pipeline.rotor_bank is not None:
+        _rotor_bank(machine, pipeline.rotor_bank)
     if pipeline.rotor_synchronous is not None:
         _healthy_rotor(machine, pipeline.rotor_synchronous)
     if pipeline.bearing is not None:

@@ -185,35 +185,59 @@ def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterat
             "pages of its multiplexer",
             "make a stream for each page, with a counter that is on it",
         )
-    counter = None if layout.counter is None else signals.get(layout.counter.signal)
-    if counter is not None and (counter.is_signed or counter.is_float):
+    if layout.counter is not None and layout.counter.signal in signals:
+        yield from _counter(signals[layout.counter.signal], (*at, "counter", "signal"))
+    for path, name in asked:
+        signal = signals.get(name)
+        if signal is not None:
+            yield from _place(signal, message.length, path)
+
+
+def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
+    """The counter counts from 0 upwards, by 1, over all of its bits."""
+    if counter.is_signed or counter.is_float:
         yield Finding(
-            (*at, "counter", "signal"),
+            at,
             "is signed or a float; a counter runs from 0 upwards and wraps",
             "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
         )
-    elif counter is not None and counter.scale != 1:
+    elif counter.scale != 1:
         yield Finding(
-            (*at, "counter", "signal"),
+            at,
             f"has the scale {counter.scale:g} in the DBC file: the raw value is counted, and one count of it "
             "would then be something else than a frame or a sample",
             "name a signal that grows by 1; if this one does, write (1,0) in the DBC file",
         )
-    elif counter is not None and counter.maximum is not None:
+    elif counter.maximum is not None:
         largest, all_ones = float(counter.maximum) - float(counter.offset), 2**counter.length - 1
         if largest != all_ones:
             yield Finding(
-                (*at, "counter", "signal"),
+                at,
                 f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were "
                 "not lost count as lost at each of its turns",
                 "see what the device sends: if it ends there, write no_counter = true in place of counter, "
                 "else correct the range in the DBC file",
                 fatal=False,
             )
-    for path, name in asked:
-        signal = signals.get(name)
-        if signal is not None and path[-2] == "signals":
-            yield from _scale(signal, path)
+
+
+def _place(signal: Signal, length: int, at: KeyPath) -> Iterator[Finding]:
+    """The signal lies within its message."""
+    if signal.start < 0 or _end_bit(signal) > 8 * length:
+        yield Finding(
+            at,
+            f"does not lie within the {length} bytes of its message in the DBC file",
+            "correct the signal, or the length of the message, in the DBC file",
+        )
+    if at[-2] == "signals":
+        yield from _scale(signal, at)
+
+
+def _end_bit(signal: Signal) -> int:
+    """One past the last bit of a signal, as they go over the bus."""
+    if signal.byte_order == "little_endian":
+        return int(signal.start + signal.length)
+    return int(8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length)
 
 
 def _scale(signal: Signal, at: KeyPath) -> Iterator[Finding]:

@@ -74,7 +74,7 @@ def fuzzed(folder, monkeypatch, seeds):
 
 
 def test_spoilt_machine_files(tmp_path, monkeypatch):
-    usable = fuzzed(tmp_path, monkeypatch, range(280))
+    usable = fuzzed(tmp_path, monkeypatch, [*range(280), 923, 6705, 9197])
     assert 20 < usable < 200
 
 
@@ -120,7 +120,7 @@ def dbc_fuzzed(folder, seeds):
 
 
 def test_spoilt_dbc_files(tmp_path):
-    assert 5 < dbc_fuzzed(tmp_path, range(200)) < 100
+    assert 5 < dbc_fuzzed(tmp_path, [*range(200), 2100, 3119]) < 100
 
 
 @pytest.mark.long

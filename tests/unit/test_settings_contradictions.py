@@ -246,6 +246,7 @@ def test_a_dbc_file_in_millivolts_read_as_volts(tmp_path):
     [
         ("8|16@1- (0.0005,0)", "8|16@1- (0,0)", "channels[0].signals[0]", "has the scale 0"),
         ("8|16@1- (0.0005,0)", "8|16@1- (1e-300,0)", "channels[0].signals[0]", "has the scale 1e-300"),
+        ("0|8@1+ (1,0)", "-1|8@1+ (1,0)", "counter.signal", "does not lie within the 8 bytes"),
         ("0|8@1+ (1,0)", "0|8@1+ (10,0)", "counter.signal", "has the scale 10"),
         ("0|8@1+ (1,0)", "0|8@1+ (0,0)", "counter.signal", "has the scale 0"),
     ],
