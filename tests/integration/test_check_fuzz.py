@@ -172,6 +172,7 @@ for path in sorted(folder.glob("huge*")):
 """
 
 
+@pytest.mark.long
 def test_huge_files_take_little_memory_and_time(tmp_path):
     (tmp_path / "sound").write_bytes(LAVAL.read_bytes())
     for number, make in enumerate(HUGE.values()):

@@ -67,7 +67,7 @@ def test_spoilt_recordings(tmp_path, ending):
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("ending", damaged_recordings.SOUND)
 def test_many_spoilt_recordings(tmp_path, ending):
-    fuzz(tmp_path, ending, 20_000, 12)
+    fuzz(tmp_path, ending, 5_000, 12)
 
 
 STRUCTURES = damaged_recordings.structures()
