@@ -298,6 +298,7 @@ def machine_file(url: str, rate_hz: float = RATE_HZ) -> object:
     return parse_machine_file(text, EXAMPLE)
 
 
+@pytest.mark.long
 async def test_damage_reaches_the_alarm_over_the_bus() -> None:
     heard: list[Received] = []
     script = Script(

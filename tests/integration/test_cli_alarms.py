@@ -82,6 +82,7 @@ def outcome(out: str) -> dict[str, Any]:
     return told
 
 
+@pytest.mark.long
 async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
     file, store = tmp_path / "motor.toml", tmp_path / "store"
     async with CanGateway() as gateway:

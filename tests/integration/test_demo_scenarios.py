@@ -15,7 +15,8 @@ from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.scenario import builtin_scenarios
 
 SHIPPED = sorted((Path(__file__).parents[2] / "config/scenarios").glob("*.toml"))
-LONG = {"bearing-damage"}
+LONG = {"bearing-damage", "healthy", "link-faults", "paper"}
+"""What else the demo is tested with plays the built-in ones."""
 
 
 def demo(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any], str]:
@@ -48,6 +49,7 @@ def test_every_scenario_that_comes_along_is_played_to_its_end(
     assert played["received"] + played["lost"] == pytest.approx(played["sent"] + played["left_over"], abs=70)
 
 
+@pytest.mark.long
 def test_noise_beyond_the_converter_is_saturated_and_said(
     capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -308,6 +308,7 @@ FRAMES_IN_A_FILE = 40
 FILES = 12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ending", [".log", ".asc", ".blf", ".trc", ".npz", ".csv"])
 @settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1))

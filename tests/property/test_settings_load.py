@@ -87,6 +87,7 @@ def leaves_of(text):
     return sorted({(spot.line, spot.source) for spot in spots})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 @settings(deadline=None, max_examples=100)
 @given(data=st.data())

@@ -203,7 +203,7 @@ def test_a_signal_of_a_data_base_has_them_too() -> None:
     [
         ("[32767, -32767]", "the least raw value that is a measurement must come first"),
         ("[-32768, 40000]", "does not lie within what int16 can carry, -32768 to 32767"),
-        ("[0.5, 40]", "has a fraction, which no int16 can carry"),
+        ("[0.5, 32767]", "has a fraction, which no int16 can carry"),
     ],
 )
 def test_a_range_that_cannot_be_is_refused(given: str, message: str) -> None:

@@ -107,6 +107,7 @@ def test_a_device_that_changes_its_rate_while_it_is_watched_is_found_out(hz: flo
     assert stream.told[-1][0] - START_NS < 86e9
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=25)
 @given(
     seed=st.integers(0, 2**31),

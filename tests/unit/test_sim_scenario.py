@@ -156,7 +156,7 @@ def test_process_noise_moves_the_machine(scenario_file):
         (SHORT.replace(PLANT, PLANT + "rotor = { eccentricity = 0 }\n"), ["no signal-to-noise"]),
         (SHORT + "[link_faults]\ndrop = 2\n", ["link_faults: link fault drop = 2.0"]),
         (SHORT.replace("12.0", "-1"), ["revolutions: Input should be greater than 0"]),
-        ("title = [", ["cannot be read: Invalid value"]),
+        ("title = [", ["cannot be read: this is not TOML: Invalid value"]),
     ],
 )
 def test_what_is_wrong_in_a_file_is_said(scenario_file, text, messages):
