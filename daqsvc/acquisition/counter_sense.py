@@ -104,8 +104,9 @@ class CounterSense:
         if self._rejected >= REJECTED * self._placed:
             self._set_aside(
                 "senseless",
-                f"the device's counter makes no sense: {self._rejected} of {self._placed} frames fit "
-                "nothing; check the device, and the place and width of the counter in the layout",
+                # Without figures: the same trouble is the same sentence each time, and not said anew.
+                "the device's counter makes no sense: a quarter of its frames, or more, fit nothing; "
+                "check the device, and the place and width of the counter in the layout",
                 now_ns,
             )
         self._placed = self._rejected = 0

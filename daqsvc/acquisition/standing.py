@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -31,12 +32,19 @@ class Standing(NamedTuple):
     proven: bool = True
 
 
+_FIGURE = re.compile("[0-9]")
+
 Tell: TypeAlias = "Callable[[str, Standing], None]"
 """Called with the name of a stream and its standing whenever that changes."""
 
 
 def tell_nobody(stream: str, standing: Standing) -> None:
     """Nobody wants to know how a stream stands."""
+
+
+def cause_of(doubt: str) -> str:
+    """What a doubt says but for its figures, by which the same trouble may differ each time."""
+    return _FIGURE.split(doubt, maxsplit=1)[0].strip()
 
 
 class StreamStanding:
@@ -52,8 +60,8 @@ class StreamStanding:
         self._tell = tell
         self._now: Standing | None = None
         self._begun_ns: int | None = None
-        self._logged_ns: int | None = None
-        self._logged = ""
+        self._said_ns: dict[str, int] = {}
+        self._logged = False
 
     def take(self, doubt: str, now_ns: int, *, known: bool) -> None:
         """Take in how the stream stands.
@@ -84,10 +92,11 @@ class StreamStanding:
 
     def _log(self, doubt: str, now_ns: int) -> None:
         if doubt:
-            if self._logged_ns is not None and now_ns - self._logged_ns < QUIET_NS and doubt == self._logged:
-                return
-            self._logged_ns, self._logged = now_ns, doubt
-            logger.warning("stream %r: %s. Nothing is judged by it meanwhile", self._stream, doubt)
-        elif self._logged_ns is not None and self._logged:
-            self._logged = self._logged if now_ns - self._logged_ns < QUIET_NS else ""
+            cause = cause_of(doubt)
+            self._logged = now_ns - self._said_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS
+            if self._logged:
+                self._said_ns[cause] = now_ns
+                logger.warning("stream %r: %s. Nothing is judged by it meanwhile", self._stream, doubt)
+        elif self._logged:
+            self._logged = False
             logger.warning("stream %r: its samples can be judged by again", self._stream)

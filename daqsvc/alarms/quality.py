@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.acquisition.standing import cause_of
 from daqsvc.alarms.events import Doubt
 from daqsvc.alarms.rules import Finding
 from daqsvc.alarms.states import Level
@@ -73,6 +74,8 @@ class Doubts:
     def __init__(self) -> None:
         self._patience: dict[str, _Patience] = {}
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
+        # Why there are no samples by which to judge, by detector, until it says good.
+        self._causes: dict[str, str] = {}
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
         # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
         self._blamed: dict[str, dict[str, str]] = {}
@@ -96,6 +99,10 @@ class Doubts:
         if (doubt := self._doubt(diagnosis, None if before is None else before[1])) is not None:
             self._remember(name, doubt)
             touched |= _blames(doubt)
+            if diagnosis.quality == "missing" and diagnosis.end_index == diagnosis.first_index:
+                self._causes[detector] = f" ({cause_of(diagnosis.reason)})"
+        else:
+            self._causes.pop(detector, None)
         # A detector may rest on other sensors than before: then what it had against those is settled, too.
         alarms = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(alarms, frozenset(touched))
@@ -141,7 +148,9 @@ class Doubts:
         worst = min(doubts, key=lambda doubt: doubt.quality != "not_ok")
         what = "cannot be judged" if worst.quality == "missing" else "not OK"
         because = f": {worst.reason}" if worst.reason else ""
-        said = "|".join(f"{d.detector}={d.quality}{'+not_ok' if d.not_ok else ''}" for d in doubts)
+        said = "|".join(
+            f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
+        )
         return Finding(Level.ALERT, said, lambda: f"{subject} {what}{because}")
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
@@ -159,6 +168,10 @@ class Doubts:
                     return _reason(blamed[1])
         lost = self._blamed.keys() & sensors if self._blamed else ()
         return next(reversed(self._blamed[min(lost)].values())) if len(lost) > rule.spare else None
+
+    def _cause(self, doubt: Doubt) -> str:
+        """Tells silence from a rate or counter that is wrong: one may take over from the other."""
+        return self._causes.get(doubt.detector, "") if doubt.quality == "missing" else ""
 
     def _remember(self, name: str, doubt: Doubt) -> None:
         self._by_detector[doubt.detector] = (name, doubt)

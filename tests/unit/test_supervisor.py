@@ -39,3 +39,33 @@ def test_a_link_is_talked_about_once_each_way(caplog: pytest.LogCaptureFixture) 
         "CAN bus 'can0' is back",
     ]
     assert (link.state, link.losses, link.reason) == ("up", 1, "")
+
+
+def test_a_link_that_comes_and_goes_does_not_fill_the_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [100.0]
+    monkeypatch.setattr("time.monotonic_ns", lambda: round(now_s[0] * S))
+    link = Link("bus")
+    for _ in range(100):
+        link.up()
+        now_s[0] += 0.1
+        link.down("half a frame")
+        now_s[0] += 0.1
+    assert link.losses == 100
+    often = "; it comes and goes, which is said three times a minute at most"
+    said = [r.message for r in caplog.records if r.levelno >= logging.WARNING]
+    assert [text for text in said if text != "bus is back"] == [
+        "bus is lost: half a frame; it is being tried again",
+        "bus is lost: half a frame; it is being tried again",
+        f"bus is lost: half a frame; it is being tried again{often}",
+    ]
+    assert said.count("bus is back") == 3
+    # One that stays away is said all the same, as soon as it may be.
+    caplog.clear()
+    for _ in range(60):
+        now_s[0] += 1.0
+        link.down("nobody answers")
+    assert [r.message for r in caplog.records] == ["bus is lost: nobody answers; it is being tried again"]
+    link.up()
+    assert caplog.records[-1].message == "bus is back"
