@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 QUIET_NS = 60 * NS_PER_S
-"""A stream whose standing changes again and again is told of no more often than this."""
+"""A stream whose standing changes again and again is reported no more often than this."""
 
 PROVING_NS = 5 * NS_PER_S
 """Until then a stream's rate is either known, or it is not waited for."""

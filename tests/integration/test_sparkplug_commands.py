@@ -1,4 +1,4 @@
-"""Hosts that acknowledge and reset alarms: by a real broker, through the desk, into the audit log."""
+"""Hosts acknowledge and reset alarms: by a real broker, through the alarm service, into the audit log."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def _quiet(caplog: pytest.LogCaptureFixture) -> None:
 
 
 class Stream:
-    """A stream of 1000 Hz as the machine file says it, and what is told of it."""
+    """A stream of 1000 Hz as the machine file says it, and what is reported about it."""
 
     def __init__(self, bits: int | None = 32, *, stamped: bool = False) -> None:
         self.told: list[tuple[int, Standing]] = []
