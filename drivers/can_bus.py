@@ -118,7 +118,10 @@ class CanDriver:
             return await ended(reader.ended, reader)
         finally:
             # Cancelled while the bus is being closed: that takes its half second all the same.
-            await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            try:
+                await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            finally:
+                reader.finish()
 
     def take(self, found: Sorted) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""

@@ -15,6 +15,7 @@ import can
 
 from drivers.can_batches import BusOffError, Sorted
 from drivers.can_errors import BUS_OFF_REASON
+from drivers.hand_over import HandOver
 
 if TYPE_CHECKING:
     import asyncio
@@ -36,7 +37,7 @@ class CanReader(threading.Thread):
         link_name: what a person calls the bus.
         source: the open bus.
         sorter: what knows the streams.
-        take: called on the event loop with each batch.
+        take: called on the event loop with each batch, one in a turn of it.
         loop: the event loop.
         record: called with each batch as it came, on this thread; must not wait.
     """
@@ -56,7 +57,7 @@ class CanReader(threading.Thread):
         self._source = source
         self._sorter = sorter
         self._take = take
-        self._loop = loop
+        self._hand = HandOver(loop)
         self._record = record
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
@@ -84,6 +85,10 @@ class CanReader(threading.Thread):
         if self.is_alive():
             logger.warning("%s: its reader hangs in the adapter and is left behind", self._link_name)
         close_quietly(self._source)
+
+    def finish(self) -> None:
+        """Take in at once what has been handed over; on the event loop, once it is closed."""
+        self._hand.finish()
 
     def _drain(self) -> None:
         """Take what is there, up to a batch, and hand it over.
@@ -123,7 +128,7 @@ class CanReader(threading.Thread):
 
     def _post(self, call: Callable[[Any], None], argument: object) -> None:
         try:
-            self._loop.call_soon_threadsafe(call, argument)
+            self._hand.post(call, argument)
         except RuntimeError:  # the event loop is closed: there is nobody left to tell
             self._stopping.set()
 

@@ -142,7 +142,10 @@ class SerialDriver:
             return await ended(reader.ended, reader, reader.cutter)
         finally:
             # Cancelled while the port is being closed: that takes its time all the same.
-            await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            try:
+                await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            finally:
+                reader.finish()
 
     def take(self, batch: Batch) -> None:
         """Take in what the reader thread has found; runs on the event loop."""

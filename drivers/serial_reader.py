@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
+from drivers.hand_over import HandOver
+
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
@@ -63,7 +65,7 @@ class Batch(NamedTuple):
 
 
 class Taker(Protocol):
-    """Who is given what the reader finds; called on the event loop."""
+    """Who is given what the reader finds; called on the event loop, once in a turn of it."""
 
     def take(self, batch: Batch) -> None:
         """Take in a batch."""
@@ -128,7 +130,7 @@ class SerialReader(threading.Thread):
         self._framing = framing
         self._taker = taker
         self._clock = clock
-        self._loop = loop
+        self._hand = HandOver(loop)
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -164,6 +166,10 @@ class SerialReader(threading.Thread):
             self._jobs.put(None)
         self.cutter.join(SHUTDOWN_S)
         close_port(self._device)
+
+    def finish(self) -> None:
+        """Take in at once what has been handed over; on the event loop, once it is closed."""
+        self._hand.finish()
 
     def _cut_on(self) -> None:
         """Do what the reading thread asks for, in turn."""
@@ -279,7 +285,7 @@ class SerialReader(threading.Thread):
 
     def _post(self, call: Any, *arguments: object) -> None:
         try:
-            self._loop.call_soon_threadsafe(call, *arguments)
+            self._hand.post(call, *arguments)
         except RuntimeError:  # the event loop is closed: there is nobody left to tell
             self._stopping.set()
 
