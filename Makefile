@@ -10,8 +10,9 @@
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
-# Tests run side by side, one process a core; a file's tests stay together.
+# Tests run side by side, one process a core; a file's tests stay together. Of the long ones many wait.
 WORKERS ?= auto
+LONG_WORKERS ?= 3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
@@ -42,7 +43,7 @@ test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(ARGS)
 
 test-long: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist load -m long $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m long $(ARGS)
 
 hil: $(READY)
 	@tests/hil/run.sh $(ARGS)

@@ -7,6 +7,7 @@ It needs a newer Python than the service. The environment is made once and kept 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import shutil
@@ -66,7 +67,11 @@ def environment() -> Path:
     for (major, minor), release in RELEASES.items():
         python = _python(major, minor)
         if python is not None:
-            return _made(python, release)
+            (ROOT / ".cache").mkdir(exist_ok=True)
+            # Tests run side by side: one of them makes it, the others wait.
+            with (ROOT / ".cache" / "home-assistant.lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                return _made(python, release)
     pytest.skip("Home Assistant needs Python 3.12 or later, and there is none on the PATH")
 
 
