@@ -18,7 +18,7 @@ from drivers.modbus_client import ModbusClient
 from drivers.modbus_line import ModbusLine, WritableRun
 from drivers.modbus_outcomes import LineLostError, ModbusCounters
 from drivers.modbus_sampling import readers_for
-from drivers.modbus_silence import Patience
+from drivers.modbus_silence import Patience, SparingByEnquiry
 from drivers.modbus_wire import LineOptions
 from drivers.registers import Run
 from drivers.tty import Character, CharacterFormat
@@ -63,6 +63,7 @@ class ModbusDriver:
         self._characters = CharacterFormat(self.link.name, Character(8, self._options.parity))
         self._readers = readers_for(port, self.counters)
         self._line: ModbusLine | None = None
+        self._sparing: SparingByEnquiry = {}
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -123,6 +124,7 @@ class ModbusDriver:
                 units=sorted({spec.layout.unit for spec in self._port.streams}),
                 writable=self._writable,
                 heard=self._heard,
+                sparing=self._sparing,
             )
             reading = [
                 asyncio.create_task(

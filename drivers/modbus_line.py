@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus_client import ModbusClient
     from drivers.modbus_outcomes import ModbusCounters
-    from drivers.modbus_silence import Patience, Silence
+    from drivers.modbus_silence import Patience, Silence, SparingByEnquiry
     from drivers.registers import Run
 
 LONGEST_BABBLE = 4
@@ -77,6 +77,7 @@ class ModbusLine:
         units: the units that are asked.
         writable: what may be written; nothing else ever is.
         heard: called when a unit has answered.
+        sparing: what has been said of its units, also while it was open before.
     """
 
     def __init__(
@@ -89,13 +90,15 @@ class ModbusLine:
         units: Sequence[int],
         writable: Sequence[WritableRun] = (),
         heard: Callable[[], None] = lambda: None,
+        sparing: SparingByEnquiry | None = None,
     ) -> None:
         self.lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._client = client
         self._clock = clock
         self._counters = counters
         self._patience = patience
-        self._units = {unit: UnitSilence(unit, patience, counters) for unit in units}
+        self._sparing: SparingByEnquiry = {} if sparing is None else sparing
+        self._units = {unit: UnitSilence(unit, patience, counters, self._sparing) for unit in units}
         self._writable = writable
         self._heard = heard
         self._lock = asyncio.Lock()
@@ -157,7 +160,7 @@ class ModbusLine:
         """Make a request as soon as it may be; returns its result, when it went out and when it ended."""
         asked = self._units.get(unit)
         if asked is None:
-            asked = self._units[unit] = UnitSilence(unit, self._patience, self._counters)
+            asked = self._units[unit] = UnitSilence(unit, self._patience, self._counters, self._sparing)
         silence = asked.of(enquiry)
         if asked.doubts(silence):
             asked.check(silence, self._clock.monotonic_ns())

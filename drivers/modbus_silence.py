@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.sparing import OFTEN, Sparing
 from drivers.modbus_outcomes import NoReplyError
 from drivers.modbus_replies import WRITE_REGISTERS
 
@@ -115,6 +116,10 @@ class Silence:
         self.failures, self.probe_ns = 0, None
 
 
+SparingByEnquiry: TypeAlias = dict[tuple[int, Enquiry], Sparing]
+"""How often it has been said of a unit, or of what it is asked, that there is no reply."""
+
+
 class UnitSilence:
     """What is known about the silence of a unit.
 
@@ -122,15 +127,19 @@ class UnitSilence:
         unit: its address.
         patience: how long to bear with it.
         counters: of the bus.
+        sparing: what has been said of it, also while the line was open before.
     """
 
-    def __init__(self, unit: int, patience: Patience, counters: ModbusCounters) -> None:
+    def __init__(
+        self, unit: int, patience: Patience, counters: ModbusCounters, sparing: SparingByEnquiry | None = None
+    ) -> None:
         self._unit = unit
         self._patience = patience
         self._counters = counters
         self._whole = Silence(Enquiry(0, "anything"))
         self._enquiries: dict[Enquiry, Silence] = {}
         self._last_words = ""
+        self._sparing: SparingByEnquiry = {} if sparing is None else sparing
 
     @property
     def dead(self) -> bool:
@@ -172,12 +181,15 @@ class UnitSilence:
         silence.hopeful = not refused and _is_repeated(silence.enquiry)
         if self.dead:
             self._counters.units_back += 1
-            logger.warning("unit %d is back", self._unit)
             for other in self._enquiries.values():
                 other.end()
         elif silence.probe_ns is not None:
             self._counters.requests_back += 1
-            logger.warning("unit %d answers %s again", self._unit, silence.enquiry)
+        if self._say_end(self._whole, "unit %d is back", self._unit):
+            for (unit, _), sparing in self._sparing.items():
+                if unit == self._unit:
+                    sparing.may_take_back()
+        self._say_end(silence, "unit %d answers %s again", self._unit, silence.enquiry)
         self._whole.end()
         silence.end()
 
@@ -192,13 +204,26 @@ class UnitSilence:
         if not lives and whole.failures >= patience.demote_after:
             if whole.set_aside(patience, now_ns):
                 self._counters.units_demoted += 1
-                logger.warning("%s; the unit is set aside, and %s", why, patience.of_probes)
+            self._say(whole, "%s; the unit is set aside, and %s%s", why, patience.of_probes)
             if len(self._enquiries) > 1:
                 # Something else is to probe next: this one may be what the unit does not know.
                 silence.probe_ns = now_ns + whole.wait_ns + patience.demotion_ns
-        elif silence.failures >= patience.demote_after and silence.set_aside(patience, now_ns):
-            self._counters.requests_demoted += 1
-            logger.warning("%s; %s is set aside, and %s", why, silence.enquiry, patience.of_probes)
+        elif silence.failures >= patience.demote_after:
+            if silence.set_aside(patience, now_ns):
+                self._counters.requests_demoted += 1
+            self._say(silence, "%s; %s is set aside, and %s%s", why, silence.enquiry, patience.of_probes)
+
+    def _say(self, silence: Silence, message: str, *arguments: object) -> None:
+        sparing = self._sparing.setdefault((self._unit, silence.enquiry), Sparing())
+        if sparing.may_say():
+            logger.warning(message, *arguments, OFTEN if sparing.often else "")
+
+    def _say_end(self, silence: Silence, message: str, *arguments: object) -> bool:
+        sparing = self._sparing.get((self._unit, silence.enquiry))
+        if sparing is None or not sparing.may_take_back():
+            return False
+        logger.warning(message, *arguments)
+        return True
 
 
 def _is_repeated(enquiry: Enquiry) -> bool:

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import logging
 import random
-import time
-from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.sparing import OFTEN, Sparing
 
 logger = logging.getLogger(__name__)
 
 LinkState = Literal["down", "up"]
-
-SAID_AT_MOST, SAID_WITHIN_NS = 3, 60 * NS_PER_S
-"""A link that comes and goes says so no more often than this."""
 
 
 class Backoff:
@@ -74,7 +70,7 @@ class Link:
     over: bool = False
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
-    _said_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SAID_AT_MOST), repr=False)
+    _sparing: Sparing = field(default_factory=Sparing, repr=False)
 
     @property
     def ever_up(self) -> bool:
@@ -87,6 +83,7 @@ class Link:
             logger.warning("%s is back" if self._ever_up else "%s is there now", self.name)
         elif self.state == "down":
             logger.info("%s is up", self.name)
+        self._sparing.may_take_back()
         self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
         self.over = False
 
@@ -94,27 +91,12 @@ class Link:
         """The link does not work, because of ``reason``, and is tried again; repeated calls are silent."""
         if self.state == "up":
             self.losses += 1
-        if not self._said_down and self._may_say():
+        if not self._said_down and self._sparing.may_say():
             lost = " is lost" if self._ever_up else ""
-            often = "; it comes and goes, which is said three times a minute at most" if self._often else ""
+            often = OFTEN if self._sparing.often else ""
             logger.warning("%s%s: %s; it is being tried again%s", self.name, lost, reason, often)
             self._said_down = True
         self.state, self.reason = "down", reason
-
-    def _may_say(self) -> bool:
-        """Whether a loss may be said now; if not, the next try that fails asks again."""
-        # Real time, whatever the service's clock is: this is about how much goes into the log.
-        now_ns = time.monotonic_ns()
-        if self._often and now_ns - self._said_ns[0] < SAID_WITHIN_NS:
-            return False
-        while self._said_ns and now_ns - self._said_ns[0] >= SAID_WITHIN_NS:
-            self._said_ns.popleft()
-        self._said_ns.append(now_ns)
-        return True
-
-    @property
-    def _often(self) -> bool:
-        return len(self._said_ns) == SAID_AT_MOST
 
     def leave_out(self, reason: str) -> None:
         """The link does not work at start, because of ``reason``, and is not tried again."""

@@ -103,7 +103,12 @@ def check_said(records: list[logging.LogRecord], minutes: int = 1) -> None:
     """Nothing has failed in a way that nobody foresaw, and nothing is said again and again."""
     warned = [record for record in records if record.levelno >= logging.WARNING]
     assert [record.getMessage() for record in warned if record.exc_info] == []
-    said = collections.Counter((record.msg, str(record.args[:1])) for record in warned if record.args)
+    # How often an alarm speaks is bounded by its chatter, which is tested there.
+    said = collections.Counter(
+        (record.msg, str(record.args[:1]))
+        for record in warned
+        if record.args and record.name != "daqsvc.alarm_log"
+    )
     assert {what: count for what, count in said.items() if count > minutes * LINES_EACH} == {}
     assert said, "something was said"
 
