@@ -6,6 +6,7 @@ import contextlib
 import errno
 import logging
 import os
+import signal
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -160,6 +161,7 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
+    _await_reload(sys.argv[1:] if arguments is None else arguments)
     try:
         chosen = _chosen(parser(commands()), arguments)
         command: Command = chosen.command
@@ -181,6 +183,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
     return code
+
+
+def _await_reload(arguments: Sequence[str]) -> None:
+    """From the first moment on, let a SIGHUP that asks the service for a reload not end it.
+
+    Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`). A handler, and
+    not SIG_IGN: that says that the service is to outlive its terminal.
+    """
+    if arguments[:1] == ["run"] and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda *_: None)
 
 
 def _give_up_stdout() -> None:

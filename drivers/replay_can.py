@@ -17,6 +17,7 @@ from daqsvc.confined.limits import UNBOUNDED, Budget, CountedFile
 from drivers.replay_blf import BlfFile
 from drivers.replay_files import RecordingError, words
 from drivers.replay_lines import TextLog, whole
+from drivers.replay_table import no_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -78,7 +79,7 @@ class CanLog:
 
     def _open(self) -> Iterator[can.Message]:
         if not self._path.is_file():
-            raise ValueError("it is no file but a folder, pipe or device")
+            raise ValueError(no_file(self._path))
         zipped = self._path.suffix.lower() == ".gz"
         reader = MESSAGE_READERS.get((self._path.with_suffix("") if zipped else self._path).suffix.lower())
         if reader is SqliteReader:

@@ -30,6 +30,11 @@ class TableError(Exception):
     """A table cannot be read; says why."""
 
 
+def no_file(path: Path) -> str:
+    """Why something that is no regular file cannot be read."""
+    return "it is no file but a folder, pipe or device" if path.exists() else "there is no such file"
+
+
 def read_columns(
     path: Path, wanted: Sequence[str], limits: Limits, reader: ConfinedProcess | None = None
 ) -> tuple[Sequence[str], dict[str, NDArray[np.float64]]]:
@@ -71,7 +76,7 @@ def columns(
     """
     file = Path(path)
     if not file.is_file():
-        raise ValueError("it is no file but a folder, pipe or device")
+        raise ValueError(no_file(file))
     budget = Budget.of(file, Limits(memory_bytes))
     if file.suffix.lower() == ".npz":
         there, found = _of_archive(file, wanted, budget)

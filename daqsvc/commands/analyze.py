@@ -95,6 +95,7 @@ class AnalyzeCommand:
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
         set_memory(arguments.max_memory)
+        self._prepare_kernel_cache()
         if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
             return _fail(wrong, EXIT_FAILED)
         if make is not None:
@@ -173,7 +174,6 @@ class AnalyzeCommand:
         """An analyst by a machine file; None after its errors have been printed."""
         if self._load(Path(machine)) is None:
             return None
-        self._prepare_kernel_cache()
         from daqsvc.analysis.machine import MachineAnalyst  # noqa: PLC0415
 
         try:

@@ -73,6 +73,7 @@ class CalibrateCommand:
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
         set_memory(arguments.max_memory)
+        self._prepare_kernel_cache()
         machine_path = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
         recordings = arguments.files[1:] if machine_path is not None else arguments.files
         if by_bearing(arguments):
@@ -87,7 +88,6 @@ class CalibrateCommand:
                 return EXIT_USAGE
             if machine.pipeline.rotor_synchronous is None:
                 return self._without_rotor(recordings, arguments, machine)
-            self._prepare_kernel_cache()
         from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415

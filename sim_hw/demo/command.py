@@ -133,7 +133,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM does what Ctrl-C does: everything is closed and removed on the way out."""
+    """SIGTERM and a lost terminal do what Ctrl-C does: everything is closed and removed on the way out."""
 
     def interrupt(_number: int, frame: FrameType | None) -> None:
         # While the event loop runs, the handler of Ctrl-C is asyncio's, which cancels the main task.
@@ -142,11 +142,16 @@ def _sigterm_interrupts() -> Iterator[None]:
             raise KeyboardInterrupt  # a shell's background job ignores Ctrl-C
         handler(signal.SIGINT, frame)
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {
+        number: signal.signal(number, interrupt)
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _fail(message: str) -> int:

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from daqsvc import kernel_cache
@@ -27,10 +28,23 @@ AS_NOBODY = [
     "--ambient-caps=+dac_read_search",
 ]
 FILES = ROOT / "config" / "machines"
+BEARING = (
+    "there-is-one.npz",
+    "--channels",
+    "acc",
+    "--speed-rpm",
+    "1797",
+    "--bearing",
+    "6205-2RS",
+    "--fs",
+    "12000",
+)
 USING_KERNELS = {
     "check": ["check", FILES / "rotor-synchronous.toml"],
     "record": ["record", FILES / "virtual-rig.toml", "--out", "x.log", "--duration", "0.2"],
     "analyze": ["analyze", FILES / "rotor-synchronous.toml", "there-is-none.npz"],
+    "analyze a bearing": ["analyze", *BEARING],
+    "calibrate a bearing": ["calibrate", *BEARING, "--out", "b.toml"],
     "calibrate": ["calibrate", FILES / "rotor-synchronous.toml", "there-is-none.npz"],
     "alarms": ["alarms", FILES / "laval-rig.toml"],
 }
@@ -62,11 +76,14 @@ def test_an_account_without_a_home_can_use_every_verb(verb: str, tmp_path: Path)
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     temporary.chmod(0o1777)
+    np.savez(temporary / "there-is-one.npz", acc=np.random.default_rng(1).standard_normal(60_000))
     done = daqsvc(
         *USING_KERNELS[verb], before=tuple(AS_NOBODY), env={"TMPDIR": str(temporary)}, cwd=temporary
     )
     assert "Traceback" not in done.stderr
     assert "no locator" not in done.stderr
+    if "bearing" in verb:
+        assert done.returncode == 0, done.stderr
     if verb.startswith("check"):
         assert done.returncode == 0
         (said,) = [line for line in done.stderr.splitlines() if "kernels" in line]
