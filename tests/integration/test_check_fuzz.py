@@ -79,6 +79,7 @@ def test_spoilt_machine_files(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(3600)
 def test_ten_thousand_spoilt_machine_files(tmp_path, monkeypatch):
     assert fuzzed(tmp_path, monkeypatch, range(280, 10_280)) > 1000
@@ -124,6 +125,7 @@ def test_spoilt_dbc_files(tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(1800)
 def test_ten_thousand_spoilt_dbc_files(tmp_path):
     assert dbc_fuzzed(tmp_path, range(200, 10_200)) > 200

@@ -19,7 +19,7 @@ from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
 from daqsvc.publish.settings import CommandSettings
 
-pytestmark = [pytest.mark.mosquitto, pytest.mark.long, pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.mosquitto, pytest.mark.long, pytest.mark.marathon, pytest.mark.timeout(1800)]
 
 COMMANDS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE, Verb.RESET}))
 DEVICE = "rig (lab/edge-1)"

@@ -133,6 +133,7 @@ async def test_a_rogue_broker_costs_connections_and_nothing_else(outbox, caplog,
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("protocol", ["5", "3.1.1"])
 async def test_a_rogue_broker_with_a_lot_of_patience(outbox, caplog, monkeypatch, protocol):
@@ -189,6 +190,7 @@ async def test_a_rogue_client_moves_counters_and_nothing_else(mosquitto, outbox,
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.mosquitto
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("protocol", ["5", "3.1.1"])

@@ -120,6 +120,7 @@ async def test_what_is_published_is_on_the_disk_whenever_that_fails(tmp_path, ca
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(900)
 async def test_what_is_published_is_on_the_disk_whenever_that_fails_in_many_rounds(tmp_path, caplog):
     await rounds(tmp_path, range(100, 130), caplog)

@@ -218,7 +218,12 @@ async def spoilt(stores, seed, caplog):
 
 @pytest.mark.parametrize(
     "seeds",
-    [range(40), pytest.param(range(1000, 2500), marks=[pytest.mark.long, pytest.mark.timeout(900)])],
+    [
+        range(40),
+        pytest.param(
+            range(1000, 2500), marks=[pytest.mark.long, pytest.mark.marathon, pytest.mark.timeout(900)]
+        ),
+    ],
     ids=str,
 )
 def test_whatever_is_spoilt_a_start_tells_the_truth_and_repeats_no_number(stores, seeds, caplog):

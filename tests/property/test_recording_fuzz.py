@@ -64,6 +64,7 @@ def test_spoilt_recordings(tmp_path, ending):
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("ending", damaged_recordings.SOUND)
 def test_many_spoilt_recordings(tmp_path, ending):
@@ -150,6 +151,7 @@ def test_spoilt_can_logs(tmp_path, ending):
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("ending", LOGS)
 def test_many_spoilt_can_logs(tmp_path, ending):

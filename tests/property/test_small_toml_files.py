@@ -102,6 +102,7 @@ def test_spoilt_files(sound, kind, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.marathon
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_spoilt_files(sound, kind, tmp_path):

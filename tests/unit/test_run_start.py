@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import signal
 from types import SimpleNamespace
 
 import daqsvc.service
+from daqsvc import cli
 from daqsvc.commands import run
 
 
@@ -35,3 +37,19 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
     finally:
         gc.unfreeze()
     assert frozen[1] > frozen[0] + 1000
+
+
+def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing():
+    before = signal.getsignal(signal.SIGHUP)
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        cli._await_reload(["check", "machine.toml"])
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+        cli._await_reload(["run", "machine.toml"])
+        signal.raise_signal(signal.SIGHUP)
+        # Whoever has asked for it (nohup) keeps a service that outlives its terminal.
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        cli._await_reload(["run", "machine.toml"])
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
