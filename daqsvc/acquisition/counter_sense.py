@@ -36,6 +36,12 @@ BACKLOG_S = 60.0
 """But not if they are what a bus may have held back for so long."""
 BACKLOG_FRAMES = 1024
 
+# Without figures: the same trouble is the same sentence each time, and not said anew.
+SENSELESS_WORDS = (
+    "the device's counter makes no sense: a quarter of its frames, or more, fit nothing; "
+    "check the device, and the place and width of the counter in the layout"
+)
+
 Kind = Literal["still", "senseless", "flood"]
 
 
@@ -63,6 +69,7 @@ class CounterSense:
         self._looked = self._sound = 0
         self._looked_since_ns = 0
         self._kind: Kind | None = None
+        self._cause_over = False
         self.doubt = ""
         """Why the frames are set aside; empty if they are not."""
 
@@ -102,15 +109,16 @@ class CounterSense:
         if self._placed < LOOKED_FRAMES or now_ns - self._placed_since_ns < LOOKED_NS:
             return
         if self._rejected >= REJECTED * self._placed:
-            self._set_aside(
-                "senseless",
-                # Without figures: the same trouble is the same sentence each time, and not said anew.
-                "the device's counter makes no sense: a quarter of its frames, or more, fit nothing; "
-                "check the device, and the place and width of the counter in the layout",
-                now_ns,
-            )
+            self._set_aside("senseless", SENSELESS_WORDS, now_ns)
         self._placed = self._rejected = 0
         self._placed_since_ns = now_ns
+
+    @property
+    def _flood_words(self) -> str:
+        return (
+            f"more than {FLOOD_RATE:g} times as many frames come as the file says "
+            f"({self._frame_rate_hz:.4g} a second); check the device, and rate_hz"
+        )
 
     def _steps(self, raw: NDArray[np.int64]) -> NDArray[np.int64] | None:
         if self._unused_bits is None:
@@ -126,12 +134,7 @@ class CounterSense:
         if self._room < 0.0:
             self._room = 0.0
             if self._kind is None:
-                self._set_aside(
-                    "flood",
-                    f"more than {FLOOD_RATE:g} times as many frames come as the file says "
-                    f"({self._frame_rate_hz:.4g} a second); check the device, and rate_hz",
-                    now_ns,
-                )
+                self._set_aside("flood", self._flood_words, now_ns)
 
     def _watch_stillness(self, steps: NDArray[np.int64], arrival_ns: NDArray[np.int64], now_ns: int) -> None:
         moved = np.flatnonzero(steps)
@@ -158,15 +161,30 @@ class CounterSense:
         if self._looked < self._sense_frames or looked_ns < SENSE_NS:
             return
         calm = self._looked <= FLOOD_RATE * self._frame_rate_hz * looked_ns / NS_PER_S + 1.0
-        if calm and self._sound >= SENSE * self._looked:
+        sound = self._sound >= SENSE * self._looked
+        if calm and sound:
             self._kind, self.doubt = None, ""
             self._placed = self._rejected = 0
             self._placed_since_ns = None
             self._room = self._most_room
+        else:
+            self._watch_cause(now_ns, calm=calm, sound=sound)
         self._looked = self._sound = 0
         self._looked_since_ns = now_ns
 
+    def _watch_cause(self, now_ns: int, *, calm: bool, sound: bool) -> None:
+        """Another reason to set frames aside takes over once the one that stands is no longer true.
+
+        One look is not enough: it may have begun before the device was right again.
+        """
+        holds = {"still": self._alike >= STILL_FRAMES, "senseless": not sound, "flood": not calm}
+        over = self._kind is not None and not holds[self._kind]
+        was_over, self._cause_over = self._cause_over, over
+        if over and was_over:
+            kind: Kind = "senseless" if calm else "flood"
+            self._set_aside(kind, SENSELESS_WORDS if calm else self._flood_words, now_ns)
+
     def _set_aside(self, kind: Kind, doubt: str, now_ns: int) -> None:
-        self._kind, self.doubt = kind, doubt
+        self._kind, self.doubt, self._cause_over = kind, doubt, False
         self._looked = self._sound = 0
         self._looked_since_ns = now_ns

@@ -80,7 +80,7 @@ class StreamStanding:
         if standing == self._now:
             return
         before, self._now = self._now, standing
-        if bool(doubt) != bool(before and before.doubt):
+        if cause_of(doubt) != cause_of(before.doubt if before else ""):
             self._log(doubt, now_ns)
         self._tell(self._stream, standing)
 
@@ -93,8 +93,8 @@ class StreamStanding:
     def _log(self, doubt: str, now_ns: int) -> None:
         if doubt:
             cause = cause_of(doubt)
-            self._logged = now_ns - self._said_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS
-            if self._logged:
+            if now_ns - self._said_ns.get(cause, now_ns - QUIET_NS) >= QUIET_NS:
+                self._logged = True
                 self._said_ns[cause] = now_ns
                 logger.warning("stream %r: %s. Nothing is judged by it meanwhile", self._stream, doubt)
         elif self._logged:

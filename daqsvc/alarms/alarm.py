@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.chatter import ChatterWatch
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
 from daqsvc.alarms.states import (
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from daqsvc.alarms.rules import Finding
     from daqsvc.alarms.status import Instant
     from daqsvc.diagnosis.record import Diagnosis
+
+CHANGES_NS = 5 * NS_PER_S
+"""Whoever doubts a sensor may have another reason each time: that is told no more often than this."""
 
 
 class Alarm:
@@ -65,6 +69,7 @@ class Alarm:
         self._cause: Diagnosis | None = None
         self._since: Instant | None = None
         self._message = ""
+        self._changed_ns: int | None = None
 
     @property
     def status(self) -> AlarmStatus:
@@ -149,9 +154,28 @@ class Alarm:
             events.append(self._event(EventKind.CHATTERING, cause, Request("", at), message))
         return events
 
+    def waits(self, finding: Finding, at: Instant) -> bool:
+        """Whether a finding of a quality alarm has nothing new but its reason, and the last is too recent.
+
+        Apply it again later, then: the reason that stands by that time is told.
+        """
+        return (
+            self._state.is_active
+            and finding.level == self._level
+            and finding.identity != self._found
+            and [doubt[:3] for doubt in self.doubts] == [doubt[:3] for doubt in self._told_doubts]
+            and self._changed_ns is not None
+            and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
+        )
+
     def _held_back(self, finding: Finding, cause: Diagnosis, at: Instant) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
-        if self.doubts == self._told_doubts:
+        not_ok, told = ({d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts))
+        # That nobody lacks samples any more the next good statement after a restart says, too.
+        if not_ok == told:
+            return []
+        # A sensor that flickers must not be an event each time; that it was not OK is on the safe side.
+        if not_ok < told and self._changed_ns is not None and 0 <= at.t_ns - self._changed_ns < CHANGES_NS:
             return []
         self._found = finding.identity
         message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"
@@ -341,6 +365,8 @@ class Alarm:
     ) -> AlarmEvent:
         """The event of a change that has been made; what is not said before was as it is now."""
         at = request.at
+        if kind is EventKind.CHANGED:
+            self._changed_ns = at.t_ns
         self._since, self._message, self._told_doubts = at, message, self.doubts
         until_ns = self._shelved_until_ns
         return AlarmEvent(

@@ -96,6 +96,8 @@ class AlarmManager:
         """Whether no diagnosis has come since `resume`: what was doubted before may silence any alarm."""
         self._conditions: set[str] = set()
         self._doubts = Doubts()
+        self._waiting: dict[str, Diagnosis] = {}
+        """By quality alarm, the statement whose reason is still to be told: see `Alarm.waits`."""
         self._start_up = StartUpSignal(self._handling.start_up)
         self._flood = FloodWatch(self._handling.flood)
         self._first_out = FirstOut({rule.alarm: rule.group for rule in rules})
@@ -309,7 +311,12 @@ class AlarmManager:
                 self._add(name, latching=False)
             alarm = self._alarms[name]
             alarm.doubts = doubts
-            yield from alarm.apply(self._doubts.finding(name), diagnosis, at)
+            finding = self._doubts.finding(name)
+            if alarm.waits(finding, at):
+                self._waiting[name] = diagnosis
+                continue
+            self._waiting.pop(name, None)
+            yield from alarm.apply(finding, diagnosis, at)
 
     def _suppression(
         self, sensors: Collection[str], diagnosis: Diagnosis, at: Instant
@@ -334,6 +341,8 @@ class AlarmManager:
             expired = self._alarms[name].expire(now, self._unjudged(name, now))
             if expired is not None:
                 yield expired
+        for name, diagnosis in tuple(self._waiting.items()):
+            yield from self._quality([name], diagnosis, now)
         yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
 
     def _await_end_of_shelving(self, alarm: Alarm) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.standing import cause_of
 from daqsvc.alarms.events import Doubt
 from daqsvc.alarms.rules import Finding
@@ -30,6 +31,13 @@ def quality_alarm(detector: str, sensors: Sequence[str]) -> str:
 
 LASTING = 8
 """So many partial statements more than good ones make a quality alarm, and as many good ones end it."""
+
+SHARE_NS = 5 * NS_PER_S
+"""The share of samples that a detector lacks is taken over so much time."""
+MOST_LACKED = 0.1
+"""A detector that lacked samples is good again when it lacks no larger share of them, ..."""
+GOOD_NS = 3 * NS_PER_S
+"""... and has been able to judge for so long."""
 
 
 class Touched(NamedTuple):
@@ -63,16 +71,50 @@ class _Patience:
         return self._lasts
 
 
+class _Shortage:
+    """What share of its samples a detector has lacked of late.
+
+    While frames are lost at random one window can be judged, and the next cannot: a quality alarm that went
+    by each would come and go many times a second.
+    """
+
+    def __init__(self) -> None:
+        self._shares: deque[tuple[int, float]] = deque()
+        self._sum = 0.0
+        self._blind_ns: int | None = None
+
+    def take(self, diagnosis: Diagnosis, share: float) -> None:
+        """Take in a statement about samples, and what share of them is missing."""
+        t_ns = diagnosis.t_ns
+        if diagnosis.quality == "missing" and not diagnosis.partial:
+            self._blind_ns = t_ns
+        self._shares.append((t_ns, share))
+        self._sum += share
+        while t_ns - self._shares[0][0] >= SHARE_NS:
+            self._sum -= self._shares.popleft()[1]
+
+    def lasts(self, t_ns: int) -> bool:
+        """Whether a detector that can judge the samples until ``t_ns`` may soon be unable to."""
+        if self._blind_ns is None:
+            return False
+        lasts = t_ns - self._blind_ns < GOOD_NS or self._sum > MOST_LACKED * len(self._shares)
+        if not lasts:
+            self._blind_ns = None
+        return lasts
+
+
 class Doubts:
     """What each detector has against its sensors, from a statement that is not good to the next good one.
 
     Missing samples do not take back that a sensor was not OK; a partial statement does, which has seen at
     least half of them. It raises a doubt of its own when such statements prevail, and upholds one that
-    samples are missing.
+    samples are missing. A detector that says what share of its samples is missing, and that could not judge
+    them, is good again only when that has lasted for some seconds.
     """
 
     def __init__(self) -> None:
         self._patience: dict[str, _Patience] = {}
+        self._shortage: defaultdict[str, _Shortage] = defaultdict(_Shortage)
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         # Why there are no samples by which to judge, by detector, until it says good.
         self._causes: dict[str, str] = {}
@@ -115,8 +157,12 @@ class Doubts:
         lacked, lasts = before is not None and before.quality == "missing", False
         if detector in self._patience and (good or diagnosis.partial):
             lasts = self._patience[detector].lasts(partial=diagnosis.partial)
+        if diagnosis.missing_share is not None and diagnosis.end_index > diagnosis.first_index:
+            self._shortage[detector].take(diagnosis, diagnosis.missing_share)
         if good:
-            return before if lasts and lacked else None
+            lasts = lasts or (detector in self._shortage and self._shortage[detector].lasts(diagnosis.t_ns))
+            # The samples that are there show that the sensor is OK.
+            return before._replace(not_ok=False) if before is not None and lasts and lacked else None
         if diagnosis.partial and not (lasts or lacked):
             return None  # and the samples that are there show that the sensor is OK
         not_ok = diagnosis.quality == "not_ok" or (

@@ -79,6 +79,7 @@ class BankStater:
         decision: int,
         stated: str,
         changed: bool,
+        missing_share: float,
     ) -> Diagnosis:
         """A diagnosis.
 
@@ -89,6 +90,7 @@ class BankStater:
             decision: index of the declared mode, -1 while undetermined.
             stated: its name, as it was last stated.
             changed: whether this states a change.
+            missing_share: share of the samples of the last revolution that are missing.
         """
         names = [mode.name for mode in self.modes]
         paper, departure = report.probabilities, report.departure
@@ -127,6 +129,7 @@ class BankStater:
             reason=verdict.reason,
             sensors=self.sensors,
             model=MODEL,
+            missing_share=missing_share,
         )
 
     def silence(self, silence_s: float, stated: str, index: int, t_ns: int, revolutions: float) -> Diagnosis:

@@ -385,5 +385,11 @@ class RotorBankDetector:
         speed_rpm = 60.0 * self._rate_hz / self._tracker.period_samples
         moment = Moment(first_index, end_index, t_ns, self._revolutions, speed_rpm)
         return self._stater.state(
-            report, verdict, moment, decision=decision, stated=self._decision, changed=changed
+            report,
+            verdict,
+            moment,
+            decision=decision,
+            stated=self._decision,
+            changed=changed,
+            missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
         )

@@ -11,6 +11,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.acquisition.standing import Standing
+from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
 
@@ -107,3 +108,20 @@ async def test_what_was_said_before_the_rate_was_found_wrong_is_never_told() -> 
     ring.close()
     await running
     assert [(d.quality, d.reason) for d in said] == [("missing", DOUBT)]
+
+
+async def test_a_doubt_takes_over_the_quality_alarm_of_a_stream_that_was_silent() -> None:
+    ring, clock = SampleRing("s", ("a",), 1000), SystemClock()
+    alarms, told = AlarmManager(Identity("lab", "box", "m"), [], clock), []
+    pipeline = Pipeline({"s": ring}, [Listener()], lambda d: told.extend(alarms.take(d)), clock)
+    running = asyncio.create_task(pipeline.run())
+    async with asyncio.timeout(20):
+        while not told:
+            await asyncio.sleep(0.01)  # it is silent
+    pipeline.stand("s", Standing(DOUBT, proven=True))
+    other = "the counter makes no sense"
+    pipeline.stand("s", Standing(other, proven=True))
+    assert [event.kind.value for event in told] == ["raised", "changed"]
+    assert told[1].message.endswith(DOUBT)
+    ring.close()
+    await running

@@ -168,6 +168,53 @@ def test_a_counter_that_stands_still_is_said_and_its_stream_set_aside(caplog) ->
     assert "its samples can be judged by again" in caplog.text
 
 
+STILL = "the device's counter stands still at 7; check the device"
+SENSELESS = "the device's counter makes no sense"
+FLOOD = "more than 4 times as many frames"
+
+
+@pytest.mark.parametrize(
+    ("counter", "per_s", "words"),
+    [
+        ("random", 100, {SENSELESS}),
+        ("random", 3000, {SENSELESS, FLOOD}),  # it is both
+        ("sound", 3000, {FLOOD}),
+        ("sound", 100, set()),
+    ],
+)
+def test_another_trouble_takes_over_from_a_counter_that_stood_still(caplog, counter, per_s, words) -> None:
+    caplog.set_level(logging.WARNING)
+    told: list[str] = []
+    unit = StreamAssembler(
+        "s",
+        1000.0,
+        counter_bits=16,
+        samples_per_frame=10,
+        counts_per_frame=1,
+        deliver=lambda _: None,
+        tell=lambda _, standing: told.append(standing.doubt),
+    )
+
+    def play(raw, rate, t_ns):
+        one = np.ones((1, 10, 1), np.float32), np.ones(1, bool)
+        for k in range(len(raw)):
+            unit.accept(raw[k : k + 1] % 2**16, *one, np.array([t_ns + k * 1_000_000_000 // rate]))
+
+    for again, offset_ns in enumerate([0, 11_000_000_000]):
+        # Whenever within a look at its frames the device begins to do something else.
+        play(np.full(300 + 27 * again, 7), 100, offset_ns)
+        assert unit.doubt == STILL
+        told.clear()
+        t_ns = offset_ns + (300 + 27 * again) * 10_000_000
+        play(COUNTERS[counter](5 * per_s, 1, np.random.default_rng(4)), per_s, t_ns)
+        assert any(map(unit.doubt.startswith, words)) if words else unit.doubt == ""
+        assert told == [unit.doubt]
+        assert any(unit.doubt in record.message for record in caplog.records)
+    play(np.arange(300), 100, 30_000_000_000)
+    assert unit.doubt == ""
+    assert any("its samples can be judged by again" in record.message for record in caplog.records)
+
+
 def test_counters_that_make_no_sense_are_set_aside_until_they_do() -> None:
     rng = np.random.default_rng(2)
     told = []

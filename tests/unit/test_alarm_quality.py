@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import numpy as np
+import pytest
 from alarm_rig import SECOND_NS, AlarmRig, kinds
 
 from daqsvc.alarms.chatter import ChatterLimit
@@ -95,3 +99,115 @@ def test_a_quality_alarm_is_bypassed_like_any_other_and_the_suppression_stays():
     rig.ask(Verb.BYPASS, "sensor-ok/probe-x")
     assert rig.status("vibration-x").state.value == "suppressed"
     assert rig.rms(50.0)[0].to_state.value == "out_of_service"
+
+
+def revolution(rig, frames_there, quality="good"):
+    """A statement of the rotor bank, ten a second, about a revolution of some frames."""
+    share = 1.0 - frames_there.mean()
+    quality = "missing" if share > 0.5 else quality
+    statement = {"decision": "normal", "severity": "normal", "sensors": ("probe-x", "probe-y")}
+    return rig.take(0.1, detector="bank", quality=quality, missing_share=share, reason="lost", **statement)
+
+
+@pytest.mark.parametrize("lost", [0.15, 0.3, 0.45])
+def test_frames_lost_at_random_are_one_quality_alarm_while_they_last(lost):
+    rng = np.random.default_rng(3)
+    rig = AlarmRig(BEARING, handling=AlarmHandling(chatter=ChatterLimit(5, 60 * SECOND_NS, 60 * SECOND_NS)))
+    lacking = [rng.random(6) >= lost for _ in range(600)]
+    assert sum((there.mean() < 0.5) != (then.mean() < 0.5) for there, then in pairwise(lacking)) > 4
+    for there in lacking:
+        revolution(rig, there)
+    assert kinds(rig.events) == [("detector-ok/bank", "raised")]
+    end_ns = rig.clock.t_ns
+    for _ in range(80):
+        revolution(rig, np.ones(6))
+    assert kinds(rig.events[1:]) == [("detector-ok/bank", "returned")]
+    # At 45 % it takes longest until no more than a tenth of the last 5 s is missing.
+    assert 0.5 < (rig.events[1].t_ns - end_ns) / SECOND_NS < 5.0
+
+
+def test_a_revolution_that_could_not_be_judged_is_over_when_some_seconds_were_good():
+    rig = AlarmRig(BEARING)
+    assert kinds(revolution(rig, np.zeros(6))) == [("detector-ok/bank", "raised")]
+    raised_ns = rig.clock.t_ns
+    while not (events := revolution(rig, np.ones(6))):
+        pass
+    assert kinds(events) == [("detector-ok/bank", "returned")]
+    assert 3.0 <= (rig.clock.t_ns - raised_ns) / SECOND_NS < 3.2
+
+
+def test_lost_frames_do_not_keep_a_sensor_not_ok_that_samples_show_to_be_ok():
+    rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0)))
+    say = lambda quality, share: rig.take(  # noqa: E731
+        detector="levels/probe-x",
+        decision="normal",
+        statistics={"rms": 0.0},
+        quality=quality,
+        missing_share=share,
+        sensors=("probe-x",),
+    )
+    say("not_ok", 0.0)
+    say("missing", 1.0)
+    assert rig.status("vibration-x").state.value == "suppressed"
+    assert kinds(say("good", 0.0)) == [("sensor-ok/probe-x", "changed"), ("vibration-x", "unsuppressed")]
+
+
+def test_a_chattering_quality_alarm_is_no_event_each_time_samples_are_missing():
+    rig = AlarmRig(BEARING, handling=AlarmHandling(chatter=ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)))
+    for quality in ["missing", "good"] * 20:
+        bearing(rig, quality, ("accel-de", "accel-fe"))
+    assert [kind for _, kind in kinds(rig.events)] == ["raised", "returned", "raised", "chattering"]
+    for _ in range(12):
+        bearing(rig, "good", ("accel-de", "accel-fe"))
+    assert [kind for _, kind in kinds(rig.events[4:])] == ["quiet", "returned"]
+
+
+def test_a_sensor_that_flickers_is_an_event_every_few_seconds_at_most():
+    rig = AlarmRig(LEVEL, handling=AlarmHandling(chatter=ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)))
+    for quality in ["not_ok", "good"] * 60:
+        rig.rms(0.0, quality, seconds=0.25)
+    told = [event for event in rig.events if event.kind.value == "changed"]
+    assert 2 <= len(told) <= 2 * 30 / 5
+    assert rig.status("sensor-ok/probe-x").chattering
+    for _ in range(24):
+        rig.rms(0.0, seconds=0.25)
+    assert rig.events[-1].doubts == ()
+
+
+def silent(rig, reason, seconds=0.5):
+    return rig.take(
+        seconds,
+        detector="levels/probe-x",
+        decision="normal",
+        quality="missing",
+        reason=reason,
+        sensors=("probe-x",),
+        end_index=0,
+    )
+
+
+def test_reasons_that_alternate_are_an_event_every_few_seconds_and_the_last_one_is_told():
+    rig = AlarmRig(LEVEL)
+    assert kinds(silent(rig, "no samples of shaft for 2.0 s")) == [("sensor-ok/probe-x", "raised")]
+    (changed,) = silent(rig, "the device sends 320 Hz, the file says 640")
+    assert (changed.kind.value, changed.message[-42:]) == (
+        "changed",
+        "the device sends 320 Hz, the file says 640",
+    )
+    for _ in range(30):
+        silent(rig, "the counter makes no sense")
+        silent(rig, "the device sends 320 Hz, the file says 640")
+    assert 4 <= len(rig.events) <= 2 + 30 / 5
+    silent(rig, "the counter stands still at 7")
+    for _ in range(6):
+        rig.tick()
+    assert rig.events[-1].message.endswith("the counter stands still at 7")
+    assert rig.tick(10.0) == []
+
+
+def test_a_reason_that_waits_is_dropped_when_the_sensor_is_good_again():
+    rig = AlarmRig(LEVEL)
+    for reason in ["no samples", "the rate is wrong", "the counter makes no sense"]:
+        silent(rig, reason)
+    assert kinds(rig.rms(0.0)) == [("sensor-ok/probe-x", "returned")]
+    assert rig.tick(10.0) == []
