@@ -22,6 +22,7 @@ from daqsvc.outbox.files import (
     take_possession,
     used_bytes,
 )
+from daqsvc.outbox.log_copy import LogCopy
 from daqsvc.outbox.messages import OutboxAwayError, OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.reading import opened_to_read
 from daqsvc.outbox.renewal import Damage, Renewal
@@ -85,7 +86,9 @@ class Journal:
         self.quarantined = 0
         self.vanished = 0
         self._mark = SequenceMark(path.with_name(path.name + ".sequence"))
+        self.set_aside: Path | None = None
         self._renewal = Renewal(path)
+        self._log_copy = LogCopy(path)
         self._wall_ns = wall_ns
         self._limits = limits
         self._ballast = Ballast(
@@ -157,6 +160,8 @@ class Journal:
             log.warning("outbox %s: the saving of what was left of %s is finished", self.path, aside)
         untold = self._renewal.untold()
         self.quarantined, self.vanished = untold.quarantined, untold.vanished
+        self._log_copy.take()
+        known_gone = self.vanished
         try:
             self._connect()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
@@ -165,8 +170,20 @@ class Journal:
             self.quarantine(error)
         self._adopt()
         self._prove()
+        self._put_log_away(is_whole=self.vanished == known_gone)
         self._tidy()
         self._ballast.take()
+
+    def _put_log_away(self, *, is_whole: bool) -> None:
+        """Delete the copy of the log, or set it aside if something of it may be missing."""
+        try:
+            if is_whole:
+                self._log_copy.discard()
+            elif (aside := self._log_copy.keep(self._wall_ns())) is not None:
+                self.set_aside = aside
+                log.warning("outbox %s: the log that is damaged is set aside as %s", self.path, aside)
+        except OSError as error:
+            log.warning("outbox %s: the copy of its log stays where it is: %s", self.path, error)
 
     def _unusable(self, error: Exception) -> OutboxError:
         kind = OutboxAwayError if may_pass(error) else OutboxError
@@ -236,7 +253,8 @@ class Journal:
         begun = self._next or LARGEST
         # A new file's numbers begin above all that the old one may have forgotten.
         self._next = max(self._next, self._mark.first_free(None, self._wall_ns()))
-        count = self._renewal.save(self.path, begun, self._mark.used, self._wall_ns())
+        in_log = [row for number, row in self._log_copy.rows().items() if number < begun]
+        count = self._renewal.save(self.path, begun, self._mark.used, self._wall_ns(), in_log)
         aside = self._renewal.replace(Damage(self.quarantined + 1, self.vanished))
         self.quarantined += 1
         log.error(
@@ -271,6 +289,12 @@ class Journal:
         gone = self._mark.vanished(stored)
         if is_new and self._mark.is_damaged:
             gone = max(gone, 1)  # there was a journal, and nobody knows what was in it
+        if self._log_copy.is_there and (gone or not stored or self._mark.is_damaged):
+            back = self._take_back(connection, stored or 0)
+            self._next = max(self._next, max(back, default=0) + 1)
+            gone -= sum(self._mark.used - gone < number <= self._mark.used for number in back)
+            if self._log_copy.was_emptied and self._mark.used:
+                gone = max(gone, 1)  # what was in the journal but not in the log, nobody knows
         if gone:
             self.vanished += gone
             self._renewal.remember(Damage(self.quarantined, self.vanished))
@@ -284,6 +308,33 @@ class Journal:
             )
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
         self._mark.begin(self._next)
+
+    def _take_back(self, connection: sqlite3.Connection, stored: int) -> list[int]:
+        """Have the messages again that SQLite does not find behind a wrong checksum in the log.
+
+        Args:
+            connection: to the journal.
+            stored: the highest number that it knows.
+
+        Returns:
+            Their numbers.
+        """
+        rows = [
+            row
+            for number, row in self._log_copy.rows().items()
+            if stored < number < LARGEST and self._mark.can_be_used(number)
+        ]
+        if rows:
+            with _transaction(connection):
+                connection.executemany("INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
+                connection.execute("DELETE FROM latest")
+                connection.execute(FILL_LATEST)
+            log.warning(
+                "outbox %s: its write-ahead log is damaged; %d messages are taken back from it, page by page",
+                self.path,
+                len(rows),
+            )
+        return [row[0] for row in rows]
 
     def _reconnect(self) -> None:
         """Open the file again in the middle of a run.

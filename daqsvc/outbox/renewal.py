@@ -18,6 +18,7 @@ import os
 import sqlite3
 import stat
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from daqsvc.outbox.files import (
@@ -33,11 +34,12 @@ from daqsvc.outbox.files import (
     sync_directory,
     sync_file,
 )
+from daqsvc.outbox.log_copy import ASIDE_SUFFIX
 from daqsvc.outbox.salvage import LARGEST, readable
 from daqsvc.outbox.tables import FILL_LATEST, bring_up_to_date
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
     from daqsvc.outbox.salvage import Row
@@ -97,7 +99,7 @@ class Renewal:
         self.save(aside, LARGEST, 0, 0)
         return self._swap()
 
-    def save(self, source: Path, below: int, last: int, wall_ns: int) -> int:
+    def save(self, source: Path, below: int, last: int, wall_ns: int, others: Collection[Row] = ()) -> int:
         """Write what can be read of ``source`` into a new file: all of it, or on a full disk what is needed.
 
         Args:
@@ -105,6 +107,7 @@ class Renewal:
             below: the first number that was never used.
             last: the highest number that was, as far as the side files tell.
             wall_ns: wall clock, ns since the Unix epoch.
+            others: messages from elsewhere, which count where the source does not tell them.
 
         Returns:
             How many messages were saved.
@@ -114,10 +117,11 @@ class Renewal:
             OSError: likewise.
         """
         try:
-            count = self._write(readable(source, below), source, last, wall_ns)
+            count = self._write(chain(readable(source, below), others), source, last, wall_ns)
         except (sqlite3.Error, OSError) as error:
             log.warning("outbox %s: not all can be saved (%s); trying what is needed", self._path, error)
-            count = self._write(_needed(source, below), source, last, wall_ns)
+            needed = (row for row in others if row[3] or not row[4])
+            count = self._write(chain(_needed(source, below), needed), source, last, wall_ns)
         self._draft.rename(self._saved)
         sync_directory(self._path.parent)
         return count
@@ -142,7 +146,7 @@ class Renewal:
         found = [
             old
             for old in self._path.parent.glob(f"{self._path.name}.corrupt-*")
-            if not old.name.endswith(SIDE_FILES[1:])
+            if not old.name.endswith((*SIDE_FILES[1:], ASIDE_SUFFIX))
         ]
         return sorted(found, key=lambda old: (old.stat().st_mtime_ns, old.name), reverse=True)
 
@@ -176,7 +180,7 @@ class Renewal:
         with contextlib.suppress(FileNotFoundError):
             self._note.unlink()
 
-    def _write(self, rows: Iterator[Row], source: Path, last: int, wall_ns: int) -> int:
+    def _write(self, rows: Iterable[Row], source: Path, last: int, wall_ns: int) -> int:
         delete(self._draft)
         try:
             with contextlib.closing(_new(self._draft, source)) as draft:

@@ -56,7 +56,7 @@ def readable(path: Path, below: int = LARGEST) -> Iterator[Row]:
 
         def new(rows: Iterable[tuple[object, ...]]) -> Iterator[Row]:
             for raw in rows:
-                row = _sound(raw, unsent)
+                row = sound_row(raw, unsent)
                 if row is not None and row[0] < below and row[0] not in seen:
                     seen.add(row[0])
                     yield row
@@ -89,7 +89,13 @@ def _up_to_a_point(
         log.debug("corrupt outbox %s could be read up to a point: %s", path, error)
 
 
-def _sound(raw: tuple[object, ...], unsent: set[int]) -> Row | None:
+def sound_row(raw: tuple[object, ...], unsent: set[int]) -> Row | None:
+    """What a row says; None if it has changed on the disk.
+
+    Args:
+        raw: its columns as they were read, text as bytes.
+        unsent: numbers of messages that another source takes for unsent.
+    """
     sequence, name, payload, retain, sent, wall_ns, told = raw
     try:
         topic = name.decode() if isinstance(name, bytes) else None
