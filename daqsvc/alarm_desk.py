@@ -187,8 +187,22 @@ class AlarmDesk:
         return self.outbox.counters.quarantined + self.outbox.counters.vanished
 
     def _forget(self, told: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
-        """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood."""
-        return [self._post(event) for event in self.manager.begin_anew(told, FORGOTTEN)]
+        """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood.
+
+        Of those that were never told of, the broker shows nothing.
+        """
+        ever = self.outbox.known_topics
+        return [
+            self._post(event)
+            for event in self.manager.begin_anew(told, FORGOTTEN)
+            if ever is None or self._topic(event) in ever
+        ]
+
+    def _topic(self, event: AlarmEvent) -> str:
+        alarm = (event.identity.machine, event.alarm)
+        if alarm not in self._topic_of:
+            self._topic_of[alarm] = self.topics.alarm(*alarm)
+        return self._topic_of[alarm]
 
     def _confirm(self, committed: Sequence[asyncio.Future[int]]) -> None:
         """Once these are on disk, the damage need not be told again after a restart."""
@@ -404,6 +418,7 @@ class AlarmDesk:
             lost=outbox.refused + outbox.lost,
             shut=bool(outbox.shut),
             damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
+            set_aside=self.outbox.has_set_aside,
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
             buses=self._bus_health(),
@@ -430,12 +445,9 @@ class AlarmDesk:
         alarm = (event.identity.machine, event.alarm)
         self._newest[alarm] = event
         self._untold.pop(alarm, None)
-        topic = self._topic_of.get(alarm)
-        if topic is None:
-            topic = self._topic_of[alarm] = self.topics.alarm(*alarm)
         try:
             committed = self.outbox.submit(
-                topic,
+                self._topic(event),
                 lambda sequence: alarm_payload(event, sequence, self.outbox.series).to_json(),
                 retain=True,
             )

@@ -97,6 +97,7 @@ class Vitals:
         buses: how each bus stands, by name.
         refused: by topic, why the broker will not take messages; None without a broker.
         shut: whether the journal cannot be opened so far.
+        set_aside: whether the damage has left files that are named ``*.corrupt-*``.
     """
 
     now_ns: int
@@ -115,6 +116,7 @@ class Vitals:
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
     refused: Mapping[str, str] | None = None
     shut: bool = False
+    set_aside: bool = False
 
 
 def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProxyType({})) -> list[str]:
@@ -246,9 +248,9 @@ class SelfCheck:
     def _damage(self, vitals: Vitals) -> Condition:
         if not self._damaged.goes_on(vitals.damaged, vitals.now_ns):
             return Condition("store/damage", Level.NORMAL, f"the files in {self._store} are sound")
+        left = "the rest is set aside as *.corrupt-*" if vitals.set_aside else "the rest is gone"
         sentence = (
-            f"files in {self._store} were damaged: what could be read was saved, the rest is set aside as "
-            "*.corrupt-*; look at the disk"
+            f"files in {self._store} were damaged: what could be read was saved, {left}; look at the disk"
         )
         return Condition("store/damage", Level.ALERT, sentence)
 

@@ -22,6 +22,7 @@ from daqsvc.outbox.files import (
     take_possession,
     used_bytes,
 )
+from daqsvc.outbox.known_topics import KnownTopics
 from daqsvc.outbox.log_copy import LogCopy
 from daqsvc.outbox.messages import OutboxAwayError, OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.reading import opened_to_read
@@ -89,6 +90,7 @@ class Journal:
         self.set_aside: Path | None = None
         self._renewal = Renewal(path)
         self._log_copy = LogCopy(path)
+        self._known_topics = KnownTopics(path.with_name(path.name + ".topics"))
         self._wall_ns = wall_ns
         self._limits = limits
         self._ballast = Ballast(
@@ -118,6 +120,11 @@ class Journal:
     def is_ready(self) -> bool:
         """Whether `open` has succeeded."""
         return self._is_ready
+
+    @property
+    def known_topics(self) -> frozenset[str] | None:
+        """Topics that ever had a retained message; None if damage has made nobody know them."""
+        return self._known_topics.topics
 
     def hold(self) -> None:
         """Create the directory and keep other processes out of it, until `close`.
@@ -171,6 +178,7 @@ class Journal:
         self._adopt()
         self._prove()
         self._put_log_away(is_whole=self.vanished == known_gone)
+        self._look_up_topics(is_whole=not (self.quarantined or self.vanished))
         self._tidy()
         self._ballast.take()
 
@@ -184,6 +192,10 @@ class Journal:
                 log.warning("outbox %s: the log that is damaged is set aside as %s", self.path, aside)
         except OSError as error:
             log.warning("outbox %s: the copy of its log stays where it is: %s", self.path, error)
+
+    def _look_up_topics(self, *, is_whole: bool) -> None:
+        topics = [row[0] for row in self._open_connection().execute("SELECT topic FROM latest")]
+        self._known_topics.open(topics, is_whole=is_whole)
 
     def _unusable(self, error: Exception) -> OutboxError:
         kind = OutboxAwayError if may_pass(error) else OutboxError
@@ -271,6 +283,8 @@ class Journal:
         """The alarms have told what has befallen the journal: a crash need not have it told again."""
         try:
             self._renewal.is_told()
+            if self._known_topics.topics is None:
+                self._look_up_topics(is_whole=True)
         except OSError as error:
             log.info("outbox %s: its damage will be told again: %s", self.path, error)
 
@@ -289,11 +303,14 @@ class Journal:
         gone = self._mark.vanished(stored)
         if is_new and self._mark.is_damaged:
             gone = max(gone, 1)  # there was a journal, and nobody knows what was in it
+        last, was_emptied = stored or 0, False
         if self._log_copy.is_there and (gone or not stored or self._mark.is_damaged):
             back = self._take_back(connection, stored or 0)
-            self._next = max(self._next, max(back, default=0) + 1)
+            last = max(back, default=last)
+            self._next = max(self._next, last + 1)
             gone -= sum(self._mark.used - gone < number <= self._mark.used for number in back)
-            if self._log_copy.was_emptied and self._mark.used:
+            was_emptied = self._log_copy.was_emptied and bool(self._mark.used)
+            if was_emptied:
                 gone = max(gone, 1)  # what was in the journal but not in the log, nobody knows
         if gone:
             self.vanished += gone
@@ -302,7 +319,7 @@ class Journal:
                 "outbox %s %s, but numbers up to %d were used: %d messages are gone from the disk; it was "
                 "damaged, deleted, or is an older copy",
                 self.path,
-                "is not there" if is_new else f"ends with message {stored or 0}",
+                "is not there" if is_new else "was empty" if was_emptied else f"ends with message {last}",
                 self._mark.used,
                 gone,
             )
@@ -419,6 +436,7 @@ class Journal:
             sequence += 1
         if rows:
             self._mark.advance(sequence - 1)
+        self._known_topics.add(latest)
         with self._committed(connection):
             connection.executemany(_INSERT, rows)
             connection.executemany("INSERT OR REPLACE INTO latest VALUES (?, ?)", latest.items())

@@ -83,6 +83,17 @@ class Outbox:
         self._writer = JournalWriter(self._journal, self._books, self._telemetry.file.give_way)
         self._ended: asyncio.Future[None] | None = None
 
+    @property
+    def known_topics(self) -> frozenset[str] | None:
+        """Topics that ever had a retained message; None if damage has made nobody know them."""
+        return self._journal.known_topics
+
+    @property
+    def has_set_aside(self) -> bool:
+        """Whether damage of this run or the last has left files named ``*.corrupt-*``."""
+        telemetry = self.counters.telemetry
+        return bool(self.counters.quarantined or telemetry.quarantined or self._journal.set_aside)
+
     async def open(self) -> None:
         """Open the files, check them, and start their writers.
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 
+import pytest
 from brokers import eventually
 
 from daqsvc.acquisition.clock import SystemClock
@@ -74,7 +76,8 @@ async def test_a_newer_event_makes_the_refused_one_needless(tmp_path, monkeypatc
         await desk.close(1.0)
 
 
-async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path) -> None:
+@pytest.mark.parametrize("knows", [True, False], ids=["which were raised", "nothing"])
+async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path, knows) -> None:
     """Else the broker would show them as active for ever."""
     rules = [DiagnosisRule("fault", "bank"), DiagnosisRule("other", "bank")]
     speakers = {"bank": ("x",)}
@@ -84,6 +87,8 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path)
     await states(desk)
     await desk.close(1.0)
     journal = tmp_path / "outbox.sqlite"
+    if not knows:
+        (tmp_path / "outbox.sqlite.topics").write_text("garbage")
     journal.write_bytes(b"garbage!" * 8 + journal.read_bytes()[64:])
 
     desk = AlarmDesk(IDENTITY, rules, tmp_path, CLOCK, None)
@@ -94,7 +99,7 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path)
     for message in await desk.outbox.latest():
         payload = json.loads(message.payload)
         told[payload["alarm"]] = (payload["kind"], payload["state"], payload["occurrence"])
-    names = ("fault", "other", "sensor-ok/x", *conditions(None))
+    names = ("fault", "other") if knows else ("fault", "other", "sensor-ok/x", *conditions(None))
     assert told == dict.fromkeys(names, ("returned", "normal", None))
     await desk.close(1.0)
 
@@ -103,4 +108,31 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path)
     before = len(await states(desk))
     await desk.resume(speakers)
     assert len(await states(desk)) == before, "once"
+    await desk.close(1.0)
+
+
+@pytest.mark.parametrize("damage", ["at byte 200", "in the middle", "emptied"])
+async def test_an_alarm_that_stands_still_stands_after_damage_of_the_log(tmp_path, damage) -> None:
+    """And one that was never raised is not told of."""
+    rules = [DiagnosisRule("fault", "bank"), DiagnosisRule("other", "another")]
+    desk = AlarmDesk(IDENTITY, rules, tmp_path / "store", CLOCK, None)
+    await desk.open()
+    desk.take(said("F1", "danger"))
+    stood = await states(desk)
+    shutil.copytree(tmp_path / "store", tmp_path / "killed", ignore=shutil.ignore_patterns("*-shm"))
+    await desk.close(1.0)
+    journal, log = tmp_path / "killed" / "outbox.sqlite", tmp_path / "killed" / "outbox.sqlite-wal"
+    if damage == "emptied":
+        journal.write_bytes(b"")
+    else:
+        content = bytearray(log.read_bytes())
+        content[200 if damage == "at byte 200" else len(content) // 2] ^= 1
+        log.write_bytes(content)
+
+    desk = AlarmDesk(IDENTITY, rules, tmp_path / "killed", CLOCK, None)
+    await desk.open()
+    await desk.resume({"bank": ("x",)})
+    await desk.settle(5.0)
+    assert await states(desk) == stood
+    assert desk.figures()["active"] == 1
     await desk.close(1.0)

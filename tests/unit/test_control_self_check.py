@@ -137,6 +137,14 @@ def test_what_happens_now_and_then_is_one_alarm(count: str, condition: str) -> N
     assert levels == [Level.NORMAL, *[Level.ALERT] * 4, Level.NORMAL]
 
 
+def test_set_aside_is_said_of_files_that_are_there() -> None:
+    for there in (False, True):
+        check = self_check()
+        look(check)
+        _, sentence = look(check, damaged=1, set_aside=there)["store/damage"]
+        assert ("corrupt-" in sentence) is there
+
+
 def test_what_the_broker_refuses_is_named_once_without_a_count() -> None:
     check = self_check()
     assert "broker/refused" not in look(check), "there is no broker"
