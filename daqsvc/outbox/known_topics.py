@@ -11,7 +11,7 @@ import logging
 import zlib
 from typing import TYPE_CHECKING
 
-from daqsvc.outbox.files import read_whole, replace_durably
+from daqsvc.outbox.files import read_whole, replace_durably, restrict
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -46,6 +46,7 @@ class KnownTopics:
             latest: what the journal knows.
             is_whole: whether these are all: then the file can be made anew, if it is damaged or missing.
         """
+        restrict(self._path)
         told = self._read()
         self._topics = frozenset() if told is None and is_whole else told
         self.add(latest)
