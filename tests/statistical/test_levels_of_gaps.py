@@ -102,7 +102,7 @@ def test_beyond_a_few_per_cent_every_level_is_uncertain_and_says_so(pairs):
             if missing <= MOST_MISSING:
                 assert set(gapped.bounds) <= {"velocity_rms"}
             elif missing <= 0.5:
-                assert set(gapped.bounds) == {"mean", *MEASURES}
+                assert set(gapped.bounds) == {"mean", "peak_to_peak", *MEASURES}
             else:
                 assert not gapped.statistics
             assert (gapped.quality == "good") == (missing <= MOST_MISSING and not gapped.bounds)
