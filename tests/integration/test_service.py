@@ -100,7 +100,8 @@ async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Pat
             told = consumer.on("/alarms/sensor-ok/accel")[0].payload
             assert "no samples of recording for" in told["message"]
             assert told["cause"]["decision"] == "alert"
-            await shake(service, 1.0)
+            # Good again is what has been good for some seconds.
+            await shake(service, 8.0)
             await eventually(
                 lambda: consumer.on("/alarms/sensor-ok/accel")[-1].payload["kind"] == "returned",
                 "the samples are back",

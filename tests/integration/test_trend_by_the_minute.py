@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-from concurrent.futures import Executor, Future
+from types import SimpleNamespace
 
 import pytest
 from alarm_rig import RIG
@@ -34,13 +34,22 @@ HOT = LevelRule("hot", "oil", "value", Setpoint(alert=80.0, deadband=2.0, on_del
 REGISTERS = Trend(1, "holding", RegisterRecord((RegisterField("oil", 0, "int16"),), (Run(0, 1),)))
 
 
-class AtOnce(Executor):
-    """Works while it is asked to: simulated time must not pass meanwhile."""
+class AtOnce:
+    """Works while it is asked to, instead of `KernelThreads`: simulated time must not pass meanwhile."""
 
-    def submit(self, work, /, *arguments, **named):
-        done = Future()
-        done.set_result(work(*arguments, **named))
-        return done
+    def __init__(self, *_):
+        pass
+
+    def submit(self, call):
+        outcome = asyncio.get_running_loop().create_future()
+        outcome.set_result(call())
+        return SimpleNamespace(outcome=outcome)
+
+    def close(self):
+        pass
+
+    def join(self):
+        pass
 
 
 class Oil:
@@ -63,7 +72,6 @@ class Oil:
         self._pipeline = Pipeline(
             {"trend": ring}, [detector], self._take, LoopClock(), patience={"trend": Patience(1e9 / RATE_HZ)}
         )
-        self._pipeline._pool = AtOnce()
         self._manager = AlarmManager(RIG, [HOT], LoopClock())
 
     def _take(self, diagnosis):
@@ -95,6 +103,7 @@ def no_threads(monkeypatch):
         return work(*arguments)
 
     monkeypatch.setattr(asyncio, "to_thread", at_once)
+    monkeypatch.setattr("daqsvc.diagnosis.pipeline.KernelThreads", AtOnce)
 
 
 def test_an_alarm_of_a_value_a_minute_is_raised_held_and_returned():
