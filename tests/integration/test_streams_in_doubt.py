@@ -104,7 +104,15 @@ async def be_in_doubt(folder: Path, *, and_recover: bool) -> None:
                 return
             for name in STILL:
                 await eventually(lambda n=name: "returned" in events.of(f"limit-{n}"), f"{name}: it is quiet")
-                assert events.of(f"sensor-ok/s-{name}")[-1] == "returned"
+                # Good again is what has been good for some seconds.
+                await eventually(
+                    lambda n=name: events.of(f"sensor-ok/s-{n}")[-1] == "returned",
+                    f"{name}: it is good again",
+                )
             for name in WRONG:
                 await eventually(lambda n=name: "raised" in events.of(f"limit-{n}"), f"{name}: it is judged")
-                assert events.of(f"sensor-ok/s-{name}")[-1] == "returned"
+                # Good again is what has been good for some seconds.
+                await eventually(
+                    lambda n=name: events.of(f"sensor-ok/s-{n}")[-1] == "returned",
+                    f"{name}: it is good again",
+                )

@@ -170,6 +170,10 @@ async def test_a_suspended_process_raises_clears_and_reorders_nothing(lossy: boo
             process.send_signal(signal.SIGCONT)
             said = len(consumer.on("/status"))
             await eventually(lambda: len(consumer.on("/status")) > said + 3, "it goes on")
+            if lossy:  # good again is what has been good for some seconds
+                await eventually(
+                    lambda: heard()[-1].payload["kind"] == "returned", "the samples are good again"
+                )
             after = [message.payload for message in heard()[before:]]
             lost = samples("lost")
             assert figures()["suspensions"] >= 1, "a busy test machine may make it more"
