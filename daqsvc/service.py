@@ -147,6 +147,7 @@ class Service:
             settling_ns=settling_ns,
             patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
             supervisor=self.supervisor,
+            fall_silent=self._fall_silent,
         )
         self.desk = AlarmDesk(
             self._identity,
@@ -295,9 +296,14 @@ class Service:
         for grid in self._grids:
             if stream in grid.streams:
                 standings = [self._standings[name] for name in grid.streams]
-                doubts = [one.doubt for one in standings if one.doubt]
+                worst = next((one for one in standings if one.doubt), Standing())
                 proven = all(one.proven for one in standings)
-                self.pipeline.stand(grid.name, Standing(doubts[0] if doubts else "", proven))
+                self.pipeline.stand(grid.name, worst._replace(proven=proven))
+
+    def _fall_silent(self, stream: str, standing: Standing) -> None:
+        """Take in that nothing comes any more of a stream in doubt; a grid stands as its streams do."""
+        if stream in self._standings:
+            self._stand(stream, standing)
 
     def _report(self, diagnosis: Diagnosis) -> None:
         with self.supervisor.sparing_others(
@@ -346,11 +352,11 @@ class Service:
             up = int(driver.link.state == "up")
             buses[driver.name] = {"up": up, "losses": driver.link.losses, **counted}
             for name, (counters, base) in driver.streams.items():
-                ring = self.rings[name]
+                ring, standing = self.rings[name], self._standings[name]
                 streams[name] = {
                     **asdict(counters),
                     "rate_hz": base.rate_hz,
-                    "doubt": base.doubt,
+                    "doubt": standing.doubt if standing.silent else base.doubt,
                     "drift_ppm": base.drift_ppm,
                     "jitter_ms": base.jitter_ns / 1e6,
                     "time_settled": int(base.settled),

@@ -16,6 +16,9 @@ logger = logging.getLogger(__name__)
 QUIET_NS = 60 * NS_PER_S
 """A stream whose standing changes again and again is reported no more often than this."""
 
+AGAIN_NS = NS_PER_S // 2
+"""A doubt is told again so often while frames come: if it is not, none come any more."""
+
 PROVING_NS = 5 * NS_PER_S
 """Until then a stream's rate is either known, or it is not waited for."""
 
@@ -26,16 +29,18 @@ class Standing(NamedTuple):
     Attributes:
         doubt: why nothing can be judged by its samples; empty if nothing speaks against them.
         proven: whether its rate seems to be the nominal one, or could not be found out in time.
+        silent: whether the doubt is that nothing comes at all, since another one stood.
     """
 
     doubt: str = ""
     proven: bool = True
+    silent: bool = False
 
 
 _FIGURE = re.compile("[0-9]")
 
 Tell: TypeAlias = "Callable[[str, Standing], None]"
-"""Called with the name of a stream and its standing whenever that changes."""
+"""Called with the name of a stream and its standing whenever that changes; a doubt also while frames come."""
 
 
 def tell_nobody(stream: str, standing: Standing) -> None:
@@ -52,7 +57,7 @@ class StreamStanding:
 
     Args:
         stream: name of the stream.
-        tell: called when it changes.
+        tell: called when it changes, and every now and then while frames come of a stream in doubt.
     """
 
     def __init__(self, stream: str, tell: Tell) -> None:
@@ -60,6 +65,7 @@ class StreamStanding:
         self._tell = tell
         self._now: Standing | None = None
         self._begun_ns: int | None = None
+        self._told_ns = 0
         self._said_ns: dict[str, int] = {}
         self._logged = False
 
@@ -77,9 +83,10 @@ class StreamStanding:
         if self._now is not None:
             proven = proven or self._now.proven
         standing = Standing(doubt, proven)
-        if standing == self._now:
+        if standing == self._now and not (doubt and abs(now_ns - self._told_ns) >= AGAIN_NS):
             return
         before, self._now = self._now, standing
+        self._told_ns = now_ns
         if cause_of(doubt) != cause_of(before.doubt if before else ""):
             self._log(doubt, now_ns)
         self._tell(self._stream, standing)

@@ -15,6 +15,7 @@ from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import Standing
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.kernel_threads import KernelThreads
+from daqsvc.diagnosis.record import silence_reason
 from daqsvc.diagnosis.silence import Patience
 from daqsvc.supervision import Supervisor, over
 from daqsvc.threads import call_in_thread
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import Chunk, SampleRing
+    from daqsvc.acquisition.standing import Tell
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.kernel_threads import Job
     from daqsvc.diagnosis.record import Diagnosis
@@ -75,6 +77,8 @@ class Pipeline:
         settling_ns: by stream, how long its first sample may be in coming without the stream being silent.
         patience: by stream, how long it may be silent; whatever is not named is fast.
         supervisor: keeps the detectors' tasks going; None for one of its own.
+        fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
+            more; whoever tells the pipeline how streams stand passes it on. None: it is passed on at once.
     """
 
     def __init__(
@@ -87,6 +91,7 @@ class Pipeline:
         settling_ns: Mapping[str, int] | None = None,
         patience: Mapping[str, Patience] | None = None,
         supervisor: Supervisor | None = None,
+        fall_silent: Tell | None = None,
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
@@ -96,6 +101,8 @@ class Pipeline:
         self._patience = {name: Patience() for name in rings} | dict(patience or {})
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._standings = dict.fromkeys(rings, Standing())
+        self._fall_silent = fall_silent or self.stand
+        self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
         self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
         self._seen_changes = dict.fromkeys(self.counters, 0)
@@ -118,6 +125,7 @@ class Pipeline:
         What is said before its rate is known waits for that.
         """
         before, self._standings[stream] = self._standings[stream], standing
+        self._doubts_told[stream] += bool(standing.doubt) and not standing.silent
         if standing.doubt != before.doubt:
             self._changes[stream] += 1
             self._held[stream].clear()
@@ -193,9 +201,11 @@ class Pipeline:
     async def _listen_for_silence(self) -> None:
         """Have detectors say, once, that their stream has fallen silent: a window never comes to say it.
 
+        Of a stream in doubt samples may not come as far as the ring; that frames come is told with the doubt.
+
         A process that was suspended has not listened: what came meanwhile still waits to be read.
         """
-        ends = {name: ring.end_index for name, ring in self._rings.items()}
+        heard = {name: (ring.end_index, self._doubts_told[name]) for name, ring in self._rings.items()}
         looked_ns = self._clock.monotonic_ns()
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
         said: set[str] = set()
@@ -206,21 +216,30 @@ class Pipeline:
             if late_ns > LOOK_NS:
                 since_ns = {name: heard_ns + late_ns for name, heard_ns in since_ns.items()}
             for name, ring in self._rings.items():
-                if ring.end_index != ends[name]:
-                    if name not in said:
+                has_doubt = bool(self._standings[name].doubt)
+                come = (heard[name][0] if has_doubt else ring.end_index, self._doubts_told[name])
+                if come != heard[name]:
+                    if name not in said and not has_doubt:
                         self._patience[name].heard_after(now_ns - since_ns[name])
-                    ends[name], since_ns[name] = ring.end_index, now_ns
+                    heard[name], since_ns[name] = come, now_ns
                     said.discard(name)
-                elif self._standings[name].doubt:
-                    since_ns[name] = now_ns  # its detectors have said why
                 elif name not in said and now_ns - since_ns[name] >= self._patience[name].ns:
                     said.add(name)
-                    self._let_go(name)
-                    self._silent_until_ns[name] = now_ns
-                    silence_s = (now_ns - since_ns[name]) / NS_PER_S
-                    for detector in self.detectors:
-                        if detector.stream == name:
-                            self._say_silent(detector, silence_s, now_ns)
+                    self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
+
+    def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> None:
+        silence_s = silence_ns / NS_PER_S
+        standing = self._standings[stream]
+        if standing.doubt:
+            # What the stream was doubted for is no longer what is wrong.
+            reason = silence_reason(stream, silence_s)
+            self._fall_silent(stream, Standing(reason, standing.proven, silent=True))
+            return
+        self._let_go(stream)
+        self._silent_until_ns[stream] = now_ns
+        for detector in self.detectors:
+            if detector.stream == stream:
+                self._say_silent(detector, silence_s, now_ns)
 
     def _say_silent(self, detector: Detector, silence_s: float, now_ns: int) -> None:
         with self._supervisor.sparing_others(_part(detector), "the other detectors say that nothing comes"):

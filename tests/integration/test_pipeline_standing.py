@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.clock import SystemClock
+from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
-from daqsvc.acquisition.standing import Standing
+from daqsvc.acquisition.standing import Standing, StreamStanding
 from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
@@ -123,5 +123,44 @@ async def test_a_doubt_takes_over_the_quality_alarm_of_a_stream_that_was_silent(
     pipeline.stand("s", Standing(other, proven=True))
     assert [event.kind.value for event in told] == ["raised", "changed"]
     assert told[1].message.endswith(DOUBT)
+    ring.close()
+    await running
+
+
+async def test_a_device_that_stops_while_a_doubt_stands_is_silent_and_no_longer_doubted() -> None:
+    ring, clock = SampleRing("s", ("a",), 1000), DrivenClock()
+    alarms, events = AlarmManager(Identity("lab", "box", "m"), [], clock), []
+    listener = Listener()
+    pipeline = Pipeline({"s": ring}, [listener], lambda d: events.extend(alarms.take(d)), clock)
+    standing = StreamStanding("s", pipeline.stand)
+    running = asyncio.create_task(pipeline.run())
+
+    async def live(seconds: int, doubt: str | None) -> list[tuple[str, str]]:
+        """What the quality alarm says while frames come that are doubted so, or none (None)."""
+        before = len(events)
+        for _ in range(10 * seconds):
+            if doubt is not None:
+                standing.take(doubt, clock.monotonic_ns(), known=True)
+            if doubt == "":
+                first, t_ns = ring.end_index, clock.monotonic_ns()
+                ring.write(SampleBlock("s", first, np.ones((BLOCK, 1), np.float32), t_ns, NS_PER_S / 100))
+                await asyncio.sleep(0.01)
+            clock.advance_to(clock.monotonic_ns() + NS_PER_S // 10)
+            await asyncio.sleep(0)
+            events.extend(alarms.tick())
+        return [(event.kind.value, event.message.partition("judged: ")[2]) for event in events[before:]]
+
+    other = "the device's counter stands still at 7"
+    silence = "no samples of s for 2.0 s; check bus and device"
+    assert await live(2, "") == []
+    # However long it stands, while frames come.
+    assert await live(9, DOUBT) == [("raised", DOUBT)]
+    assert await live(9, None) == [("changed", silence)]
+    assert await live(9, DOUBT) == [("changed", DOUBT)]
+    assert await live(9, None) == [("changed", silence)]
+    assert await live(9, other) == [("changed", other)]
+    assert await live(9, None) == [("changed", silence)]
+    assert await live(9, "") == [("returned", "")]
+    assert await live(9, None) == [("raised", "2 s")], "as its detector says it"
     ring.close()
     await running

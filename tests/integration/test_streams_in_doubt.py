@@ -86,6 +86,11 @@ async def be_in_doubt(folder: Path, *, and_recover: bool) -> None:
                     f"{name}: the rate is said",
                 )
                 assert RATE_WRONG.match(service.figures()["streams"][name]["doubt"])
+            # One that is asked would answer all the same, and its counter stand still.
+            nodes["can"].phases = [Phase("stopped", per_s=0.0)]
+            nothing = "no samples of can for "
+            await eventually(lambda: nothing in events.words("sensor-ok/s-can")[-1], "the device has stopped")
+            assert service.figures()["streams"]["can"]["doubt"].startswith(nothing)
             for name in STILL:
                 await eventually(lambda n=name: events.of(f"limit-{n}"), f"{name}: the limit is passed")
                 nodes[name].phases = [Phase("still", counter="still")]

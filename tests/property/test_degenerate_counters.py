@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 import pytest
@@ -208,7 +208,7 @@ def test_another_trouble_takes_over_from_a_counter_that_stood_still(caplog, coun
         t_ns = offset_ns + (300 + 27 * again) * 10_000_000
         play(COUNTERS[counter](5 * per_s, 1, np.random.default_rng(4)), per_s, t_ns)
         assert any(map(unit.doubt.startswith, words)) if words else unit.doubt == ""
-        assert told == [unit.doubt]
+        assert [doubt for doubt, _ in groupby([STILL, *told])][1:] == [unit.doubt]
         assert any(unit.doubt in record.message for record in caplog.records)
     play(np.arange(300), 100, 30_000_000_000)
     assert unit.doubt == ""
@@ -237,7 +237,7 @@ def test_counters_that_make_no_sense_are_set_aside_until_they_do() -> None:
         unit.accept(counter, np.ones((n, 1, 1), np.float32), np.ones(n, bool), t_ns)
         at += n
     unit.flush()
-    assert [doubt[:36] for doubt in told if doubt] == ["the device's counter makes no sense:"]
+    assert [doubt[:36] for doubt, _ in groupby(told) if doubt] == ["the device's counter makes no sense:"]
     assert told[-1] == ""
     assert 3000 < unit.counters.frames_set_aside < 5000
     assert unit.counters.samples_received > 3000
