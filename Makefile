@@ -7,6 +7,7 @@
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
+# make proto  the module of the Sparkplug payload, anew from its schema
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
@@ -22,7 +23,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost lock clean
+.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -72,6 +73,10 @@ nothing-lost: $(READY)
 
 bench-data: $(READY)
 	@for table in tests/bench/data_*.py; do $(BIN)/python $$table || exit 1; done
+
+# What is compiled needs a protobuf of this major version, no older than the compiler: pyproject.toml says which.
+proto: $(READY)
+	@$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. daqsvc/publish/sparkplug/sparkplug_b.proto
 
 # Pin again what pyproject.toml asks for. Needs uv (pip install uv).
 lock:

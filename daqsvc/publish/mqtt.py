@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.certificates import CertificateError, certificate, voucher
+from daqsvc.publish.certificates import CertificateError, certificate, issuer_of
 from daqsvc.publish.command_intake import CommandIntake
 from daqsvc.publish.connection import PUBACK_S, Connection, Will
 from daqsvc.publish.counters import PublishCounters
@@ -328,7 +328,7 @@ class MqttPublisher:
         )
 
     def _see(self, connection: Connection, credentials: Credentials) -> None:
-        """Note how long the broker's certificate and the one that vouches for it last."""
+        """Note how long the broker's certificate and that of its issuer last."""
         der = connection.shown_certificate
         if der is None:
             return
@@ -338,7 +338,7 @@ class MqttPublisher:
             log.warning("nobody will be told when the certificate of %s ends: %s", self._name, error)
             return
         self._expiry["broker"] = shown.not_after_ns
-        authority = voucher(shown, credentials.trusted)
+        authority = issuer_of(shown, credentials.trusted)
         if authority is not None:
             self._expiry["ca"] = authority.not_after_ns
 

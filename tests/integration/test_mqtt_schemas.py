@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brokers import Consumer, eventually, running_mosquitto
-from json_schema import faults
+from jsonschema import Draft202012Validator
 from live_service import play, running
 from machine_files import MACHINES
 from test_mqtt_commands import say
@@ -19,7 +19,15 @@ from daqsvc.publish.schemas import PAYLOADS, schema_files
 from daqsvc.settings import parse_machine_file
 
 DOCS = Path(__file__).parents[2] / "docs" / "schemas"
-SCHEMAS = {name: json.loads((DOCS / f"{name.replace('/', '-')}.json").read_text()) for name in PAYLOADS}
+SCHEMAS = {
+    name: Draft202012Validator(json.loads((DOCS / f"{name.replace('/', '-')}.json").read_text()))
+    for name in PAYLOADS
+}
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMAS))
+def test_every_published_schema_is_one_itself(name):
+    Draft202012Validator.check_schema(SCHEMAS[name].schema)
 
 
 @pytest.mark.parametrize("name", sorted(schema_files()))
@@ -77,8 +85,8 @@ async def test_all_that_a_service_says_and_hears_is_as_the_schemas_promise(tmp_p
     said = [m.payload for m in live.messages if not m.topic.endswith("/commands/acknowledge")]
     assert {payload["schema"] for payload in said} == set(PAYLOADS) - {"daqsvc.command/1"}
     for payload in [*said, good]:
-        assert list(faults(payload, SCHEMAS[payload["schema"]])) == []
-    assert list(faults(bad, SCHEMAS["daqsvc.command/1"]))
+        SCHEMAS[payload["schema"]].validate(payload)
+    assert not SCHEMAS["daqsvc.command/1"].is_valid(bad)
 
 
 @pytest.mark.parametrize(
@@ -91,5 +99,5 @@ async def test_all_that_a_service_says_and_hears_is_as_the_schemas_promise(tmp_p
         ("daqsvc.availability/1", {"schema": "daqsvc.availability/1", "state": "gone"}),
     ],
 )
-def test_the_check_itself_finds_faults(name, payload):
-    assert list(faults(payload, SCHEMAS[name]))
+def test_the_schemas_refuse_what_is_no_payload(name, payload):
+    assert not SCHEMAS[name].is_valid(payload)

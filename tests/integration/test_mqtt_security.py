@@ -11,7 +11,7 @@ import subprocess
 
 import pytest
 from brokers import Consumer, TcpProxy, eventually, free_port, listens, running_mosquitto
-from tls_files import authority, openssl, self_signed, signed
+from tls_files import authority, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.publish.certificates import CertificateError
@@ -56,7 +56,7 @@ def tls_settings(port, ca_file, own=None):
 
 
 async def test_a_broker_with_a_trusted_certificate_is_served(tmp_path, outbox):
-    broker = self_signed(tmp_path, "broker", "IP:127.0.0.1")
+    broker = self_signed(tmp_path, "broker", "127.0.0.1")
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, broker.cert)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected over TLS")
@@ -67,13 +67,13 @@ async def test_a_broker_with_a_trusted_certificate_is_served(tmp_path, outbox):
 @pytest.mark.parametrize(
     ("host", "trusted", "reason"),
     [
-        ("DNS:another.example", True, "its certificate is for another host: IP address mismatch"),
-        ("IP:127.0.0.1", False, "nobody in ca_file vouches for its certificate: self"),
+        ("another.example", True, "its certificate is for another host: IP address mismatch"),
+        ("127.0.0.1", False, "nobody in ca_file vouches for its certificate: self"),
     ],
 )
 async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, caplog, host, trusted, reason):
     broker = self_signed(tmp_path, "broker", host)
-    stranger = self_signed(tmp_path, "stranger", "IP:127.0.0.1")
+    stranger = self_signed(tmp_path, "stranger", "127.0.0.1")
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
         settings = tls_settings(mosquitto.port, (broker if trusted else stranger).cert)
         async with publishing(outbox, settings) as publisher:
@@ -85,10 +85,10 @@ async def test_a_broker_that_cannot_prove_itself_is_refused(tmp_path, outbox, ca
 async def test_the_reason_why_a_broker_does_not_come_back_is_told_when_it_changes(tmp_path, outbox, caplog):
     """It goes, comes back with the certificate of another host, then with one that has expired."""
     ca = authority(tmp_path, "ca")
-    good = signed(tmp_path, "broker", ca, host="IP:127.0.0.1")
-    other = signed(tmp_path, "other", ca, host="DNS:another.example")
-    expired = signed(tmp_path, "expired", ca, host="IP:127.0.0.1", days=-1)
-    again = signed(tmp_path, "again", ca, host="IP:127.0.0.1")
+    good = signed(tmp_path, "broker", ca, host="127.0.0.1")
+    other = signed(tmp_path, "other", ca, host="another.example")
+    expired = signed(tmp_path, "expired", ca, host="127.0.0.1", days=-1)
+    again = signed(tmp_path, "again", ca, host="127.0.0.1")
     with running_mosquitto(tmp_path, config=tls_config(good)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
@@ -112,7 +112,7 @@ async def test_the_reason_why_a_broker_does_not_come_back_is_told_when_it_change
 
 
 async def test_a_rotated_certificate_takes_effect_at_the_next_connection(tmp_path, outbox):
-    old, new = (self_signed(tmp_path, name, "IP:127.0.0.1") for name in ("old", "new"))
+    old, new = (self_signed(tmp_path, name, "127.0.0.1") for name in ("old", "new"))
     trusted = tmp_path / "trusted.crt"
     trusted.write_bytes(old.cert.read_bytes())
     with running_mosquitto(tmp_path, config=tls_config(old)) as mosquitto:
@@ -127,7 +127,7 @@ async def test_a_rotated_certificate_takes_effect_at_the_next_connection(tmp_pat
 
 async def test_a_broker_that_wants_certificates_gets_the_one_of_the_box(tmp_path, outbox, caplog):
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
             await eventually(lambda: "is away" in caplog.text, "nobody is served without a certificate")
@@ -143,8 +143,8 @@ async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
     """The complaint: a renewed certificate takes effect only after a restart, if somebody thinks of it."""
     monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
     old_ca, new_ca = authority(tmp_path, "old-ca"), authority(tmp_path, "new-ca", days=60)
-    broker, box = signed(tmp_path, "broker", old_ca, host="IP:127.0.0.1"), signed(tmp_path, "box", old_ca)
-    new_broker = signed(tmp_path, "new-broker", new_ca, host="IP:127.0.0.1", days=9)
+    broker, box = signed(tmp_path, "broker", old_ca, host="127.0.0.1"), signed(tmp_path, "box", old_ca)
+    new_broker = signed(tmp_path, "new-broker", new_ca, host="127.0.0.1", days=9)
     new_box = signed(tmp_path, "new-box", new_ca, days=9)
     with running_mosquitto(tmp_path, config=tls_config(broker, old_ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, old_ca.cert, box)) as publisher:
@@ -175,7 +175,7 @@ async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
 async def test_a_renewal_is_no_outage_to_anybody(tmp_path, outbox, monkeypatch):
     monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     renewed = signed(tmp_path, "renewed", ca)
     plain = free_port()
     config = f"{tls_config(broker, ca)}\nlistener {plain} 127.0.0.1\nallow_anonymous true"
@@ -199,8 +199,8 @@ async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_lo
     monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
     monkeypatch.setattr("daqsvc.publish.session.LOOK_AGAIN_S", 0.2)
     ca = authority(tmp_path, "ca")
-    broker = signed(tmp_path, "broker", ca, host="IP:127.0.0.1", days=5)
-    renewed = signed(tmp_path, "renewed", ca, host="IP:127.0.0.1", days=29)
+    broker = signed(tmp_path, "broker", ca, host="127.0.0.1", days=5)
+    renewed = signed(tmp_path, "renewed", ca, host="127.0.0.1", days=29)
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
@@ -218,7 +218,7 @@ async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_lo
 async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, outbox, monkeypatch, caplog):
     monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.02)
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     whole = box.cert.read_bytes()
     with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
@@ -237,13 +237,13 @@ async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, out
 async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
     tmp_path, outbox, monkeypatch, caplog
 ):
-    def unreadable(_der):
+    def unreadable(_certificate):
         raise CertificateError("not an X.509 certificate: it is stranger than that")
 
-    monkeypatch.setattr("daqsvc.publish.certificates.certificate", unreadable)
+    monkeypatch.setattr("daqsvc.publish.credentials.certificates", unreadable)
     monkeypatch.setattr("daqsvc.publish.mqtt.certificate", unreadable)
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
@@ -253,9 +253,8 @@ async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
 
 async def test_an_encrypted_key_is_refused_and_nobody_is_asked_at_the_terminal(tmp_path, outbox, caplog):
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
-    openssl("ec", "-in", box.key, "-aes256", "-passout", "pass:sesame", "-out", tmp_path / "locked.key")
-    (tmp_path / "locked.key").replace(box.key)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
+    box.encrypt_key("sesame")
     with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)):
             await eventually(lambda: "is encrypted" in caplog.text, "it is said")
@@ -288,7 +287,7 @@ async def test_a_corrected_password_is_read_at_the_next_attempt_and_never_logged
 
 async def test_password_and_key_may_be_systemd_credentials(tmp_path, outbox, monkeypatch, caplog):
     ca = authority(tmp_path, "ca")
-    broker, box = signed(tmp_path, "broker", ca, host="IP:127.0.0.1"), signed(tmp_path, "box", ca)
+    broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     config = f"{tls_config(broker)}\n{password_config(tmp_path)}"
     with running_mosquitto(tmp_path, config=config, anonymous=False) as mosquitto:
         settings = dataclasses.replace(
@@ -386,7 +385,7 @@ async def test_a_secret_that_everybody_can_read_is_warned_of_once(tmp_path, outb
 async def test_a_certificate_whose_common_name_alone_is_the_host_is_refused(tmp_path, outbox, caplog):
     """RFC 9525: names count where certificates have them since 2000, in the subject alternative names."""
     ca = authority(tmp_path, "ca")
-    broker = signed(tmp_path, "localhost", ca, host="email:a@example")  # CN=localhost
+    broker = signed(tmp_path, "localhost", ca, host="a@example")  # CN=localhost
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
         settings = dataclasses.replace(tls_settings(mosquitto.port, ca.cert), host="localhost")
         async with publishing(outbox, settings) as publisher:

@@ -40,20 +40,10 @@ class Consumer:
         self.arrivals: list[Arrival] = []
         self.ids: set[str] = set()
         self.subscribed = threading.Event()
-        self._client = paho.Client(
-            paho.CallbackAPIVersion.VERSION2, client_id="consumer", clean_session=False
-        )
-        self._client.reconnect_delay_set(0.02, 0.1)  # type: ignore[arg-type]  # seconds; fractions work
-        self._client.on_connect = self._connected
-        self._client.on_disconnect = lambda *_: self.subscribed.clear()
-        self._client.on_subscribe = lambda *_: self.subscribed.set()
-        self._client.on_message = self._take
         self._port = port
 
     async def __aenter__(self) -> Self:
-        self._client.connect_async(LOOPBACK, self._port)
-        self._client.loop_start()
-        await self.is_listening()
+        await self._join()
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -63,9 +53,7 @@ class Consumer:
         """Go away for a while; the broker keeps the session and what comes in the meantime."""
         await self._leave()
         await asyncio.sleep(duration_s)
-        await asyncio.to_thread(self._client.reconnect)
-        self._client.loop_start()
-        await self.is_listening()
+        await self._join()
 
     async def is_listening(self) -> None:
         """Wait until the broker has it as a subscriber."""
@@ -84,11 +72,25 @@ class Consumer:
             await asyncio.sleep(0.01)
         return True
 
+    async def _join(self) -> None:
+        # A client for each time: the loop of one may be stopped before it has seen the end, and then cannot
+        # be started again without leaving sockets behind.
+        self._client = client = paho.Client(
+            paho.CallbackAPIVersion.VERSION2, client_id="consumer", clean_session=False
+        )
+        client.reconnect_delay_set(0.02, 0.1)  # type: ignore[arg-type]  # seconds; fractions work
+        client.on_connect = self._connected
+        client.on_disconnect = lambda *_: self.subscribed.clear()
+        client.on_subscribe = lambda *_: self.subscribed.set()
+        client.on_message = self._take
+        client.connect_async(LOOPBACK, self._port)
+        client.loop_start()
+        await self.is_listening()
+
     async def _leave(self) -> None:
         self._client.disconnect()
         await asyncio.to_thread(self._client.loop_stop)
-        # The loop may be stopped before it has seen the end, and starting it again leaves a pair behind.
-        self._client._reset_sockets()
+        self.subscribed.clear()
 
     def _connected(self, client: paho.Client, _userdata: object, flags: Any, *_: object) -> None:
         if flags.session_present:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -13,6 +16,8 @@ from sparkplug_host import seen
 
 from daqsvc.publish.sparkplug.codec import MOST_BYTES, DataType, Metric, Payload, PayloadError, decode, encode
 
+ROOT = Path(__file__).parents[2]
+SCHEMA = ROOT / "daqsvc/publish/sparkplug/sparkplug_b.proto"
 U64 = 2**64 - 1
 VALUES = {
     DataType.INT32: st.integers(-(2**31), 2**31 - 1),
@@ -119,12 +124,47 @@ def test_what_is_not_known_is_skipped() -> None:
         (DataType.STRING, 1),
         (DataType.DOUBLE, "1"),
         (DataType.FLOAT, 1e300),
+        (DataType.DOUBLE, 10**400),
+        (DataType.DOUBLE, True),
         (None, 1),
     ],
 )
 def test_a_value_that_does_not_fit_its_datatype_is_refused(datatype, value) -> None:
     with pytest.raises(PayloadError, match="'speed'"):
         encode(Payload(0, 0, (Metric(name="speed", datatype=datatype, value=value),)))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        Payload(-1, 0, ()),
+        Payload(0, 2**64, ()),
+        Payload(0, 0, (Metric(name="speed", alias=-1, datatype=DataType.INT32),)),
+        Payload(0, 0, (Metric(name="\ud800", datatype=DataType.INT32),)),
+    ],
+)
+def test_a_number_or_a_name_that_its_field_cannot_hold_is_refused(payload) -> None:
+    with pytest.raises(PayloadError, match="cannot be written as a Sparkplug payload"):
+        encode(payload)
+
+
+def test_infinity_fits_both_kinds_of_floats() -> None:
+    metrics = tuple(
+        Metric(name="x", datatype=kind, value=-math.inf) for kind in (DataType.FLOAT, DataType.DOUBLE)
+    )
+    assert decode(encode(Payload(0, 0, metrics))).metrics == metrics
+
+
+def test_the_compiled_schema_is_that_of_the_proto_file(tmp_path: Path) -> None:
+    compiled = sorted(SCHEMA.parent.glob("sparkplug_b_pb2.py*"))
+    assert [file.suffix for file in compiled] == [".py", ".pyi"]
+    name = SCHEMA.relative_to(ROOT)
+    output = [f"--python_out={tmp_path}", f"--pyi_out={tmp_path}"]
+    command = [sys.executable, "-m", "grpc_tools.protoc", "-I.", *output, name]
+    subprocess.run(command, cwd=ROOT, check=True, timeout=60)
+    for file in compiled:
+        anew = tmp_path / file.relative_to(ROOT)
+        assert file.read_text("utf-8") == anew.read_text("utf-8"), "run make proto"
 
 
 def test_not_a_number_can_be_told() -> None:
@@ -136,12 +176,12 @@ def test_not_a_number_can_be_told() -> None:
     ("raw", "why"),
     [
         (b"\x00" * (MOST_BYTES + 1), "longest that is read"),
-        (b"\x12\x05abc", "cut"),
-        (b"\x08", "cut"),
-        (b"\x08" + b"\xff" * 11, "more than 64 bits"),
-        (b"\x0b", "no wire type"),
+        (b"\x12\x05abc", "5 bytes that are no Sparkplug B payload"),
+        (b"\x08", "no Sparkplug B payload"),
+        (b"\x08" + b"\xff" * 11, "no Sparkplug B payload"),
+        (b"\x0b", "no Sparkplug B payload"),
         (b"\x12\x02\x20\x63", "datatype 99 is not known"),
-        (b"\x12\x04\x0a\x02\xff\xfe", "not UTF-8"),
+        (b"\x12\x04\x0a\x02\xff\xfe", "UTF-8"),
         (b"\x12\x05\x4a\x03\x0a\x01a", "1 keys for 0 values"),
     ],
 )

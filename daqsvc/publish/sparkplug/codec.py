@@ -1,26 +1,31 @@
-"""The Sparkplug B payload on the wire: the part of its protocol-buffers schema that an edge node needs.
+"""The Sparkplug B payload: values with datatypes, to bytes and back.
 
-Written out rather than generated: five messages with plain fields. What is not known is skipped on reading,
-as the encoding asks for. Source: Sparkplug 3.0, section 6.4.1; Protocol Buffers, "Encoding".
+protobuf writes and reads the messages of ``sparkplug_b.proto``; what is added here is that a value fits its
+datatype. Source: Sparkplug 3.0, section 6.4.
 """
 
 from __future__ import annotations
 
-import struct
+import math
+import sys
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
+
+from google.protobuf.message import DecodeError
+
+from daqsvc.publish.sparkplug import sparkplug_b_pb2 as messages
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Mapping
 
 Value: TypeAlias = "bool | int | float | str | None"
 
 MOST_BYTES = 1_000_000
 """No command is as long; a longer payload is not looked at."""
 
-_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 _U32, _U64 = 2**32 - 1, 2**64 - 1
+_LARGEST_FLOAT = (2 - 2**-23) * 2.0**127
 
 
 class PayloadError(ValueError):
@@ -42,24 +47,24 @@ class DataType(IntEnum):
 
 
 _FIELD = {
-    # The fields of the value in a metric; a property has them seven lower.
-    DataType.INT32: 10,
-    DataType.UINT32: 10,
-    DataType.INT64: 11,
-    DataType.UINT64: 11,
-    DataType.DATETIME: 11,
-    DataType.FLOAT: 12,
-    DataType.DOUBLE: 13,
-    DataType.BOOLEAN: 14,
-    DataType.STRING: 15,
+    DataType.INT32: "int_value",
+    DataType.UINT32: "int_value",
+    DataType.INT64: "long_value",
+    DataType.UINT64: "long_value",
+    DataType.DATETIME: "long_value",
+    DataType.FLOAT: "float_value",
+    DataType.DOUBLE: "double_value",
+    DataType.BOOLEAN: "boolean_value",
+    DataType.STRING: "string_value",
 }
-_PROPERTY_SHIFT = 7
 _LIMITS = {
     DataType.INT32: (-(2**31), 2**31 - 1),
     DataType.UINT32: (0, _U32),
     DataType.INT64: (-(2**63), 2**63 - 1),
     DataType.UINT64: (0, _U64),
     DataType.DATETIME: (0, _U64),
+    DataType.FLOAT: (-_LARGEST_FLOAT, _LARGEST_FLOAT),
+    DataType.DOUBLE: (-sys.float_info.max, sys.float_info.max),
 }
 
 
@@ -109,105 +114,58 @@ def encode(payload: Payload, *, datatypes: bool = True) -> bytes:
         datatypes: whether the datatypes are written: births need them, data messages do without.
 
     Raises:
-        PayloadError: a value does not fit its datatype.
+        PayloadError: a value does not fit its datatype, or a number its field.
     """
-    parts = []
-    if payload.timestamp_ms is not None:
-        parts.append(_number(1, payload.timestamp_ms))
-    parts += [_bytes(2, _metric(metric, datatypes=datatypes)) for metric in payload.metrics]
-    if payload.seq is not None:
-        parts.append(_number(3, payload.seq))
-    return b"".join(parts)
+    try:
+        metrics = [_message(metric, datatypes=datatypes) for metric in payload.metrics]
+        message = messages.Payload(timestamp=payload.timestamp_ms, metrics=metrics, seq=payload.seq)
+    except PayloadError:
+        raise
+    except ValueError as error:
+        raise PayloadError(f"this cannot be written as a Sparkplug payload: {error}") from error
+    return message.SerializeToString()
 
 
-def _metric(metric: Metric, *, datatypes: bool) -> bytes:
-    if metric.datatype is None:
+def _message(metric: Metric, *, datatypes: bool) -> messages.Metric:
+    datatype, value = metric.datatype, metric.value
+    if datatype is None:
         raise PayloadError(f"metric {metric.name!r} has no datatype; say how its value is written")
-    parts = []
-    if metric.name is not None:
-        parts.append(_text(1, metric.name))
-    if metric.alias is not None:
-        parts.append(_number(2, metric.alias))
-    if metric.timestamp_ms is not None:
-        parts.append(_number(3, metric.timestamp_ms))
-    if datatypes:
-        parts.append(_number(4, metric.datatype))
-    if metric.historical:
-        parts.append(_number(5, 1))
-    if metric.value is None:
-        parts.append(_number(7, 1))
-    if metric.properties:
-        parts.append(_bytes(9, _properties(metric.properties)))
-    if metric.value is not None:
-        parts.append(_value(_FIELD[metric.datatype], metric.datatype, metric.value, metric.name))
-    return b"".join(parts)
+    message = messages.Metric(
+        name=metric.name,
+        alias=metric.alias,
+        timestamp=metric.timestamp_ms,
+        datatype=datatype if datatypes else None,
+        is_historical=metric.historical or None,
+        is_null=value is None or None,
+        properties=_property_set(metric.properties) if metric.properties else None,
+    )
+    if value is not None:
+        if not _fits(datatype, value=value):
+            raise PayloadError(
+                f"{value!r} of metric {metric.name!r} is no {datatype.name}; correct the metric's datatype"
+            )
+        if isinstance(value, int) and value < 0 and datatype in {DataType.INT32, DataType.INT64}:
+            # In two's complement, as the reference implementation sends them.
+            value &= _U32 if datatype is DataType.INT32 else _U64
+        setattr(message, _FIELD[datatype], value)
+    return message
 
 
-def _properties(properties: Mapping[str, str]) -> bytes:
-    keys = [_text(1, key) for key in properties]
-    shape = _FIELD[DataType.STRING] - _PROPERTY_SHIFT
-    values = [_bytes(2, _number(1, DataType.STRING) + _text(shape, value)) for value in properties.values()]
-    return b"".join([*keys, *values])
+def _property_set(properties: Mapping[str, str]) -> messages.PropertySet:
+    values = [messages.PropertyValue(type=DataType.STRING, string_value=text) for text in properties.values()]
+    return messages.PropertySet(keys=properties, values=values)
 
 
-def _value(at: int, datatype: DataType, value: Value, name: str | None) -> bytes:
-    wrong = PayloadError(f"{value!r} of metric {name!r} is no {datatype.name}; correct the metric's datatype")
-    if datatype is DataType.STRING:
-        if not isinstance(value, str):
-            raise wrong
-        return _text(at, value)
-    if value is None or isinstance(value, str) or isinstance(value, bool) != (datatype is DataType.BOOLEAN):
-        raise wrong
-    if datatype is DataType.BOOLEAN:
-        return _number(at, int(value))
-    if datatype in {DataType.FLOAT, DataType.DOUBLE}:
-        wide = datatype is DataType.DOUBLE
-        try:
-            packed = struct.pack("<d" if wide else "<f", value)
-        except OverflowError:
-            raise wrong from None
-        return _key(at, _FIXED64 if wide else _FIXED32) + packed
+def _fits(datatype: DataType, *, value: bool | float | str) -> bool:
+    if isinstance(value, str) or datatype is DataType.STRING:
+        return isinstance(value, str) and datatype is DataType.STRING
+    if isinstance(value, bool) or datatype is DataType.BOOLEAN:
+        return isinstance(value, bool) and datatype is DataType.BOOLEAN
+    takes_floats = datatype in {DataType.FLOAT, DataType.DOUBLE}
+    if isinstance(value, float) and not (takes_floats and math.isfinite(value)):
+        return takes_floats
     low, high = _LIMITS[datatype]
-    if not isinstance(value, int) or not low <= value <= high:
-        raise wrong
-    # Negative numbers go in two's complement of 32 or 64 bits, as the reference implementation sends them.
-    return _number(at, value & (_U32 if datatype in {DataType.INT32, DataType.UINT32} else _U64))
-
-
-def _varint(number: int) -> bytes:
-    written = bytearray()
-    while number > 0x7F:
-        written.append(number & 0x7F | 0x80)
-        number >>= 7
-    written.append(number)
-    return bytes(written)
-
-
-def _key(at: int, kind: int) -> bytes:
-    return _varint(at << 3 | kind)
-
-
-def _number(at: int, number: int) -> bytes:
-    if not 0 <= number <= _U64:
-        raise PayloadError(f"{number} cannot stand in a payload; it takes 0 to {_U64}")
-    return _key(at, _VARINT) + _varint(number)
-
-
-def _bytes(at: int, content: bytes) -> bytes:
-    return _key(at, _LENGTH) + _varint(len(content)) + content
-
-
-def _text(at: int, text: str) -> bytes:
-    return _bytes(at, text.encode())
-
-
-class _Field(NamedTuple):
-    """A field as read: its number and wire type, and what stands in it."""
-
-    at: int
-    kind: int
-    number: int
-    content: bytes
+    return low <= value <= high
 
 
 def decode(raw: bytes) -> Payload:
@@ -218,129 +176,55 @@ def decode(raw: bytes) -> Payload:
     """
     if len(raw) > MOST_BYTES:
         raise PayloadError(f"payload of {len(raw)} bytes; the longest that is read has {MOST_BYTES}")
-    timestamp_ms = seq = None
-    metrics = []
-    for found in _fields(raw):
-        match found.at, found.kind:
-            case 1, 0:
-                timestamp_ms = found.number
-            case 2, 2:
-                metrics.append(_read_metric(found.content))
-            case 3, 0:
-                seq = found.number
-    return Payload(timestamp_ms, seq, tuple(metrics))
-
-
-def _read_metric(raw: bytes) -> Metric:
-    fields = {found.at: found for found in _fields(raw)}
-    datatype = _datatype(fields.get(4))
-    properties = fields.get(9)
-    return Metric(
-        name=_read_text(fields.get(1)),
-        alias=_read_number(fields.get(2)),
-        timestamp_ms=_read_number(fields.get(3)),
-        datatype=datatype,
-        value=None if _read_number(fields.get(7)) else _read_value(fields.values(), datatype),
-        historical=bool(_read_number(fields.get(5))),
-        properties={} if properties is None else _read_properties(properties.content),
+    try:
+        message = messages.Payload.FromString(raw)
+    except DecodeError as error:
+        raise PayloadError(f"{len(raw)} bytes that are no Sparkplug B payload: {error}") from error
+    return Payload(
+        message.timestamp if message.HasField("timestamp") else None,
+        message.seq if message.HasField("seq") else None,
+        tuple(map(_metric, message.metrics)),
     )
 
 
-def _datatype(found: _Field | None) -> DataType | None:
-    number = _read_number(found)
-    if number is None:
-        return None
+def _metric(message: messages.Metric) -> Metric:
+    datatype = _datatype(message.datatype) if message.HasField("datatype") else None
+    return Metric(
+        name=message.name if message.HasField("name") else None,
+        alias=message.alias if message.HasField("alias") else None,
+        timestamp_ms=message.timestamp if message.HasField("timestamp") else None,
+        datatype=datatype,
+        value=None if message.is_null else _signed(_value(message), datatype),
+        historical=message.is_historical,
+        properties=_properties(message.properties),
+    )
+
+
+def _datatype(number: int) -> DataType:
     try:
         return DataType(number)
     except ValueError:
-        raise PayloadError(f"datatype {number} is not known here; send one of {_names()}") from None
+        known = ", ".join(f"{one.value} ({one.name})" for one in DataType)
+        raise PayloadError(f"datatype {number} is not known here; send one of {known}") from None
 
 
-def _names() -> str:
-    return ", ".join(f"{one.value} ({one.name})" for one in DataType)
+def _value(message: messages.Metric | messages.PropertyValue) -> Value:
+    name = message.WhichOneof("value")
+    value: Value = None if name is None else getattr(message, name)
+    return value
 
 
-def _read_value(fields: Iterable[_Field], datatype: DataType | None, shift: int = 0) -> Value:
-    """The value in the fields of a metric or, seven lower, of a property."""
-    for found in fields:
-        match found.at + shift, found.kind:
-            case 10 | 11, 0:
-                return _signed(found.number, datatype)
-            case 12, 5:
-                return float(struct.unpack("<f", found.content)[0])
-            case 13, 1:
-                return float(struct.unpack("<d", found.content)[0])
-            case 14, 0:
-                return found.number != 0
-            case 15, 2:
-                return _utf8(found.content)
-    return None
+def _signed(value: Value, datatype: DataType | None) -> Value:
+    """An integer with its sign: the fields are unsigned, the datatype may say otherwise."""
+    if datatype is DataType.INT32 and isinstance(value, int):
+        value &= _U32
+        return value - 2**32 if value >= 2**31 else value
+    if datatype is DataType.INT64 and isinstance(value, int):
+        return value - 2**64 if value >= 2**63 else value
+    return value
 
 
-def _signed(number: int, datatype: DataType | None) -> int:
-    if datatype is DataType.INT32:
-        number &= _U32
-        return number - 2**32 if number >= 2**31 else number
-    if datatype is DataType.INT64:
-        return number - 2**64 if number >= 2**63 else number
-    return number
-
-
-def _read_properties(raw: bytes) -> dict[str, str]:
-    keys, values = [], []
-    for found in _fields(raw):
-        if found.at == 1 and found.kind == _LENGTH:
-            keys.append(_utf8(found.content))
-        elif found.at == 2 and found.kind == _LENGTH:
-            values.append(_read_value(_fields(found.content), None, _PROPERTY_SHIFT))
-    if len(keys) != len(values):
-        raise PayloadError(f"a property set has {len(keys)} keys for {len(values)} values")
-    return {key: str(value) for key, value in zip(keys, values, strict=True)}
-
-
-def _read_number(found: _Field | None) -> int | None:
-    return found.number if found is not None and found.kind == _VARINT else None
-
-
-def _read_text(found: _Field | None) -> str | None:
-    return _utf8(found.content) if found is not None and found.kind == _LENGTH else None
-
-
-def _utf8(content: bytes) -> str:
-    try:
-        return content.decode()
-    except UnicodeDecodeError:
-        raise PayloadError(f"text in a payload is not UTF-8: {content[:20]!r}") from None
-
-
-def _fields(raw: bytes) -> Iterator[_Field]:
-    at = 0
-    while at < len(raw):
-        key, at = _read_varint(raw, at)
-        number, content = 0, b""
-        kind = key & 7
-        if kind == _VARINT:
-            number, at = _read_varint(raw, at)
-        elif kind in {_FIXED64, _FIXED32, _LENGTH}:
-            length, at = _read_varint(raw, at) if kind == _LENGTH else (8 if kind == _FIXED64 else 4, at)
-            content = raw[at : at + length]
-            if len(content) < length:
-                raise PayloadError(f"a field of {length} bytes ends after {len(content)}: the payload is cut")
-            at += length
-        else:
-            raise PayloadError(f"byte {at}: {kind} is no wire type that is read here")
-        yield _Field(key >> 3, kind, number, content)
-
-
-def _read_varint(raw: bytes, at: int) -> tuple[int, int]:
-    number = shift = 0
-    while at < len(raw):
-        byte = raw[at]
-        number |= (byte & 0x7F) << shift
-        at += 1
-        if byte < 0x80:
-            return number & _U64, at
-        shift += 7
-        if shift >= 70:
-            raise PayloadError(f"byte {at}: a number of more than 64 bits")
-    raise PayloadError("a number is cut: the payload ends in the middle of it")
+def _properties(message: messages.PropertySet) -> dict[str, str]:
+    if len(message.keys) != len(message.values):
+        raise PayloadError(f"a property set has {len(message.keys)} keys for {len(message.values)} values")
+    return {key: str(_value(value)) for key, value in zip(message.keys, message.values, strict=True)}
