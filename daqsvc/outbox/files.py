@@ -131,6 +131,18 @@ def replace_durably(path: Path, content: bytes) -> None:
     sync_directory(path.parent)
 
 
+def append_durably(path: Path, content: bytes) -> None:
+    """Add to the end of a file that is there; after a power cut some of it may be missing.
+
+    Raises:
+        OSError: it is not there, or was not written whole.
+    """
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW), "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def overwrite_durably(descriptor: int, content: bytes) -> None:
     """Write over the beginning of a file, in place: that takes no room on a full disk."""
     written = os.pwrite(descriptor, content, 0)
