@@ -11,8 +11,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from drivers.fields import Field
-    from drivers.frames import Payloads
+    from drivers.fields import Field, Payloads
 
 
 class FieldGroup:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
+
+    Payloads: TypeAlias = NDArray[np.uint8]
+    """Frames of one length: ``[n, length]``."""
 
 Kind = Literal["signed", "unsigned", "float"]
 ByteOrder = Literal["little", "big"]

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    Payloads: TypeAlias = NDArray[np.uint8]
+    from drivers.fields import Payloads
+
     Floats: TypeAlias = NDArray[np.float64]
     InUnits: TypeAlias = Callable[[NDArray[Any], Floats, Floats], NDArray[np.float32]]
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
     from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
-    from sim_hw.sim_command_nodes import SimNode
+    from sim_hw.sim_command_order import SimNode
     from sim_hw.sim_command_signals import Signals
 
 EXIT_FAILED = 1
@@ -98,7 +98,7 @@ class SimCommand:
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
-        from sim_hw.sim_command_nodes import NodeError  # noqa: PLC0415
+        from sim_hw.sim_command_order import NodeError  # noqa: PLC0415
         from sim_hw.sim_command_signals import SignalError  # noqa: PLC0415
 
         try:
@@ -139,7 +139,8 @@ def _misuse(arguments: argparse.Namespace) -> str | None:
 async def _simulate(arguments: argparse.Namespace) -> int:
     from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
     from sim_hw.nodes.pacing import RealTimePacer  # noqa: PLC0415
-    from sim_hw.sim_command_nodes import NodeOrder, node_for  # noqa: PLC0415
+    from sim_hw.sim_command_nodes import node_for  # noqa: PLC0415
+    from sim_hw.sim_command_order import NodeOrder  # noqa: PLC0415
     from sim_hw.sim_command_signals import SignalError, stream_samples  # noqa: PLC0415
 
     stop = asyncio.Event()

@@ -14,12 +14,12 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.modbus_node import Answer, ModbusNode, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
-from sim_hw.sim_command_nodes import NodeError
+from sim_hw.sim_command_order import NodeError
 
 if TYPE_CHECKING:
     from sim_hw.node_faults import Window
     from sim_hw.nodes.pacing import Pacer
-    from sim_hw.sim_command_nodes import NodeOrder
+    from sim_hw.sim_command_order import NodeOrder
 
 LOOK_S = 0.01
 LINGER_S = 2.0
@@ -134,12 +134,12 @@ class ModbusNodes:
         return cls(address, server, nodes, replies)
 
     async def ready(self) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.ready`: the first request tells."""
+        """See `sim_hw.sim_command_order.SimNode.ready`: the first request tells."""
         while not self._replies.injected["requests"]:  # noqa: ASYNC110 - counted where nothing waits
             await asyncio.sleep(LOOK_S)
 
     async def play(self, pacer: Pacer) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.play`; a client has time to read the last sample."""
+        """See `sim_hw.sim_command_order.SimNode.play`; a client has time to read the last sample."""
         self._replies.start()
         async with asyncio.TaskGroup() as group:
             for node in self._nodes.values():
@@ -147,7 +147,7 @@ class ModbusNodes:
         await asyncio.sleep(LINGER_S)
 
     def figures(self) -> dict[str, dict[str, Any]]:
-        """See `sim_hw.sim_command_nodes.SimNode.figures`; faults are those of the whole line."""
+        """See `sim_hw.sim_command_order.SimNode.figures`; faults are those of the whole line."""
         injected = dict(self._replies.injected)
         return {
             name: {"samples_sent": node.samples_sent, "injected": injected}
@@ -155,7 +155,7 @@ class ModbusNodes:
         }
 
     async def close(self) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.close`."""
+        """See `sim_hw.sim_command_order.SimNode.close`."""
         self._server.stop()
 
 

@@ -11,11 +11,11 @@ from drivers.base import StreamSpec
 from drivers.serial_port import framing_of
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
-from sim_hw.sim_command_nodes import NodeError
+from sim_hw.sim_command_order import NodeError
 
 if TYPE_CHECKING:
     from sim_hw.nodes.pacing import Pacer
-    from sim_hw.sim_command_nodes import NodeOrder
+    from sim_hw.sim_command_order import NodeOrder
 
 LOOK_S = 0.01
 LINGER_S = 1.0
@@ -69,21 +69,21 @@ class SerialNodes:
         return cls(cable, nodes)
 
     async def ready(self) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.ready`: whether the port is open can be told."""
+        """See `sim_hw.sim_command_order.SimNode.ready`: whether the port is open can be told."""
         while not self._cable.listening:  # noqa: ASYNC110 - a pseudo-terminal does not tell
             await asyncio.sleep(LOOK_S)
 
     async def play(self, pacer: Pacer) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.play`; a client has time to read the last frame."""
+        """See `sim_hw.sim_command_order.SimNode.play`; a client has time to read the last frame."""
         async with asyncio.TaskGroup() as group:
             for node in self._nodes.values():
                 group.create_task(node.play(pacer))
         await asyncio.sleep(LINGER_S)
 
     def figures(self) -> dict[str, dict[str, Any]]:
-        """See `sim_hw.sim_command_nodes.SimNode.figures`."""
+        """See `sim_hw.sim_command_order.SimNode.figures`."""
         return {name: node.figures() for name, node in self._nodes.items()}
 
     async def close(self) -> None:
-        """See `sim_hw.sim_command_nodes.SimNode.close`."""
+        """See `sim_hw.sim_command_order.SimNode.close`."""
         self._cable.unplug()

@@ -6,7 +6,7 @@ import bisect
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.analysis.result import Instant, told, words
+from daqsvc.analysis.result import Instant, RotorAlarm
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -14,54 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.synchronous.identify import Identification
-    from daqsvc.rotor.synchronous.signatures import RotorFault
     from daqsvc.rotor.synchronous.watch import WatchReport
-
-
-@dataclass(frozen=True, slots=True)
-class RotorAlarm:
-    """A departure, and what came of it until the next one or until the machine was healthy again.
-
-    Attributes:
-        onset: estimated begin of the change.
-        departure: where the alarm was raised.
-        declaration: where its last group was first named; None if it never was.
-        verdict: the most likely fault by its last look; None if it was over before there was one.
-        group: all that could not be told apart, the most likely first.
-        returned: where the machine was found healthy again; None if it was not.
-    """
-
-    onset: Instant
-    departure: Instant
-    declaration: Instant | None
-    verdict: RotorFault | None
-    group: tuple[RotorFault, ...]
-    returned: Instant | None
-
-    def as_json(self) -> dict[str, Any]:
-        """For the output."""
-        instants = {
-            "departure": self.departure,
-            "onset": self.onset,
-            "declaration": self.declaration,
-            "returned": self.returned,
-        }
-        found: dict[str, Any] = {
-            name: None if instant is None else instant.as_json() for name, instant in instants.items()
-        }
-        return found | {"verdict": self.verdict, "group": list(self.group)}
-
-    def describe(self) -> str:
-        """One line for a person."""
-        what = " or ".join(words(name) for name in self.group) or "a change that got no look"
-        named = (
-            "not named" if self.declaration is None else f"named at revolution {self.declaration.revolution}"
-        )
-        after = "" if self.returned is None else f"; healthy again at {told(self.returned)}"
-        return (
-            f"alarm at {told(self.departure)}: {what}, changed at revolution {self.onset.revolution}, "
-            f"{named}{after}"
-        )
 
 
 @dataclass(frozen=True, slots=True)

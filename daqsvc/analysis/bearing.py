@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.bearing_setup import BearingSetup, HealthyRun
+    from daqsvc.analysis.bearing_inputs import HealthyRun
+    from daqsvc.analysis.bearing_setup import BearingSetup
     from daqsvc.bearing.identify_baseline import BearingBaseline
     from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
+from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import PLACES, RaceInputError
 from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
+from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.analysis.bearing_setup import BearingSetup
+    from daqsvc.bearing.identify_baseline import BearingBaseline
     from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
     from daqsvc.recording.recording import Recording
 
@@ -99,6 +103,54 @@ def against_healthy_run(recording: Recording, setup: BearingSetup) -> tuple[str,
                 or f"{name}: its harmonics do not confirm {setup.speed_rpm:g} rpm at {recording.rate_hz:g} Hz"
             )
     return damage, doubt
+
+
+@dataclass(slots=True)
+class HealthyRun:
+    """A recording of the healthy machine, learnt anew for each sampling rate that is compared with it.
+
+    Attributes:
+        setup: what is known.
+        recording: the healthy machine's.
+    """
+
+    setup: BearingSetup
+    recording: Recording
+    _learnt: dict[float, BearingBaseline] = field(default_factory=dict)
+    _against: tuple[str, str] | None = None
+
+    @property
+    def against(self) -> tuple[str, str]:
+        """What speaks against it as a healthy run, see `against_healthy_run`."""
+        if self._against is None:
+            self._against = against_healthy_run(self.recording, self.setup)
+        return self._against
+
+    def at(self, rate_hz: float) -> BearingBaseline:
+        """The healthy machine at a sampling rate.
+
+        Raises:
+            NotIdentifiableError: it cannot be learnt at that rate.
+        """
+        if rate_hz not in self._learnt:
+            self._learnt[rate_hz] = self.setup.learn(self.recording, rate_hz)
+        return self._learnt[rate_hz]
+
+
+def load_healthy(
+    setup: BearingSetup, path: str, map_to: Mapping[str, str], rate_hz: float | None
+) -> HealthyRun:
+    """The healthy machine at a path; arguments as of `BearingSetup.load`.
+
+    Raises:
+        ValueError: it cannot be read, or cannot be the healthy machine's.
+    """
+    try:
+        healthy = HealthyRun(setup, setup.load(path, map_to, rate_hz))
+        healthy.at(healthy.recording.rate_hz)
+    except (RecordingError, NotIdentifiableError) as error:
+        raise ValueError(f"healthy run {path}: {error}") from error
+    return healthy
 
 
 def _judged(recording: Recording, name: str, setup: BearingSetup, speed_rpm: float) -> RaceVerdict | str:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.analysis.bearing_inputs import against_healthy_run
-from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_baseline import BearingBaseline, learn_baseline, resampled
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.race.rules import RaceRules
@@ -136,51 +134,3 @@ def matching(path: str, variable: str, there: Iterable[str]) -> str:
             f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; name one of them"
         )
     return matches[0]
-
-
-@dataclass(slots=True)
-class HealthyRun:
-    """A recording of the healthy machine, learnt anew for each sampling rate that is compared with it.
-
-    Attributes:
-        setup: what is known.
-        recording: the healthy machine's.
-    """
-
-    setup: BearingSetup
-    recording: Recording
-    _learnt: dict[float, BearingBaseline] = field(default_factory=dict)
-    _against: tuple[str, str] | None = None
-
-    @property
-    def against(self) -> tuple[str, str]:
-        """What speaks against it as a healthy run, see `against_healthy_run`."""
-        if self._against is None:
-            self._against = against_healthy_run(self.recording, self.setup)
-        return self._against
-
-    def at(self, rate_hz: float) -> BearingBaseline:
-        """The healthy machine at a sampling rate.
-
-        Raises:
-            NotIdentifiableError: it cannot be learnt at that rate.
-        """
-        if rate_hz not in self._learnt:
-            self._learnt[rate_hz] = self.setup.learn(self.recording, rate_hz)
-        return self._learnt[rate_hz]
-
-
-def load_healthy(
-    setup: BearingSetup, path: str, map_to: Mapping[str, str], rate_hz: float | None
-) -> HealthyRun:
-    """The healthy machine at a path; arguments as of `BearingSetup.load`.
-
-    Raises:
-        ValueError: it cannot be read, or cannot be the healthy machine's.
-    """
-    try:
-        healthy = HealthyRun(setup, setup.load(path, map_to, rate_hz))
-        healthy.at(healthy.recording.rate_hz)
-    except (RecordingError, NotIdentifiableError) as error:
-        raise ValueError(f"healthy run {path}: {error}") from error
-    return healthy

@@ -91,7 +91,8 @@ def bearing_analyst(arguments: argparse.Namespace) -> Analyst:
         ValueError: the bearing is not known, or the healthy run cannot be used.
     """
     from daqsvc.analysis.bearing import BearingAnalyst  # noqa: PLC0415 - brings numpy and scipy
-    from daqsvc.analysis.bearing_setup import BearingSetup, load_healthy  # noqa: PLC0415
+    from daqsvc.analysis.bearing_inputs import load_healthy  # noqa: PLC0415
+    from daqsvc.analysis.bearing_setup import BearingSetup  # noqa: PLC0415
     from daqsvc.bearing.identify_change import ChangeRules  # noqa: PLC0415
 
     setup = BearingSetup(

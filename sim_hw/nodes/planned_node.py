@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sim_hw.link_faults import FaultCounts
-    from sim_hw.node_faults_plan import NodePlan
+    from sim_hw.node_faults import NodePlan
     from sim_hw.nodes.pacing import Pacer
 
 RETRY_S = 0.002

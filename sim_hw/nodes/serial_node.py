@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drivers.serial_framing import Framing
     from drivers.serial_lines import LineLayout
     from sim_hw.link_faults import LinkFaults
-    from sim_hw.node_faults_plan import NodePlan
+    from sim_hw.node_faults import NodePlan
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 

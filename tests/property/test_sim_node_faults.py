@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from daqsvc.acquisition.assembler import StreamAssembler
 from drivers.frames import FrameLayout
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
-from sim_hw.node_faults import EVER, Babble, Delay, Drift, NodeFaults, Window
-from sim_hw.node_faults_plan import BABBLER, Mark
+from sim_hw.node_faults import BABBLER, EVER, Babble, Delay, Drift, Mark, NodeFaults, Window
 
 RATE_HZ = 1000.0
 PER_FRAME = 5
