@@ -14,6 +14,7 @@ from daqsvc.settings.bus_checks import DRIVERS
 from daqsvc.settings.buses import CanBus
 from daqsvc.settings.modbus import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.models import DbcLayout, OtherBus, PlainLayout
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.serial import LineLayout as LineSettings
 from daqsvc.settings.serial import SerialLayout
@@ -51,10 +52,6 @@ _NS_PER_MS = 1_000_000
 _POLL_MS = 100.0
 _LOOKS_PER_FILL = 4
 """How often a store of samples in a device is looked at while it fills once."""
-
-
-class AssemblyError(Exception):
-    """A machine file that is sound by itself asks for something that is not there."""
 
 
 def stream_layout(

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
-from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.expected import handling_conditions
-from daqsvc.assembly_streams import patience
-from daqsvc.publish.settings import STALE_S, CommandSettings, HomeAssistantSettings, MqttSettings, Reading
+from daqsvc.detectors.make import plugins
+from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings, MqttSettings
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
-from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.self_check import conditions
 from daqsvc.settings.alarms import DiagnosisAlarm
 from daqsvc.settings.broker_url import host_of, is_tls, port_of
-from daqsvc.settings.models import (
-    BEARING,
-    ROTOR_BANK,
-    ROTOR_SYNCHRONOUS,
-    Keyphasor,
-    ProximityProbe,
-    TrendValue,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from daqsvc.diagnosis.reading import Reading
     from daqsvc.settings.alarms import Alarm
-    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.models import MachineFile
 
 
 def mqtt_settings(machine: MachineFile) -> MqttSettings | None:
@@ -86,7 +76,7 @@ def sparkplug_settings(machine: MachineFile, store: Path) -> SparkplugSettings |
         memory=store / "sparkplug.json",
         primary_host=given.primary_host,
         alarms=(*(alarm.name for alarm in machine.alarms), *_services(machine, mqtt_settings(machine))),
-        readings=tuple(_readings(machine)),
+        readings=_readings(machine),
     )
 
 
@@ -113,13 +103,11 @@ def _home_assistant(machine: MachineFile, mqtt: MqttSettings) -> HomeAssistantSe
         description=machine.machine.description,
         alarms=tuple(alarm.name for alarm in machine.alarms),
         services=tuple(_services(machine, mqtt)),
-        readings=tuple(_readings(machine)),
+        readings=_readings(machine),
         prefix=given.prefix,
         enabled=given.enabled,
         rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
-        findings=tuple(
-            name for name in machine.detectors if name in {ROTOR_BANK, ROTOR_SYNCHRONOUS, BEARING}
-        ),
+        findings=machine.detectors,
         buttons=()
         if mqtt.commands is None
         else tuple(verb for verb in (Verb.ACKNOWLEDGE, Verb.RESET) if verb in mqtt.commands.allow),
@@ -138,52 +126,13 @@ def _rests_on(alarm: Alarm) -> Iterator[str]:
 
 def _services(machine: MachineFile, mqtt: MqttSettings | None) -> Iterator[str]:
     """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
-    if machine.pipeline.levels is not None:
-        yield from (f"sensor-ok/{sensor.name}" for sensor in _measured(machine))
-    yield from (f"detector-ok/{detector}" for detector in machine.detectors)
+    for plugin, given in plugins(machine):
+        yield from plugin.quality_alarms(machine, given)
     handling = machine.alarm_handling
     yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
     yield from conditions(mqtt, {name: bus.driver for name, bus in machine.buses.items()})
 
 
-def _readings(machine: MachineFile) -> Iterator[Reading]:
+def _readings(machine: MachineFile) -> tuple[Reading, ...]:
     """What is shown by itself: vibration levels of every sensor, speed, 1X, probabilities of the modes."""
-    pipeline = machine.pipeline
-    if pipeline.levels is not None:
-        for sensor in _measured(machine):
-            rate_hz = machine.streams[sensor.stream].rate_hz
-            silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
-            yield from _levels(sensor, max(STALE_S, math.ceil(silent_s)))
-    if pipeline.rotor_bank is not None:
-        yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
-        for mode in pipeline.rotor_bank.modes:
-            yield Reading(ROTOR_BANK, "probabilities", mode.name)
-    if pipeline.rotor_synchronous is not None:
-        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "speed", "rpm")
-        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.amplitude", "um")
-        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.phase", "deg")
-        for fault in get_args(RotorFault):
-            yield Reading(ROTOR_SYNCHRONOUS, "probabilities", fault)
-    if pipeline.bearing is not None:
-        from daqsvc.diagnosis.bearing_finding import WORDS  # noqa: PLC0415 - brings SciPy's statistics
-
-        for word in WORDS:
-            yield Reading(BEARING, "probabilities", word)
-
-
-def _measured(machine: MachineFile) -> Iterator[Sensor]:
-    return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
-
-
-def _levels(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
-    detector = f"levels/{sensor.name}"
-    if isinstance(sensor, TrendValue):
-        yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
-        return
-    yield Reading(detector, "statistics", "rms", sensor.unit, stale_s)
-    yield Reading(detector, "statistics", "peak", sensor.unit, stale_s)
-    if isinstance(sensor, ProximityProbe):
-        if sensor.sensitivity_mv_per_unit is not None:
-            yield Reading(detector, "statistics", "gap_voltage", "V", stale_s)
-    else:
-        yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)
+    return tuple(reading for plugin, given in plugins(machine) for reading in plugin.readings(machine, given))

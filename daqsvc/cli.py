@@ -73,11 +73,12 @@ class CheckCommand:
         if machine is None:
             return EXIT_BAD_FILE
         kernel_cache.prepare()
-        from daqsvc.assembly import AssemblyError, check_calibrations  # noqa: PLC0415
+        from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
         try:
-            check_calibrations(machine)
+            check_files(machine)
         except AssemblyError as error:
             print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
             return EXIT_BAD_FILE

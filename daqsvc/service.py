@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc import assembly, assembly_drivers
+from daqsvc import assembly_drivers
 from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -21,9 +21,10 @@ from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
 from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.assembly_store import outbox_limits
-from daqsvc.assembly_streams import at_once, patience
 from daqsvc.control import ControlError, ControlServer
+from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.snapshots import at_once, patience
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
 from daqsvc.self_check import BusHealth
 from daqsvc.settings.alignment import Grid
@@ -131,17 +132,17 @@ class Service:
         self.supervisor = Supervisor()
         self._on_ending = on_ending
         self._identity = identity(machine)
-        detectors = assembly.detectors(machine, store)
+        watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
         self._standings = dict.fromkeys(machine.streams, Standing())
-        self.rings = {grid.name: _ring(machine, grid, detectors) for grid in grids}
+        self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, self.clock, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver, self._stand)
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
         self.pipeline = Pipeline(
             self.rings,
-            detectors,
+            watching,
             self._report,
             self.clock,
             settling_ns=settling_ns,

@@ -93,9 +93,9 @@ class SimCommand:
             from sim_hw.bus_socket import run_hub  # noqa: PLC0415
 
             return run_hub(str(arguments.bus))
-        from daqsvc.assembly_drivers import AssemblyError  # noqa: PLC0415
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
         from sim_hw.sim_command_order import NodeError  # noqa: PLC0415

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from daqsvc.diagnosis.rotor_modes import RotorMode, bank_modes
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
 from daqsvc.rotor import kernels
 from daqsvc.rotor.discretise import discretise
 from daqsvc.rotor.model import RotorParameters

@@ -12,10 +12,10 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
+from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.mqtt import MqttSettings
 from daqsvc.publish.payloads import alarm_payload
-from daqsvc.publish.settings import Reading
 from daqsvc.publish.sparkplug.codec import DataType, Metric, Payload, encode
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings

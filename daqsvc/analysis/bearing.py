@@ -25,8 +25,8 @@ from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import compare_residual
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
-from daqsvc.diagnosis.bearing_finding import find
-from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
+from daqsvc.detectors.bearing.finding import find
+from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:

@@ -9,11 +9,12 @@ import numpy as np
 from daqsvc.analysis.bearing_machine import present
 from daqsvc.analysis.machine import MachineAnalyst
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.assembly_bearing import SAME_RATE, orders_of, pair_models
 from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
-from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
+from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
+from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
+from daqsvc.detectors.bearing.settings import Bearing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -57,7 +58,7 @@ def learn_by_machine(
     """
     analyst = MachineAnalyst(machine=str(machine.path), channels=channels, rate_hz=rate_hz)
     analyst.check_map(machine)
-    given = machine.pipeline.bearing
+    given = machine.pipeline.table(Bearing)
     assert given is not None  # noqa: S101 - the command has asked for it
     recording = analyst.load(machine, path, given.sensors)
     watched = present(given, recording.names)

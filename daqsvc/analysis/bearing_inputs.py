@@ -12,7 +12,7 @@ from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import PLACES, RaceInputError
-from daqsvc.diagnosis.bearing_quality import ClippedError, refuse_clipped
+from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:

@@ -13,11 +13,12 @@ from daqsvc.analysis.bearing_result import BearingAnalysis
 from daqsvc.analysis.bearing_setup import BearingSetup
 from daqsvc.analysis.quality import DataQuality
 from daqsvc.analysis.statements import Statements
-from daqsvc.assembly_bearing import bearing_detector, orders_of
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import load_bearing_baseline
-from daqsvc.diagnosis.bearing_finding import BearingFinding
-from daqsvc.diagnosis.bearing_standing import UNDETERMINED
+from daqsvc.detectors.bearing.build import bearing_detector, orders_of
+from daqsvc.detectors.bearing.finding import BearingFinding
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.detectors.bearing.standing import UNDETERMINED
 from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:
@@ -28,12 +29,12 @@ if TYPE_CHECKING:
 
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.bearing.race.verdict import RaceWord
-    from daqsvc.diagnosis.bearing import BearingDetector
-    from daqsvc.diagnosis.bearing_look import Look
-    from daqsvc.diagnosis.bearing_standing import Standing
+    from daqsvc.detectors.bearing.detector import BearingDetector
+    from daqsvc.detectors.bearing.look import Look
+    from daqsvc.detectors.bearing.standing import Standing
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.recording.recording import Recording
-    from daqsvc.settings.models import Bearing, MachineFile
+    from daqsvc.settings.models import MachineFile
 
     Floats = NDArray[np.float64]
 
@@ -81,7 +82,7 @@ def check_bearings(machine: MachineFile, calibration: Path | None) -> None:
     Raises:
         ValueError: they are not, or it cannot.
     """
-    given = machine.pipeline.bearing
+    given = machine.pipeline.table(Bearing)
     assert given is not None  # noqa: S101 - the caller has looked
     for index, bearing in enumerate(given.bearings):
         orders_of(bearing, index)
@@ -111,7 +112,9 @@ def analyse_machine_bearings(
     Raises:
         ValueError: a bearing is not known, or the calibration cannot be used.
     """
-    detector = bearing_detector(machine, None, calibration)
+    given = machine.pipeline.table(Bearing)
+    assert given is not None  # noqa: S101 - the caller has looked
+    detector = bearing_detector(machine, given, None, calibration)
     said: list[Diagnosis] = []
     looks: list[Look] = []
     for statements in _watch(detector, samples, recording.rate_hz, progress):
@@ -229,7 +232,7 @@ def bearings_not_judged(machine: MachineFile, recording: str, why: str) -> Beari
 
 def _setup(machine: MachineFile) -> BearingSetup:
     """What the machine file says, in the words of an analysis; its channels are the bearings."""
-    given = machine.pipeline.bearing
+    given = machine.pipeline.table(Bearing)
     assert given is not None  # noqa: S101 - the caller has looked
     unit = machine.sensor(given.bearings[0].sensor).unit
     return BearingSetup(

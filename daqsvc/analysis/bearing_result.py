@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.analysis.result import finite
 from daqsvc.bearing.race.verdict import PARTS
-from daqsvc.diagnosis.bearing_finding import WORDS, severity_of
+from daqsvc.detectors.bearing.finding import WORDS, severity_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daqsvc.analysis.quality import DataQuality
     from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
-    from daqsvc.diagnosis.bearing_finding import BearingFinding
+    from daqsvc.detectors.bearing.finding import BearingFinding
 
 _TOLD_LINES = 4
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.analysis.calibrating import CalibrationSetup
 from daqsvc.analysis.machine import MachineAnalyst
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,7 +33,7 @@ class MachineRecordings:
         rate_hz: float | None,
         unit: LengthUnit | None,
     ) -> None:
-        given = machine.pipeline.rotor_synchronous
+        given = machine.pipeline.table(RotorSynchronous)
         assert given is not None  # noqa: S101 - the command has asked for it
         self._given = given.model_copy(update={"calibration": None})
         pipeline = machine.pipeline.model_copy(update={"rotor_synchronous": self._given})

@@ -13,6 +13,9 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.assembly_alignment import alignment
 from daqsvc.assembly_drivers import frame_layout
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import CAN_LOGS
 from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE
@@ -390,6 +393,11 @@ def _group(machine: MachineFile, playing: _Playing) -> tuple[dict[str, list[tupl
 def _watched(machine: MachineFile) -> list[Sensor]:
     """The sensors of the detectors that need their samples at one rate."""
     pipeline = machine.pipeline
-    rotors = [one.sensors for one in (pipeline.rotor_synchronous, pipeline.rotor_bank) if one is not None]
-    bearings = [] if pipeline.bearing is None else [pipeline.bearing.sensors]
+    rotors = [
+        one.sensors
+        for one in (pipeline.table(RotorSynchronous), pipeline.table(RotorBank))
+        if one is not None
+    ]
+    given = pipeline.table(Bearing)
+    bearings = [] if given is None else [given.sensors]
     return [machine.sensor(name) for names in (*rotors, *bearings) for name in names]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from daqsvc import assembly
 from daqsvc.analysis.bank import bank_analysis
 from daqsvc.analysis.bearing_machine import (
     analyse_machine_bearings,
@@ -24,7 +23,11 @@ from daqsvc.analysis.result import RotorAnalysis
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
 from daqsvc.analysis.statements import Statements, by_name, listen, worst
-from daqsvc.assembly_rotor import healthy_rotor
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.detectors.make import detectors
+from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK, RotorBank
+from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.recording.channels import UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
@@ -76,14 +79,15 @@ class MachineAnalyst:
         """
         machine = load_machine_file(Path(self.machine))
         self.check_map(machine)
-        if machine.pipeline.rotor_synchronous is not None:
-            healthy_rotor(machine, machine.pipeline.rotor_synchronous, self.calibration)
-        elif self.calibration is not None and machine.pipeline.bearing is None:
+        synchronous = machine.pipeline.table(RotorSynchronous)
+        if synchronous is not None:
+            healthy_rotor(machine, synchronous, self.calibration)
+        elif self.calibration is not None and machine.pipeline.table(Bearing) is None:
             raise ValueError(
                 f"--calibration: {self.machine} has neither [pipeline.rotor_synchronous] nor "
                 "[pipeline.bearing] that would use it; add it"
             )
-        if machine.pipeline.bearing is not None:
+        if machine.pipeline.table(Bearing) is not None:
             check_bearings(machine, self._of_bearings(machine))
 
     def check_map(self, machine: MachineFile) -> None:
@@ -113,15 +117,16 @@ class MachineAnalyst:
             return _outcome(_not_judged(machine, recording, str(error)), ())
         machine = _as_recorded(machine, loaded)
         analysis: RotorAnalysis | BearingAnalysis | None = None
-        if machine.pipeline.rotor_synchronous is not None:
-            setup = self.setup(machine, machine.pipeline.rotor_synchronous)
+        synchronous = machine.pipeline.table(RotorSynchronous)
+        if synchronous is not None:
+            setup = self.setup(machine, synchronous)
             analysis = analyse(loaded, setup, progress)
             if figures is not None and analysis.trace is not None:
                 from daqsvc.analysis.plots import draw  # noqa: PLC0415 - brings matplotlib
 
                 draw(loaded, setup, analysis, figures)
         statements = self._statements(machine, loaded)
-        bank = statements.get(models.ROTOR_BANK)
+        bank = statements.get(ROTOR_BANK)
         if bank is not None:
             if figures is not None:
                 from daqsvc.analysis.bank_plots import draw_bank  # noqa: PLC0415 - brings matplotlib
@@ -129,7 +134,7 @@ class MachineAnalyst:
                 draw_bank(loaded, bank, f"{figures}-bank")
             if analysis is None:
                 analysis = bank_analysis(loaded, bank)
-        if analysis is None and machine.pipeline.bearing is None:
+        if analysis is None and machine.pipeline.table(Bearing) is None:
             analysis = RotorAnalysis(recording=recording, quality=count_bad(loaded.names, loaded.samples))
         try:
             bearings = self._bearings(machine, loaded, figures)
@@ -222,7 +227,7 @@ class MachineAnalyst:
             )
         return found
 
-    def setup(self, machine: MachineFile, given: models.RotorSynchronous) -> RotorSetup:
+    def setup(self, machine: MachineFile, given: RotorSynchronous) -> RotorSetup:
         """The calibrated rotor of a machine file, as `analyse` wants it.
 
         Args:
@@ -264,9 +269,10 @@ class MachineAnalyst:
         Raises:
             ValueError: its calibration cannot be used.
         """
-        if machine.pipeline.bearing is None:
+        given = machine.pipeline.table(Bearing)
+        if given is None:
             return None
-        stream = machine.sensor(machine.pipeline.bearing.bearings[0].sensor).stream
+        stream = machine.sensor(given.bearings[0].sensor).stream
         samples = self._stream(machine, stream, recording)
         found = analyse_machine_bearings(machine, recording, samples, self._of_bearings(machine))
         if figures is not None and found.analysis.races:
@@ -277,7 +283,7 @@ class MachineAnalyst:
 
     def _of_bearings(self, machine: MachineFile) -> Path | None:
         """The calibration that was given, if it is for the bearings: a rotor's comes first."""
-        return self.calibration if machine.pipeline.rotor_synchronous is None else None
+        return self.calibration if machine.pipeline.table(RotorSynchronous) is None else None
 
     def _statements(self, machine: MachineFile, recording: Recording) -> dict[str, Statements]:
         """What the other detectors say, by name."""
@@ -289,7 +295,7 @@ class MachineAnalyst:
             streams[grid.name] = np.concatenate([streams[name] for name in grid.streams], axis=1)
         return {
             statements.detector: statements
-            for detector in assembly.detectors(others)
+            for detector in detectors(others)
             for statements in by_name(
                 detector.name,
                 tuple(listen(detector, streams[detector.stream], recording.rate_hz)),
@@ -313,7 +319,7 @@ class MachineAnalyst:
 
 def _needed(machine: MachineFile) -> tuple[str, ...]:
     """The sensors without which the rotor cannot be judged."""
-    synchronous, bank = machine.pipeline.rotor_synchronous, machine.pipeline.rotor_bank
+    synchronous, bank = machine.pipeline.table(RotorSynchronous), machine.pipeline.table(RotorBank)
     if synchronous is not None:
         return synchronous.sensors
     return () if bank is None else (*bank.probes, bank.keyphasor)
@@ -322,11 +328,11 @@ def _needed(machine: MachineFile) -> tuple[str, ...]:
 def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
     """The machine with the sensors of a recording only, the detectors that they suffice for, and its rate."""
     sensors = tuple(sensor for sensor in machine.sensors if sensor.name in recording.names)
-    bank = machine.pipeline.rotor_bank
+    bank = machine.pipeline.table(RotorBank)
     update: dict[str, Any] = {}
     if bank is not None and not {*bank.probes, bank.keyphasor} <= set(recording.names):
         update["rotor_bank"] = None
-    update["bearing"] = present(machine.pipeline.bearing, recording.names)
+    update["bearing"] = present(machine.pipeline.table(Bearing), recording.names)
     streams = {
         name: stream.model_copy(update={"rate_hz": recording.rate_hz})
         for name, stream in machine.streams.items()
@@ -343,7 +349,11 @@ def _as_recorded(machine: MachineFile, recording: Recording) -> MachineFile:
 def _not_judged(machine: MachineFile, recording: str, why: str) -> RotorAnalysis | BearingAnalysis:
     """The verdict about a recording that cannot be judged, with the keys that one about it would have."""
     pipeline = machine.pipeline
-    if pipeline.bearing is None or pipeline.rotor_synchronous is not None or pipeline.rotor_bank is not None:
+    if (
+        pipeline.table(Bearing) is None
+        or pipeline.table(RotorSynchronous) is not None
+        or pipeline.table(RotorBank) is not None
+    ):
         return RotorAnalysis.not_judged(recording, why)
     return bearings_not_judged(machine, recording, why)
 

@@ -19,6 +19,8 @@ from daqsvc.commands.calibrate_bearing import (
 )
 from daqsvc.commands.option_types import SpeedOption
 from daqsvc.commands.signals import signals_to_end
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 
 if TYPE_CHECKING:
     import argparse
@@ -86,7 +88,7 @@ class CalibrateCommand:
             machine = self._load(Path(machine_path))
             if machine is None:
                 return EXIT_USAGE
-            if machine.pipeline.rotor_synchronous is None:
+            if machine.pipeline.table(RotorSynchronous) is None:
                 return self._without_rotor(recordings, arguments, machine)
         from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415
         from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
@@ -112,7 +114,7 @@ class CalibrateCommand:
     def _without_rotor(
         self, recordings: Sequence[str], arguments: argparse.Namespace, machine: MachineFile
     ) -> int:
-        if machine.pipeline.bearing is None:
+        if machine.pipeline.table(Bearing) is None:
             self._parser.error(
                 f"{machine.path} has neither [pipeline.rotor_synchronous] nor [pipeline.bearing] to be "
                 "calibrated; add one"
@@ -200,9 +202,9 @@ def _live(machine: MachineFile, arguments: argparse.Namespace) -> CalibrationRec
     """Listen to the machine; the terminal sees the revolutions go by."""
     from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
     from daqsvc.analysis.progress import progress_bar  # noqa: PLC0415
-    from daqsvc.assembly import AssemblyError  # noqa: PLC0415
     from daqsvc.commands.calibrate_live import calibrate_live, default_timeout_s  # noqa: PLC0415
     from daqsvc.rotor.calibration.file import CalibrationRecord  # noqa: PLC0415
+    from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
     from drivers.frames import LayoutError  # noqa: PLC0415
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from daqsvc import assembly, assembly_drivers
+from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.assembly_alignment import alignment
+from daqsvc.detectors.make import detectors
+from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 
 if TYPE_CHECKING:
@@ -81,11 +83,12 @@ class _Listener:
     def __init__(self, machine: MachineFile, clock: Clock, revolutions: int) -> None:
         self._clock = clock
         self._revolutions = revolutions
-        (detector,) = assembly.detectors(_only_rotor(machine, revolutions))
+        (detector,) = detectors(_only_rotor(machine, revolutions))
         assert isinstance(detector, RotorSynchronousDetector)  # noqa: S101 - the only one left
         self._detector = detector
-        assert machine.pipeline.rotor_synchronous is not None  # noqa: S101 - the command has asked for it
-        grid = machine.grid(machine.pipeline.rotor_synchronous)
+        given = machine.pipeline.table(RotorSynchronous)
+        assert given is not None  # noqa: S101 - the command has asked for it
+        grid = machine.grid(given.sampled_together)
         capacity = max(round(_RING_S * grid.rate_hz), 4 * detector.block)
         self._ring = SampleRing(grid.name, grid.channel_names, capacity)
         self._alignment = alignment(machine, clock, self._deliver)
@@ -132,7 +135,7 @@ class _Listener:
 
 def _only_rotor(machine: MachineFile, revolutions: int) -> MachineFile:
     """The machine with the calibrated rotor as its only detector, not calibrated yet."""
-    given = machine.pipeline.rotor_synchronous
+    given = machine.pipeline.table(RotorSynchronous)
     assert given is not None  # noqa: S101 - the command has asked for it
     given = given.model_copy(update={"calibration": None, "calibrate_revolutions": revolutions})
     update = {"levels": None, "rotor_bank": None, "rotor_synchronous": given}

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.option_types import positive
+from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 
 if TYPE_CHECKING:
     import argparse
@@ -92,11 +94,11 @@ class DetectabilityCommand:
             _complain(f"{arguments.file}: {wrong}")
             return _BAD_FILE
         machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
-        if machine.pipeline.rotor_bank is None:
+        if machine.pipeline.table(RotorBank) is None:
             return _tell_vector(machine, arguments)
         self._prepare_kernel_cache()
-        from daqsvc.assembly import AssemblyError  # noqa: PLC0415 - it brings the kernels' compiler
         from daqsvc.commands.detectability_report import as_json, as_text  # noqa: PLC0415
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - it brings the kernels' compiler
 
         try:
             found = _foresee(machine, arguments.process_noise)
@@ -110,12 +112,12 @@ class DetectabilityCommand:
 def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
     """What is wrong with the options for this machine; empty if nothing is."""
     pipeline = machine.pipeline
-    if pipeline.rotor_bank is None and pipeline.rotor_synchronous is None:
+    if pipeline.table(RotorBank) is None and pipeline.table(RotorSynchronous) is None:
         return (
             "there is neither [pipeline.rotor_bank], whose modes could be told apart, nor "
             "[pipeline.rotor_synchronous]; add one, with [machine.rotor] for the rotor that it watches"
         )
-    if pipeline.rotor_bank is None:
+    if pipeline.table(RotorBank) is None:
         if arguments.process_noise is not None:
             return "--process-noise: there is no [pipeline.rotor_bank] that it belongs to; leave it out"
     elif arguments.noise_um is not None or arguments.eccentricity_um is not None:
@@ -153,13 +155,13 @@ def _tell_vector(machine: MachineFile, arguments: argparse.Namespace) -> int:
 
 def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability:
     """Detectability of the bank that the service would run for this machine file."""
-    from daqsvc.assembly import detectors  # noqa: PLC0415
-    from daqsvc.diagnosis.rotor_bank import RotorBankDetector  # noqa: PLC0415
+    from daqsvc.detectors.make import detectors  # noqa: PLC0415
+    from daqsvc.detectors.rotor_bank.detector import RotorBankDetector  # noqa: PLC0415
     from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
     from daqsvc.rotor.detectability.foretell import detectability  # noqa: PLC0415
 
     (detector,) = (made for made in detectors(machine) if isinstance(made, RotorBankDetector))
-    bank = machine.pipeline.rotor_bank
+    bank = machine.pipeline.table(RotorBank)
     calibrates = bank is not None and bank.calibrate_revolutions > 0
     return detectability(
         detector.bank_modes,

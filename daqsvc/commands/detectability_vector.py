@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.assembly_rotor import healthy_rotor
+from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.rotor.detectability.vector import stated_calibration, vector_detectability
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.vectors import HARMONICS
@@ -36,9 +37,9 @@ def foresee_vector(
     Raises:
         ValueError: something is not known, or cannot be used; the message says which option tells it.
     """
-    given, rotor_table = machine.pipeline.rotor_synchronous, machine.machine.rotor
+    given, rotor_table = machine.pipeline.table(RotorSynchronous), machine.machine.rotor
     assert given is not None  # noqa: S101 - the command has looked
-    assert rotor_table is not None  # noqa: S101 - settings/rotor_checks.py: it needs [machine.rotor]
+    assert rotor_table is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]
     threshold_nats = threshold_for(given.false_alarms_per_1000_rev)
     rotor, calibrations = healthy_rotor(machine, given)
     if calibrations:
@@ -56,7 +57,7 @@ def foresee_vector(
                 f"{' and '.join(lacking)}, or calibrate the machine and name the file as "
                 "pipeline.rotor_synchronous.calibration"
             )
-        rate_hz = machine.grid(given).rate_hz
+        rate_hz = machine.grid(given.sampled_together).rate_hz
         calibration = stated_calibration(
             rotor,
             speed_rpm=machine.machine.speed_rpm,
@@ -77,7 +78,7 @@ def vector_json(found: VectorDetectability, machine: MachineFile) -> dict[str, A
         found: the figures.
         machine: the machine file that they are for.
     """
-    was, given = found.calibration, machine.pipeline.rotor_synchronous
+    was, given = found.calibration, machine.pipeline.table(RotorSynchronous)
     assert given is not None  # noqa: S101 - see foresee_vector
     return {
         "machine": machine.machine.name,

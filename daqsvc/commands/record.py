@@ -78,7 +78,8 @@ class RecordCommand:
         except _MisuseError as error:
             return _say(error, EXIT_MISUSED)
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
-        from daqsvc.assembly_drivers import AssemblyError, bus_driver  # noqa: PLC0415
+        from daqsvc.assembly_drivers import bus_driver  # noqa: PLC0415
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.base import DeviceAbsentError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
 

@@ -88,8 +88,8 @@ class RunCommand:
 
 
 def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard) -> int:
-    from daqsvc.assembly import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.outbox.store import OutboxError  # noqa: PLC0415
+    from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
     from drivers.frames import LayoutError  # noqa: PLC0415

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import deque
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.diagnosis.trends import BRIDGED
+
+BRIDGED = 2
+"""So many values in a row may be missing: until then the last one stands. A lost poll is no lost sensor."""
 
 SILENCE_NS = 2 * NS_PER_S
 """A stream from which nothing has come for so long is silent, ..."""

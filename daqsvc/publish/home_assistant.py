@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Any
 import daqsvc
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.states import AlarmState, Level
+from daqsvc.diagnosis.reading import STALE_S
 from daqsvc.publish.home_assistant_readings import digits_of
-from daqsvc.publish.settings import STALE_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.publish.settings import HomeAssistantSettings, Reading
+    from daqsvc.diagnosis.reading import Reading
+    from daqsvc.publish.settings import HomeAssistantSettings
     from daqsvc.publish.topics import Topics
 
 _UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F"}

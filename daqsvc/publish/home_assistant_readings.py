@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.publish.settings import HomeAssistantSettings, Reading
+    from daqsvc.publish.settings import HomeAssistantSettings
     from daqsvc.publish.topics import Topics
 
 LEAST_NS = 10 * NS_PER_S

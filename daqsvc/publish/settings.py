@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.alarms.commands import Verb
+    from daqsvc.diagnosis.reading import Reading
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,29 +30,6 @@ class CommandSettings:
     max_age_s: float = 60.0
     max_bytes: int = 4096
     reserved: tuple[str, ...] = ()
-
-
-STALE_S = 120
-"""A figure that has not been told for so long is no longer true, unless it is told more seldom."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """A figure of a detector's statements that is shown by itself.
-
-    Attributes:
-        detector: whose statements.
-        kind: where it stands in them.
-        key: its name there, e.g. ``"rms"`` or ``"F1"``.
-        unit: its unit as in the statements, e.g. ``"um"``; empty for none.
-        stale_s: a figure that has not been told for so long is no longer true.
-    """
-
-    detector: str
-    kind: Literal["statistics", "probabilities"]
-    key: str
-    unit: str = ""
-    stale_s: int = STALE_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import DiagnosisAlarm, SetpointAlarm, VotingAlarm
-from daqsvc.settings.pipeline import ROTOR_BANK
 from daqsvc.settings.problems import Finding, choice
-from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
-from daqsvc.settings.rotor_checks import check_alarm_detector
+from daqsvc.settings.registry import configured, detector_tables
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.setpoint_checks import setpoint_checks
 
@@ -23,8 +21,6 @@ if TYPE_CHECKING:
 _TAKEN = ("alarm-flood", "trip-multiply")
 """Alarms that the service raises itself."""
 _START_UP: KeyPath = ("alarm_handling", "start_up")
-_START_UP_SIGNALS = {ROTOR_BANK: ("speed",), ROTOR_SYNCHRONOUS: ("speed", "1x.amplitude")}
-"""The detectors that go on stating their signal while the speed changes, and these signals."""
 
 
 def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
@@ -42,7 +38,7 @@ def alarm_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
             if isinstance(alarm, VotingAlarm):
                 yield _vote(draft, alarm, at)
             if isinstance(alarm, DiagnosisAlarm):
-                yield check_alarm_detector(draft, alarm, at)
+                yield _detector(draft, alarm, at)
     with suppress(UnusableValueError):
         if draft.alarm_handling.start_up is not None:
             yield _start_up(draft, draft.alarm_handling.start_up)
@@ -77,6 +73,24 @@ def _vote(draft: MachineFile, alarm: VotingAlarm, at: KeyPath) -> Iterator[Findi
         )
 
 
+def _detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterator[Finding]:
+    """The detector that an alarm follows is there and can raise it."""
+    keys = {plugin.detector: key for key, plugin in detector_tables().items() if plugin.detector is not None}
+    if alarm.detector not in keys:
+        yield Finding((*at, "detector"), "there is no such detector", choice(alarm.detector, keys))
+        return
+    key = keys[alarm.detector]
+    given = getattr(draft.pipeline, key)
+    if given is None:
+        yield Finding(
+            (*at, "detector"),
+            "this detector is not configured",
+            f"write a table [pipeline.{key}], or remove the alarm",
+        )
+        return
+    yield from detector_tables()[key].alarm_checks(given, at)
+
+
 def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
     if start_up.between is None and start_up.change_per_s is None:
         yield Finding(_START_UP, "has neither between nor change_per_s", "add one of the two, or both")
@@ -93,19 +107,21 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
 
 
 def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
-    signals = {name: _START_UP_SIGNALS[name] for name in draft.detectors if name in _START_UP_SIGNALS}
-    if draft.pipeline.levels is not None:
-        trends = (sensor.name for sensor in draft.sensors if sensor.type == "trend")
-        signals |= {f"levels/{name}": ("value",) for name in trends}
+    signals: dict[str, tuple[str, ...]] = {}
+    for _, plugin, given in configured(draft.pipeline):
+        signals |= plugin.start_up_signals(draft, given)
     if not signals:
+        tables = [f"[pipeline.{key}]" for key, plugin in detector_tables().items() if plugin.states_speed]
         yield Finding(
             (*_START_UP, "detector"),
             "no detector of this machine states a speed",
-            "write a table [pipeline.rotor_bank] or [pipeline.rotor_synchronous], take a trend value that is "
-            "the speed, or remove [alarm_handling.start_up] and every trip_multiply",
+            f"write a table {' or '.join(tables)}, take a trend value that is the speed, or remove "
+            "[alarm_handling.start_up] and every trip_multiply",
         )
     elif start_up.detector not in signals:
-        there = start_up.detector in draft.detectors or start_up.detector.startswith("levels/")
+        there = (
+            start_up.detector in draft.detectors or start_up.detector.partition("/")[0] in detector_tables()
+        )
         yield Finding(
             (*_START_UP, "detector"),
             "states no speed while the machine starts up"

@@ -34,10 +34,8 @@ def alignment_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
 def _used(draft: MachineFile) -> Iterator[Finding]:
     """Some detector has its sensors in several streams."""
     named = {sensor.name: sensor.stream for sensor in draft.sensors}
-    pipeline = draft.pipeline
-    for detector in (pipeline.rotor_bank, pipeline.rotor_synchronous):
-        if detector is not None and len({named.get(name) for name in detector.sensors}) > 1:
-            return
+    if any(len({named.get(name) for name in together}) > 1 for together in draft.sampled_together):
+        return
     yield Finding(
         _ALIGNMENT,
         "has no effect: no detector of the rotor has its sensors in several streams",

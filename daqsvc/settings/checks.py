@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
-from daqsvc.settings.bearing_checks import bearing_checks
 from daqsvc.settings.broker_url import is_tls
 from daqsvc.settings.bus_checks import check_can_keys, check_can_owners, check_drivers, check_interfaces
 from daqsvc.settings.buses import DbcLayout, PlainLayout
@@ -29,14 +28,13 @@ from daqsvc.settings.layout_checks import (
     unique,
 )
 from daqsvc.settings.memory_checks import check_memory
-from daqsvc.settings.modbus import RegistersLayout
 from daqsvc.settings.modbus_checks import check_modbus
 from daqsvc.settings.modbus_overlaps import check_writes_and_samples
 from daqsvc.settings.mqtt_files import credential_files
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.record_checks import check_recorded_buses
+from daqsvc.settings.registry import configured
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
-from daqsvc.settings.rotor_checks import rotor_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
     check_alarm_reach,
@@ -52,15 +50,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from daqsvc.settings.dbc import DbcMessage
-    from daqsvc.settings.models import MachineFile, Mqtt, Sensor
+    from daqsvc.settings.models import MachineFile, Mqtt
     from daqsvc.settings.problems import KeyPath
 
 _MOST_FINDINGS = 200
 """Whoever has mended these may ask again."""
-_RING_WINDOWS = 2
-_LEAST_WINDOW_SAMPLES = 16
-_WAVEFORMS = ("proximity", "accelerometer", "velocity")
-"""Types of sensors whose levels are measured here, window by window."""
 
 
 def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Finding]:
@@ -110,12 +104,10 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield _names(draft)
     yield check_writes_and_samples(draft)
     with suppress(UnusableValueError):
-        if draft.pipeline.levels is not None:
-            yield _window(draft)
-            yield _velocity_band(draft)
-    yield from rotor_checks(draft)
+        for _, plugin, given in configured(draft.pipeline, valid_only=True):
+            with suppress(UnusableValueError):
+                yield from plugin.checks(draft, given)
     yield from alignment_checks(draft)
-    yield from bearing_checks(draft)
     yield from alarm_checks(draft)
     with suppress(UnusableValueError):
         if draft.mqtt is not None:
@@ -154,73 +146,6 @@ def _unused_buses(draft: MachineFile) -> Iterator[Finding]:
             yield Finding(
                 ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
             )
-
-
-def _rate_hz(draft: MachineFile, sensor: Sensor) -> float | None:
-    return draft.streams[sensor.stream].rate_hz if sensor.stream in draft.streams else None
-
-
-def _window(draft: MachineFile) -> Iterator[Finding]:
-    pipeline = draft.pipeline
-    if pipeline.levels is None:
-        return
-    window_s = pipeline.levels.window_s
-    at = ("pipeline", "levels", "window_s")
-    waveforms = {sensor.stream for sensor in draft.sensors if sensor.type in _WAVEFORMS}
-    slow = [(draft.streams[name].rate_hz, name) for name in waveforms if name in draft.streams]
-    if slow and window_s * min(slow)[0] < _LEAST_WINDOW_SAMPLES:
-        slowest_hz, name = min(slow)
-        remedy = f"write window_s = {_LEAST_WINDOW_SAMPLES / slowest_hz:.3g} or more"
-        yield Finding(
-            at,
-            f"{window_s:g} s at {slowest_hz:g} Hz are fewer than {_LEAST_WINDOW_SAMPLES} samples",
-            remedy + _if_no_waveform(draft, name),
-        )
-    if pipeline.ring_s < _RING_WINDOWS * window_s:
-        yield Finding(
-            at,
-            f"a ring of {pipeline.ring_s:g} s must hold at least {_RING_WINDOWS} windows",
-            f"write ring_s = {_RING_WINDOWS * window_s:g} or more in [pipeline], or a shorter window",
-        )
-
-
-def _velocity_band(draft: MachineFile) -> Iterator[Finding]:
-    levels = draft.pipeline.levels
-    if levels is None:
-        return
-    at = ("pipeline", "levels", "velocity_band_hz")
-    low_hz, high_hz = levels.velocity_band_hz
-    casing = [sensor for sensor in draft.sensors if sensor.type in {"accelerometer", "velocity"}]
-    if not casing and "velocity_band_hz" in levels.model_fields_set:
-        yield Finding(
-            at,
-            "has no effect: no accelerometer or velocity sensor sends a waveform, and a trend value has the "
-            "band of its device",
-            "remove it",
-            fatal=False,
-        )
-    for sensor in casing:
-        rate_hz = _rate_hz(draft, sensor)
-        if rate_hz is not None and high_hz >= rate_hz / 2:
-            usable_hz = 0.4 * rate_hz
-            remedy = (
-                f"write velocity_band_hz = [{low_hz:.1f}, {usable_hz:.1f}]"
-                if usable_hz > low_hz
-                else "sample faster, or write a lower band"
-            )
-            yield Finding(
-                at,
-                f"the band {low_hz:g} Hz to {high_hz:g} Hz must end below {rate_hz / 2:g} Hz, half the rate "
-                f'of stream "{sensor.stream}" (sensor "{sensor.name}")',
-                remedy + _if_no_waveform(draft, sensor.stream),
-            )
-            return
-
-
-def _if_no_waveform(draft: MachineFile, stream: str) -> str:
-    """What else to do about a stream that is too slow for waveforms, if its registers are polled."""
-    polled = isinstance(draft.streams[stream].layout, RegistersLayout)
-    return ', or type = "trend" for sensors whose level the device measures itself' if polled else ""
 
 
 def _transport(mqtt: Mqtt) -> Iterator[Finding]:

@@ -7,20 +7,16 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
-from daqsvc.settings.bearing import BEARING
 from daqsvc.settings.buses import CanBus, DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.layout_checks import bus_share, frame_facts
-from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS
-from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue, VelocitySensor
+from daqsvc.settings.registry import configured
+from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from daqsvc.settings.bearing import Bearing, WatchedBearing
     from daqsvc.settings.buses import Stream
     from daqsvc.settings.models import MachineFile, Mqtt, Sensor
-    from daqsvc.settings.pipeline import Levels, Mode, RotorBank
-    from daqsvc.settings.rotor import RotorSynchronous
 
 COLUMNS = 100
 _INDENT = "  "
@@ -174,120 +170,12 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
     yield "ring", f"{pipeline.ring_s:g} s of every stream"
     for grid in machine.grids:
         reference, *others = grid.streams
-        assert pipeline.alignment is not None  # noqa: S101 - settings/rotor_checks.py
+        assert pipeline.alignment is not None  # noqa: S101 - detectors/shaft/checks.py
         error_us, wait_ms = pipeline.alignment.max_error_us, pipeline.alignment.max_wait_ms
         text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
         yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
-    if pipeline.levels is not None:
-        yield "levels", _levels(machine, pipeline.levels)
-    bank = pipeline.rotor_bank
-    if bank is not None:
-        text = (
-            f"{bank.probes[0]}, {bank.probes[1]} and {bank.keyphasor}; noise {bank.noise_um:g} um; "
-            f"rule {bank.rule}, {_thresholds(bank)}; "
-        )
-        if bank.calibrate_revolutions:
-            text += f"unbalance and sag from the first {bank.calibrate_revolutions} revolutions; "
-        text += f"modes {', '.join(map(_mode, bank.modes))}"
-        yield "rotor-bank", text
-    if pipeline.rotor_synchronous is not None:
-        yield ROTOR_SYNCHRONOUS, _synchronous(machine, pipeline.rotor_synchronous)
-    if pipeline.bearing is not None:
-        yield BEARING, _bearing(pipeline.bearing)
-
-
-def _levels(machine: MachineFile, given: Levels) -> str:
-    casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
-    waveforms = [s.name for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
-    trends = [s.name for s in machine.sensors if isinstance(s, TrendValue)]
-    parts: list[str] = []
-    if waveforms:
-        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(waveforms)}")
-    if casing:
-        low_hz, high_hz = given.velocity_band_hz
-        parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
-    if trends:
-        parts.append(
-            f"{', '.join(trends)} as they come, or averaged over {given.window_s:g} s if they are faster"
-        )
-    return "; ".join(parts)
-
-
-def _synchronous(machine: MachineFile, synchronous: RotorSynchronous) -> str:
-    *others, last = synchronous.sensors
-    speed_rpm = abs(machine.machine.speed_rpm)
-    angle = {
-        "keyphasor": "angle from the keyphasor",
-        "fixed": f"angle from {speed_rpm:g} rpm, taken as exact",
-        "orbit": f"angle from the orbit's 1X around {speed_rpm:g} rpm",
-    }
-    healthy = (
-        f"the first {synchronous.calibrate_revolutions} revolutions are the healthy state, kept over restarts"
-        if synchronous.calibration is None
-        else f"healthy state in {synchronous.calibration} (that of the first "
-        f"{synchronous.calibrate_revolutions} revolutions if a run-up is all that it holds)"
-    )
-    parts = [
-        f"{', '.join(others)} and {last}",
-        angle[synchronous.reference],
-        healthy,
-        f"at most {synchronous.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions",
-        f"natural frequency within {synchronous.natural_frequency_tolerance_percent:g} %",
-        f"damping within {synchronous.damping_tolerance_percent:g} %",
-    ]
-    if machine.ac_coupled:
-        parts.append("no mean position from AC-coupled probes, so no static load is seen")
-    return "; ".join(parts)
-
-
-def _bearing(given: Bearing) -> str:
-    healthy = (
-        f"the first {given.calibrate_s:g} s are the healthy state, kept over restarts"
-        if given.calibration is None
-        else f"healthy state in {given.calibration}"
-    )
-    return "; ".join(
-        [
-            *(_watched(bearing) for bearing in given.bearings),
-            *(() if given.keyphasor is None else (f"speed by {given.keyphasor}",)),
-            healthy,
-            f'false alarms of "changed" {given.false_alarm_probability:g} a look',
-        ]
-    )
-
-
-def _watched(bearing: WatchedBearing) -> str:
-    orders = bearing.orders
-    kinematics = (
-        f"{bearing.type}"
-        if orders is None
-        else f"BPFI {orders.bpfi:g}, BPFO {orders.bpfo:g}, BSF {orders.bsf:g}, FTF {orders.ftf:g}"
-    )
-    by = bearing.sensor
-    if bearing.rotor_sensor is not None:
-        by += f", races also by direction with {bearing.rotor_sensor}"
-    return f"{bearing.name} ({kinematics}) by {by}"
-
-
-def _thresholds(bank: RotorBank) -> str:
-    forward, back = f"{bank.threshold_nats:g} nats forward", f"{bank.back_threshold_nats:g} back"
-    if bank.false_alarms_per_1000_rev is not None:
-        forward = f"at most {bank.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions"
-    if bank.mtbf_hours is not None:
-        back = f"MTBF {bank.mtbf_hours:g} h"
-    return f"{forward}, {back}"
-
-
-def _mode(mode: Mode) -> str:
-    words = {
-        "damping_ratio": f"zeta {mode.damping_ratio:g}" if mode.damping_ratio is not None else "",
-        "unbalance_ratio": f"unbalance x {mode.unbalance_ratio:g}",
-        "stiffness_ratio": f"stiffness x {mode.stiffness_ratio:g}",
-        "static_load_um": f"static load {mode.static_load_um[0]:g}, {mode.static_load_um[1]:g} um",
-        "rub": "rub",
-    }
-    differs = ", ".join(words[key] for key in mode.differs) or "as stated"
-    return f"{mode.name} ({differs}: {mode.severity})"
+    for key, plugin, given in configured(pipeline):
+        yield plugin.detector or key, plugin.describe(machine, given)
 
 
 _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband and delays")

@@ -37,11 +37,10 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
     pipeline = draft.pipeline
     needed: dict[str, float] = {}
     rings = dict.fromkeys(draft.streams, 1)
-    for detector in (pipeline.rotor_bank, pipeline.rotor_synchronous):
-        if detector is not None:
-            joined = {sensor.stream for sensor in draft.sensors if sensor.name in detector.sensors}
-            for name in joined & rings.keys() if len(joined) > 1 else ():
-                rings[name] += 1
+    for together in draft.sampled_together:
+        joined = {sensor.stream for sensor in draft.sensors if sensor.name in together}
+        for name in joined & rings.keys() if len(joined) > 1 else ():
+            rings[name] += 1
     for name, stream in draft.streams.items():
         with suppress(UnusableValueError):
             row_bytes = SAMPLE_BYTES * len(stream.layout.channel_names)

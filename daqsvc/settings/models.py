@@ -19,7 +19,6 @@ from daqsvc.settings.alarms import (
     VotingAlarm,
 )
 from daqsvc.settings.alignment import Grid
-from daqsvc.settings.bearing import BEARING, Bearing, WatchedBearing
 from daqsvc.settings.buses import (
     Bus,
     CanBus,
@@ -33,8 +32,8 @@ from daqsvc.settings.buses import (
 )
 from daqsvc.settings.mqtt import Mqtt
 from daqsvc.settings.packing import Channel, Counter
-from daqsvc.settings.pipeline import ROTOR_BANK, Levels, Mode, Pipeline, RotorBank
-from daqsvc.settings.rotor import ROTOR_SYNCHRONOUS, RotorSynchronous
+from daqsvc.settings.pipeline import Pipeline
+from daqsvc.settings.registry import INSTALLED, configured, no_detectors
 from daqsvc.settings.section import AngleDeg, DampingRatio, Line, Name, PositionUm, Section
 from daqsvc.settings.sensors import (
     Accelerometer,
@@ -47,19 +46,15 @@ from daqsvc.settings.sensors import (
 from daqsvc.settings.store import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from daqsvc.settings.dbc import DbcMessage
     from daqsvc.settings.problems import Problem
 
 __all__ = [
-    "BEARING",
-    "ROTOR_BANK",
-    "ROTOR_SYNCHRONOUS",
     "Accelerometer",
     "Alarm",
     "AlarmHandling",
-    "Bearing",
     "Bus",
     "CanBus",
     "Channel",
@@ -71,10 +66,8 @@ __all__ = [
     "Keyphasor",
     "Layout",
     "LevelAlarm",
-    "Levels",
     "Machine",
     "MachineFile",
-    "Mode",
     "Mqtt",
     "Origin",
     "OtherBus",
@@ -82,8 +75,6 @@ __all__ = [
     "PlainLayout",
     "ProximityProbe",
     "Rotor",
-    "RotorBank",
-    "RotorSynchronous",
     "Sensor",
     "SetpointAlarm",
     "Store",
@@ -91,7 +82,6 @@ __all__ = [
     "TrendValue",
     "VelocitySensor",
     "VotingAlarm",
-    "WatchedBearing",
 ]
 
 
@@ -205,7 +195,9 @@ class MachineFile(Section):
         tuple[Sensor, ...],
         Field(strict=False, min_length=1, max_length=MOST_ENTRIES, description="the sensors"),
     ]
-    pipeline: Pipeline = Field(default=Pipeline(), description="what is computed")
+    pipeline: Annotated[Pipeline, INSTALLED] = Field(
+        default_factory=no_detectors, description="what is computed"
+    )
     alarms: Annotated[tuple[Alarm, ...], Field(strict=False, max_length=MOST_ENTRIES)] = Field(
         default=(), description="the alarms"
     )
@@ -238,18 +230,13 @@ class MachineFile(Section):
     @property
     def detectors(self) -> tuple[str, ...]:
         """Names of the detectors that an alarm can follow."""
-        configured = {
-            ROTOR_BANK: self.pipeline.rotor_bank,
-            ROTOR_SYNCHRONOUS: self.pipeline.rotor_synchronous,
-            BEARING: self.pipeline.bearing,
-        }
-        return tuple(name for name, section in configured.items() if section is not None)
+        names = (plugin.detector for _, plugin, _ in configured(self.pipeline))
+        return tuple(name for name in names if name is not None)
 
     @property
     def ac_coupled(self) -> bool:
         """Whether a probe of the rotor shows motion only, so that no detector sees its static position."""
-        detectors = (self.pipeline.rotor_bank, self.pipeline.rotor_synchronous)
-        probes = [name for detector in detectors if detector is not None for name in detector.probes]
+        probes = {name for together in self.sampled_together for name in together}
         named = (sensor for sensor in self.sensors if sensor.name in probes)
         return any(sensor.ac_coupled for sensor in named if isinstance(sensor, ProximityProbe))
 
@@ -275,20 +262,25 @@ class MachineFile(Section):
                 return sensor
         raise KeyError(f"no sensor {name!r}; there are {', '.join(s.name for s in self.sensors)}")
 
-    def grid(self, detector: RotorBank | RotorSynchronous) -> Grid:
-        """Where a detector of the rotor finds its samples.
+    @property
+    def sampled_together(self) -> tuple[tuple[str, ...], ...]:
+        """The sensors that each detector takes together, sample by sample; the reference's first."""
+        together = (plugin.sampled_together(given) for _, plugin, given in configured(self.pipeline))
+        return tuple(names for names in together if names)
 
-        The keyphasor's stream is the reference if there is one: its edges are not to be interpolated.
+    def grid(self, together: Sequence[str]) -> Grid:
+        """Where a detector finds the samples of sensors that it takes together.
+
+        Args:
+            together: names of the sensors; the stream of the first one is the grid.
         """
-        names = sorted(detector.sensors, key=lambda name: name != detector.keyphasor)
-        streams = [self.sensor(name).stream for name in names]
+        streams = [self.sensor(name).stream for name in together]
         return Grid({name: self.streams[name] for name in streams})
 
     @property
     def grids(self) -> tuple[Grid, ...]:
         """The grids of several streams that the detectors need, each once."""
-        detectors = (self.pipeline.rotor_bank, self.pipeline.rotor_synchronous)
-        grids = [self.grid(detector) for detector in detectors if detector is not None]
+        grids = [self.grid(together) for together in self.sampled_together]
         return tuple({grid.name: grid for grid in grids if grid.aligned}.values())
 
     def column(self, sensor: Sensor) -> int:

@@ -1,141 +1,22 @@
-"""What is computed from the samples: level detectors, the rotor's two detectors, the bearings'."""
+"""What is computed from the samples: what all detectors share; each has a table of its own below it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, TypeVar
 
-from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
+from pydantic import Field
 
 from daqsvc.settings.alignment import Alignment  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.bearing import Bearing  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.rotor import RotorSynchronous  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.settings.section import DampingRatio, Name, Nats, PositionUm, Section
+from daqsvc.settings.section import Section
 
-Severity = Literal["normal", "alert", "danger"]
-
-Fault = Literal["unbalance", "damping_loss", "static_load", "stiffness_loss", "rub"]
-
-ROTOR_BANK = "rotor-bank"
-"""Name of the rotor's model bank as a detector."""
-
-
-def _ordered_band(band_hz: tuple[float, float]) -> tuple[float, float]:
-    low_hz, high_hz = band_hz
-    if not 0 < low_hz < high_hz:
-        raise PydanticCustomError(
-            "band_order",
-            "is not a band: it needs 0 < lower edge < upper edge, in Hz",
-            {"remedy": "write e.g. [10.0, 1000.0]"},
-        )
-    return band_hz
-
-
-BandHz = Annotated[float, Field(ge=0.001, le=5_000_000)]
-
-
-class Levels(Section):
-    """RMS, peak, crest factor and velocity RMS of every vibration sensor, window by window."""
-
-    window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(default=0.5, description="length of a window")
-    velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
-        Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
-    )
-
-
-class Mode(Section):
-    """A state of the rotor that the bank has a model for: what differs from [machine.rotor], at one level."""
-
-    name: Annotated[Name, Field(description="name of the mode", examples=["F1"])]
-    severity: Annotated[Severity, Field(description="how bad it is", examples=["alert"])]
-    fault: Fault | None = Field(default=None, description="what it is; told from what differs if absent")
-    damping_ratio: DampingRatio | None = Field(
-        default=None, description="the rotor's damping in it; that of [machine.rotor] if absent"
-    )
-    unbalance_ratio: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=1.0, description="eccentricity over the healthy one"
-    )
-    stiffness_ratio: Annotated[float, Field(ge=0.01, le=100)] = Field(
-        default=1.0, description="stiffness of the shaft over the healthy one"
-    )
-    static_load_um: Annotated[tuple[PositionUm, PositionUm], Field(strict=False)] = Field(
-        default=(0.0, 0.0), description="additional sag towards +x and +y, of the healthy shaft"
-    )
-    rub: bool = Field(default=False, description="whether the rotor can touch the stator in it")
-
-    @property
-    def differs(self) -> tuple[str, ...]:
-        """Keys of the model that this mode sets, in the order of the file's format."""
-        ordinary = {
-            "unbalance_ratio": 1.0,
-            "stiffness_ratio": 1.0,
-            "static_load_um": (0.0, 0.0),
-            "rub": False,
-        }
-        told = [key for key, value in ordinary.items() if getattr(self, key) != value]
-        return tuple(["damping_ratio", *told] if self.damping_ratio is not None else told)
-
-
-ProcessNoise = Annotated[float, Field(ge=1e-12, le=1e6)]
-Threshold = Annotated[float, Field(ge=0.1, le=1_000_000)]
-
-
-class RotorBank(Section):
-    """One observer per mode, and the rule that decides between them."""
-
-    probes: Annotated[
-        tuple[Name, Name],
-        Field(strict=False, description="the two proximity probes", examples=['["probe-x", "probe-y"]']),
-    ]
-    keyphasor: Annotated[Name, Field(description="the keyphasor", examples=["keyphasor"])]
-    noise_um: Annotated[
-        float,
-        Field(ge=1e-3, le=10_000, description="standard deviation of the sensor noise", examples=[2.0]),
-    ]
-    process_noise: ProcessNoise = Field(default=1e-4, description="PSD q of the linear observers, normalised")
-    rub_process_noise: ProcessNoise = Field(default=0.1, description="PSD q3 of the rub observer, normalised")
-    rule: Literal["cusum", "paper"] = Field(
-        default="cusum", description="cusum raises alarms; paper shows probabilities only"
-    )
-    threshold_nats: Threshold = Field(default=16.0, description="evidence that declares a worse mode")
-    back_threshold_nats: Threshold = Field(
-        default=25.0, description="evidence that declares a healthier mode"
-    )
-    false_alarms_per_1000_rev: Annotated[float, Field(ge=1e-9, le=10_000)] | None = Field(
-        default=None, description="accepted on a healthy machine, in place of threshold_nats"
-    )
-    mtbf_hours: Annotated[float, Field(ge=1e-3, le=1e9)] | None = Field(
-        default=None, description="mean time between failures, in place of back_threshold_nats"
-    )
-    identity_nats: Nats = Field(
-        default=3.0, description="lead over the other candidates that names the fault"
-    )
-    settle_revolutions: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="how long a departure waits for its name; some 4 for many kinds of faults"
-    )
-    calibrate_revolutions: Annotated[int, Field(ge=0, le=100_000)] = Field(
-        default=0,
-        description="healthy revolutions that unbalance and sag are measured over; 0 trusts the file",
-    )
-    modes: Annotated[
-        tuple[Mode, ...],
-        Field(
-            strict=False,
-            min_length=2,
-            max_length=64,
-            description="the modes, healthy first",
-            examples=['[{ name = "N", damping_ratio = 0.18, severity = "normal" }, ...]'],
-        ),
-    ]
-
-    @property
-    def sensors(self) -> tuple[Name, ...]:
-        """The sensors that it rests on."""
-        return (*self.probes, self.keyphasor)
+TableT = TypeVar("TableT", bound=Section)
 
 
 class Pipeline(Section):
-    """The detectors, and how much of the past they can reach."""
+    """The detectors, and how much of the past they can reach.
+
+    `daqsvc.settings.registry.pipeline_model` adds the tables of the detectors that are installed.
+    """
 
     ring_s: Annotated[float, Field(ge=0.01, le=3600)] = Field(
         default=30.0, description="length of each stream's ring"
@@ -143,9 +24,15 @@ class Pipeline(Section):
     alignment: Alignment | None = Field(
         default=None, description="sensors of a rotor detector in several streams"
     )
-    levels: Levels | None = Field(default=None, description="level detectors")
-    rotor_bank: RotorBank | None = Field(default=None, description="the rotor's model bank")
-    rotor_synchronous: RotorSynchronous | None = Field(
-        default=None, description="the rotor against its own healthy state"
-    )
-    bearing: Bearing | None = Field(default=None, description="the rolling bearings")
+
+    def table(self, kind: type[TableT]) -> TableT | None:
+        """The table of a detector, by its class; None if the file has none.
+
+        Raises:
+            UnusableValueError: it is there and not valid.
+        """
+        for key in type(self).model_fields:
+            given = getattr(self, key) if key not in Pipeline.model_fields else None
+            if isinstance(given, kind):
+                return given
+        return None

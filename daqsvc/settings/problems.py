@@ -78,6 +78,10 @@ class MachineFileError(Exception):
         return "\n\n".join(str(problem) for problem in self.problems)
 
 
+class AssemblyError(Exception):
+    """A machine file that is sound by itself asks for something that is not there, or cannot be made."""
+
+
 def choice(wanted: str, known: Iterable[str]) -> str:
     """A remedy for a name that is not known: the closest one, or all there are."""
     names = sorted(known)

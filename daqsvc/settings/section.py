@@ -90,11 +90,16 @@ class Kinds:
 
     Attributes:
         choose: picks the section for a table.
-        sections: all of them, to recognise keys of another kind.
+        listed: all of them, to recognise keys of another kind; a function where plugins bring them.
     """
 
     choose: Callable[[Mapping[str, Any]], type[Section]]
-    sections: tuple[type[Section], ...]
+    listed: tuple[type[Section], ...] | Callable[[], tuple[type[Section], ...]]
+
+    @property
+    def sections(self) -> tuple[type[Section], ...]:
+        """All the kinds."""
+        return self.listed if isinstance(self.listed, tuple) else self.listed()
 
     def __get_pydantic_core_schema__(
         self, _source: object, _handler: GetCoreSchemaHandler

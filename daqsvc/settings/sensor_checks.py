@@ -99,8 +99,7 @@ def check_voltages(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[
 
 
 def _of_a_rotor(draft: MachineFile, name: str) -> bool:
-    detectors = (draft.pipeline.rotor_bank, draft.pipeline.rotor_synchronous)
-    return any(detector is not None and name in detector.probes for detector in detectors)
+    return any(name in together for together in draft.sampled_together)
 
 
 def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm
 from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.registry import configured, detector_tables
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import ProximityProbe, TrendValue
 
@@ -177,12 +178,13 @@ def _measured(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
     with suppress(UnusableValueError):
         if not set(alarm.watched) <= set(_named(draft)):
             return  # said already, about the same key
-    if draft.pipeline.levels is None:
+    if not any(plugin.measures_levels for _, plugin, _ in configured(draft.pipeline)):
+        tables = (f"[pipeline.{key}]" for key, plugin in detector_tables().items() if plugin.measures_levels)
         one = isinstance(alarm, LevelAlarm)
         yield Finding(
             (*at, "sensor" if one else "sensors"),
             "nothing measures its level" if one else "nothing measures their levels",
-            "write a table [pipeline.levels] (it may be empty), or remove the alarm",
+            f"write a table {' or '.join(tables)} (it may be empty), or remove the alarm",
         )
 
 

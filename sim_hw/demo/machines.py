@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file
 from sim_hw.demo.errors import DemoError
 
@@ -95,7 +96,8 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
     text = resources.files(__package__).joinpath("laval-rig.toml").read_text("utf-8")
     rig = parse_machine_file(text, Path("laval-rig.toml"))
     assert rig.machine.rotor is not None  # noqa: S101 - the file next to this one has it
-    assert rig.pipeline.rotor_bank is not None  # noqa: S101
+    bank = rig.pipeline.table(RotorBank)
+    assert bank is not None  # noqa: S101
     assert rig.mqtt is not None  # noqa: S101
     plant, rotor = scenario.plant, scenario.plant.rotor
     described = rig.machine.rotor.model_copy(
@@ -109,7 +111,7 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
             "contact_stiffness": rotor.contact_stiffness,
         }
     )
-    bank = rig.pipeline.rotor_bank.model_copy(update={"noise_um": noise_um})
+    bank = bank.model_copy(update={"noise_um": noise_um})
     return rig.model_copy(
         update={
             "machine": rig.machine.model_copy(update={"speed_rpm": plant.speed_rpm, "rotor": described}),

@@ -11,16 +11,16 @@ import pytest
 from bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, healthy, knocks
 from machine_files import MACHINES
 
-from daqsvc import assembly
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify_file import load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.parameter_sets import S3
 from daqsvc.bearing.two_sensors import PairModel
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.bearing_direction import TwoSensors
-from daqsvc.diagnosis.bearing_housed import HousedBearing
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.direction import TwoSensors
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import parse_machine_file
 from sim_hw.demo.session import Script, Session
@@ -325,10 +325,10 @@ async def test_damage_reaches_the_alarm_over_the_bus() -> None:
 
 async def test_the_healthy_state_outlives_a_restart(tmp_path) -> None:
     given = machine_file("mqtt://127.0.0.1:1")
-    (first,) = (d for d in assembly.detectors(given, tmp_path) if d.name == "bearing")
+    (first,) = (d for d in detectors(given, tmp_path) if d.name == "bearing")
     await asyncio.to_thread(lambda: list(feed(first, two(12.5, 95))))
     assert (tmp_path / "bearing.toml").exists()
-    (again,) = (d for d in assembly.detectors(given, tmp_path) if d.name == "bearing")
+    (again,) = (d for d in detectors(given, tmp_path) if d.name == "bearing")
     assert again.baseline is not None
     assert again.baseline.races == first.baseline.races
     hiss = 0.1 * np.random.default_rng(6).standard_normal((round(5.0 * RATE_HZ), 2)).astype(np.float32)

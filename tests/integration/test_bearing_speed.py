@@ -11,11 +11,11 @@ from bearing_signals import OUTER, RATE_HZ, SPEED_RPM, healthy, knocks
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.bearing_housed import HousedBearing
-from daqsvc.diagnosis.bearing_speed import SpeedError, measure_speed
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
+from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.probe_checks import KeyphasorProbe
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis

@@ -14,12 +14,12 @@ import pytest
 from machine_files import LAVAL, MACHINES, TRIAXIAL
 from machine_mutations import mutated
 
-from daqsvc import assembly
-from daqsvc.assembly import AssemblyError
 from daqsvc.assembly_drivers import frame_layout
 from daqsvc.cli import main
+from daqsvc.detectors.make import check_files
 from daqsvc.service import Service
 from daqsvc.settings import MachineFileError, describe, load_machine_file, parse_machine_file
+from daqsvc.settings.problems import AssemblyError
 
 RING_BYTES = 200_000_000
 DEVICE = MACHINES.parent / "devices" / "triaxial-accelerometer.dbc"
@@ -42,7 +42,7 @@ def checked(folder, name, data):
     try:
         machine = load_machine_file(path)
         describe(machine)
-        assembly.check_calibrations(machine)
+        check_files(machine)
     except MachineFileError as error:
         for problem in error.problems:
             assert problem.message

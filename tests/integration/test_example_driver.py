@@ -15,8 +15,8 @@ from conformance.rig import samples_of
 from live_service import running
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_drivers import AssemblyError, drivers, frame_layout
 from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings.problems import AssemblyError, drivers, frame_layout
 
 if TYPE_CHECKING:
     from daqsvc.settings import MachineFile

@@ -13,8 +13,9 @@ from mqtt_publishing import publishing
 from test_mqtt_commands import say
 
 from daqsvc.alarms.commands import Verb
+from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.publish.settings import HomeAssistantSettings, Reading
+from daqsvc.publish.settings import HomeAssistantSettings
 
 pytestmark = pytest.mark.mosquitto
 RIG = HomeAssistantSettings(

@@ -10,8 +10,8 @@ import pytest
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
+from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.levels import LevelChannel, LevelDetector
 from drivers.base import BusPort, StreamSpec
 from drivers.can_adapter import batch_of
 from drivers.can_bus import CanDriver

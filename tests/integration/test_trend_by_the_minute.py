@@ -17,10 +17,10 @@ from daqsvc.alarms.events import EventKind
 from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.detectors.levels.statements import Limits
+from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import Patience
-from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus import ModbusDriver
 from drivers.modbus_layouts import Trend

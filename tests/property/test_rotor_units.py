@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daqsvc.diagnosis.rotor_modes import RotorMode, bank_modes
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
 from daqsvc.rotor.model import NormalisedRotor, RotorParameters
 
 POSITIVE = st.floats(1e-2, 1e2)

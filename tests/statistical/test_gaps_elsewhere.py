@@ -17,13 +17,13 @@ from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import learn_healthy
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import RaceInputError
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.bearing_housed import HousedBearing
-from daqsvc.diagnosis.bearing_speed import SpeedError, measure_speed
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
+from daqsvc.detectors.rotor_bank.detector import RotorBankDetector, RotorMode
+from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
+from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.probe_checks import KeyphasorProbe, Probe
-from daqsvc.diagnosis.rotor_bank import RotorBankDetector, RotorMode
-from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
 from daqsvc.dsp.keyphasor import KeyphasorTracker
 from daqsvc.dsp.orders import order_vectors
 from daqsvc.rotor.laval import LavalRotor

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gapped_signals import FRAMES, RATE_HZ, SHARES, SIGNALS, lost
 
+from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
+from daqsvc.detectors.levels.partial import MOST_MISSING
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.levels import LevelChannel, LevelDetector
-from daqsvc.diagnosis.partial_levels import MOST_MISSING
 
 WINDOW = 1000
 WINDOWS = 60

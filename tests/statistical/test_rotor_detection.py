@@ -20,8 +20,8 @@ import pytest
 import rotor_runs as runs
 from scipy.stats import binom
 
+from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.rotor_bank import KeyphasorProbe, Probe, RotorBankDetector
 from daqsvc.rotor.decision import DecisionRules
 
 pytestmark = [pytest.mark.statistical, pytest.mark.timeout(900)]

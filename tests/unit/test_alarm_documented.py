@@ -15,8 +15,8 @@ from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.conditions import RESERVED
 from daqsvc.alarms.diagram import state_diagram
 from daqsvc.alarms.states import AlarmState, moves
+from daqsvc.detectors.levels.settings import Levels
 from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, Measure, StartUp, VotingAlarm
-from daqsvc.settings.pipeline import Levels
 from daqsvc.settings.sensors import TrendValue
 
 TEXT = (Path(__file__).parents[2] / "docs" / "alarms.md").read_text(encoding="utf-8")

@@ -11,10 +11,10 @@ from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.quality import LASTING
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
+from daqsvc.detectors.levels.detector import GapCheck, LevelChannel, LevelDetector
+from daqsvc.detectors.levels.partial import MOST_MISSING
+from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.level_statements import Limits
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
-from daqsvc.diagnosis.partial_levels import MOST_MISSING
 
 WINDOW = 1000
 SECOND_NS = 1_000_000_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem
 
-from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alignment import alignment
+from daqsvc.detectors.make import detectors
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 
 TWO_BUSES = MACHINES / "rotor-two-buses.toml"
@@ -50,10 +50,10 @@ def test_the_keyphasor_s_stream_is_the_grid_and_detectors_find_their_columns() -
     assert grid.rate_hz == 1600.0
     assert grid.channel_names == ("shaft-y.y", "shaft-y.kph", "shaft-x.x")
     assert [grid.column(machine.sensor(name)) for name in ("probe-x", "probe-y", "keyphasor")] == [2, 0, 1]
-    (detector,) = (d for d in assembly.detectors(machine) if d.name == "rotor-synchronous")
+    (detector,) = (d for d in detectors(machine) if d.name == "rotor-synchronous")
     assert detector.stream == grid.name
     # The levels of each probe are taken where it is sampled.
-    levels = {d.stream for d in assembly.detectors(machine) if d.name.startswith("levels/")}
+    levels = {d.stream for d in detectors(machine) if d.name.startswith("levels/")}
     assert levels == {"shaft-x", "shaft-y"}
     assert "shaft-x on the samples of shaft-y" in describe(machine)
 

@@ -7,9 +7,9 @@ import pytest
 
 from daqsvc.bearing.identify_change import BANDS, ResidualChange
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence, RaceVerdict
-from daqsvc.diagnosis.bearing_direction import Direction
-from daqsvc.diagnosis.bearing_finding import WORDS, find
-from daqsvc.diagnosis.bearing_standing import CLEAR_LOOKS, CONFIRM_LOOKS, Steadfast
+from daqsvc.detectors.bearing.direction import Direction
+from daqsvc.detectors.bearing.finding import WORDS, find
+from daqsvc.detectors.bearing.standing import CLEAR_LOOKS, CONFIRM_LOOKS, Steadfast
 
 
 def evidence(severity: float) -> PartEvidence:

@@ -10,14 +10,16 @@ import pytest
 from bearing_signals import healthy
 from machine_files import MACHINES, changed, only_problem, problems_of
 
-from daqsvc import assembly, assembly_bearing
+from daqsvc import assembly_bearing
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_file import save_bearing_baseline
 from daqsvc.cli import main
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.probe_checks import KeyphasorProbe
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.make import detectors
+from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
 from daqsvc.settings import describe, parse_machine_file
+from daqsvc.settings.problems import AssemblyError
 
 EXAMPLE = MACHINES / "bearing.toml"
 ROTOR = MACHINES / "rotor-synchronous.toml"
@@ -35,7 +37,7 @@ def machine(*replacements):
 
 
 def detector(given, store=None):
-    (made,) = (d for d in assembly.detectors(given, store) if isinstance(d, BearingDetector))
+    (made,) = (d for d in detectors(given, store) if isinstance(d, BearingDetector))
     return made
 
 
@@ -155,7 +157,7 @@ def test_two_sensors_of_a_bearing_tell_its_races_by_direction() -> None:
 
 def test_a_rate_too_low_for_the_rolling_elements_stops_it() -> None:
     pair = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}'
-    with pytest.raises(assembly.AssemblyError, match=r"bearings\[0\].model: at 7000 samples .* at 7716 Hz"):
+    with pytest.raises(AssemblyError, match=r"bearings\[0\].model: at 7000 samples .* at 7716 Hz"):
         detector(machine((TYPE, pair), ("rate_hz = 25_600.0", "rate_hz = 7_000.0")))
 
 
@@ -173,10 +175,10 @@ def test_a_calibration_of_other_masses_or_without_the_pair_stops_it(right, tmp_p
     kept = detector(machine((TYPE, pair), named)).baseline.pairs[names]
     assert kept.parameters == models[names].parameters
     np.testing.assert_array_equal(kept.detection.covariance, learnt.pairs[names].detection.covariance)
-    with pytest.raises(assembly.AssemblyError, match="learnt with other masses, springs or dampers"):
+    with pytest.raises(AssemblyError, match="learnt with other masses, springs or dampers"):
         detector(machine((TYPE, pair.replace("1e8", "1.1e8")), named))
     save_bearing_baseline(replace(learnt, pairs={}), path)
-    with pytest.raises(assembly.AssemblyError, match="holds nothing of accel-fe and accel-de together"):
+    with pytest.raises(AssemblyError, match="holds nothing of accel-fe and accel-de together"):
         detector(machine((TYPE, pair), named))
 
 
@@ -240,9 +242,9 @@ def test_an_alarm_follows_it_only_if_it_is_there() -> None:
 
 
 def test_a_bearing_that_nobody_knows_stops_the_assembly() -> None:
-    with pytest.raises(assembly.AssemblyError, match=r"bearings\[0\].type: bearing '6205-XX' is not in the"):
+    with pytest.raises(AssemblyError, match=r"bearings\[0\].type: bearing '6205-XX' is not in the"):
         detector(machine((TYPE, 'type = "6205-XX"')))
-    with pytest.raises(assembly.AssemblyError, match=r"bearings\[1\].orders: BPFI 7 does not fit BPFO 3.053"):
+    with pytest.raises(AssemblyError, match=r"bearings\[1\].orders: BPFI 7 does not fit BPFO 3.053"):
         detector(machine(("bpfi = 4.9469", "bpfi = 7.0")))
 
 
@@ -276,7 +278,7 @@ def test_a_calibration_that_does_not_fit_stops_it(tmp_path, rate_hz, speed_rpm, 
     path = tmp_path / "motor.toml"
     save_bearing_baseline(baseline(rate_hz, speed_rpm, *sensors), path)
     key = rf"pipeline\.bearing\.calibration = '.*motor\.toml': .*{said}"
-    with pytest.raises(assembly.AssemblyError, match=key):
+    with pytest.raises(AssemblyError, match=key):
         detector(machine(("calibrate_s = 30.0", f'calibration = "{path}"')))
 
 

@@ -9,8 +9,8 @@ import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem
 from shaft_channels import channels_of, feed
 
-from daqsvc import assembly
 from daqsvc.commands.detectability import DetectabilityCommand
+from daqsvc.detectors.make import detectors
 from daqsvc.settings import describe, parse_machine_file
 from sim_hw.plants import rotor as plant
 
@@ -55,7 +55,7 @@ def test_the_detectors_see_a_clockwise_shaft_as_its_mirror_image(which):
     told = []
     for clockwise in (False, True):
         machine = rig(clockwise=clockwise)
-        (detector,) = (made for made in assembly.detectors(machine) if made.name == which)
+        (detector,) = (made for made in detectors(machine) if made.name == which)
         told.append(course(detector, samples(clockwise=clockwise)))
     assert told[1] == told[0]
     assert told[0][-1][0] in {"F1", "unbalance", "damping_loss"}
@@ -67,7 +67,7 @@ def test_thresholds_by_a_rate_of_false_alarms_do_not_know_the_direction():
     thresholds = []
     for speed in (SPEED, "speed_rpm = -600.0"):
         machine = parse_machine_file(text.replace(SPEED, speed, 1), LAVAL)
-        (bank,) = (made for made in assembly.detectors(machine) if made.name == "rotor-bank")
+        (bank,) = (made for made in detectors(machine) if made.name == "rotor-bank")
         thresholds.append(bank.rules.thresholds(4))
     np.testing.assert_array_equal(*thresholds)
     assert np.isfinite(thresholds[0]).all()

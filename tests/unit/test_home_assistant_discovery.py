@@ -11,14 +11,15 @@ import pytest
 from home_assistant_rules import check_discovery, rendered
 from machine_files import LAVAL, MACHINES
 
-from daqsvc import assembly
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.reading import Reading
 from daqsvc.publish.command_payloads import CommandPayload
 from daqsvc.publish.home_assistant import Discovery
 from daqsvc.publish.home_assistant_readings import Readings
-from daqsvc.publish.settings import HomeAssistantSettings, Reading
+from daqsvc.publish.settings import HomeAssistantSettings
 from daqsvc.publish.topics import Topics
 from daqsvc.settings import parse_machine_file
 from sim_hw.plants import rotor as plant
@@ -111,7 +112,7 @@ def said():
     period_ns = 1e9 / 640.0
     readings = Readings(mqtt_settings(rig).home_assistant, Topics("daqsvc", rig.site, rig.box), SystemClock())
     units = {}
-    for detector in assembly.detectors(rig):
+    for detector in detectors(rig):
         detector.warm()
         for begin in range(0, len(samples) - detector.block + 1, detector.block):
             part = samples[begin : begin + detector.block]

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
+from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.home_assistant_memory import FILE, ToldTopics
 from daqsvc.publish.home_assistant_readings import Readings
-from daqsvc.publish.settings import HomeAssistantSettings, Reading
+from daqsvc.publish.settings import HomeAssistantSettings
 from daqsvc.publish.topics import Topics
 
 SETTINGS = HomeAssistantSettings(

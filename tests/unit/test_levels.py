@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daqsvc.detectors.levels.detector import GapCheck, LevelChannel, LevelDetector
+from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.level_statements import Limits
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
 from daqsvc.dsp.levels import band_rms, levels
 
 RATE_HZ = 2000.0

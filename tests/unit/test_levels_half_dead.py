@@ -9,9 +9,9 @@ from alarm_rig import AlarmRig
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import Level
+from daqsvc.detectors.levels.detector import GapCheck, LevelChannel, LevelDetector
+from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.level_statements import Limits
-from daqsvc.diagnosis.levels import GapCheck, LevelChannel, LevelDetector
 
 RATE_HZ = 300.0
 BLOCK = 150

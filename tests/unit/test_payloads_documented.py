@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daqsvc import assembly
 from daqsvc.alarms.events import EventKind
 from daqsvc.alarms.states import AlarmState
+from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.publish.schemas import PAYLOADS
 from daqsvc.service import Service
@@ -66,7 +66,7 @@ def said():
     samples = np.column_stack((x, y, keyphasor_voltage(motion.revolution))).astype(np.float32)
     period_ns = 1e9 / 640.0
     last = {}
-    for detector in assembly.detectors(RIG):
+    for detector in detectors(RIG):
         detector.warm()
         for begin in range(0, len(samples) - detector.block + 1, detector.block):
             part = samples[begin : begin + detector.block]

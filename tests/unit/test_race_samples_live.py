@@ -9,8 +9,8 @@ from bearing_signals import OUTER, RATE_HZ, SPEED_RPM, healthy, knocks
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.bearing_housed import HousedBearing
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:

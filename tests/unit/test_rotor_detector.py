@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
 
+from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.rotor_bank import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant

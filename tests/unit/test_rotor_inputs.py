@@ -9,7 +9,13 @@ import pytest
 import rotor_runs as runs
 from shaft_channels import feed
 
-from daqsvc.diagnosis.rotor_bank import DEPARTURE, KeyphasorProbe, Probe, RotorBankDetector, RotorMode
+from daqsvc.detectors.rotor_bank.detector import (
+    DEPARTURE,
+    KeyphasorProbe,
+    Probe,
+    RotorBankDetector,
+    RotorMode,
+)
 from daqsvc.rotor.decision import DecisionRules
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.sensors import keyphasor_voltage

@@ -9,14 +9,15 @@ import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
 from run_ups import RATE_HZ, record
 
-from daqsvc import assembly
 from daqsvc.assembly_alarms import alarm_rules
-from daqsvc.diagnosis.rotor_synchronous import RotorSynchronousDetector
+from daqsvc.detectors.make import detectors
+from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.rotor.calibration.file import CalibrationRecord, save_calibration, save_record
 from daqsvc.rotor.calibration.run_up import fit_run_up
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.settings import describe, parse_machine_file
+from daqsvc.settings.problems import AssemblyError
 
 EXAMPLE = MACHINES / "rotor-synchronous.toml"
 TABLE = "[pipeline.rotor_synchronous]"
@@ -28,7 +29,7 @@ def machine(*replacements):
 
 
 def detector(given):
-    (made,) = (d for d in assembly.detectors(given) if isinstance(d, RotorSynchronousDetector))
+    (made,) = (d for d in detectors(given) if isinstance(d, RotorSynchronousDetector))
     return made
 
 
@@ -153,18 +154,18 @@ def test_a_calibration_is_read_beside_the_machine_file(tmp_path):
     np.testing.assert_array_equal(made.watch.calibration.baseline, calibration.baseline)
     assert "healthy state in healthy.toml" in " ".join(describe(given).split())
     save_calibration(dataclasses.replace(calibration, speed_rpm=3000.0), tmp_path / "healthy.toml")
-    with pytest.raises(assembly.AssemblyError, match=r"rotor_synchronous\.calibration = 'healthy\.toml'"):
-        assembly.detectors(given)
+    with pytest.raises(AssemblyError, match=r"rotor_synchronous\.calibration = 'healthy\.toml'"):
+        detectors(given)
     (tmp_path / "healthy.toml").unlink()
-    with pytest.raises(assembly.AssemblyError, match=r"rotor_synchronous\.calibration = 'healthy\.toml'"):
-        assembly.detectors(given)
+    with pytest.raises(AssemblyError, match=r"rotor_synchronous\.calibration = 'healthy\.toml'"):
+        detectors(given)
 
 
 def test_a_kept_healthy_state_is_used_with_what_the_file_says_of_the_rotor_now(tmp_path, caplog):
     calibration = healthy(LavalRotor(natural_frequency_hz=99.0, damping_ratio=0.5), 50)
 
     def kept():
-        made = assembly.detectors(machine(), tmp_path)
+        made = detectors(machine(), tmp_path)
         return next(d for d in made if isinstance(d, RotorSynchronousDetector)).watch
 
     assert kept().state == "calibrating"
@@ -190,7 +191,7 @@ def test_a_run_up_tells_the_rotor_and_the_healthy_state_is_learnt_live(tmp_path)
     store.mkdir()
 
     def watch():
-        made = assembly.detectors(given, store)
+        made = detectors(given, store)
         return next(d for d in made if isinstance(d, RotorSynchronousDetector)).watch
 
     learning = watch()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from machine_files import LAVAL, MOTOR, changed, only_problem, problems_of
 
-from daqsvc import assembly
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.flood import FloodLimit
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules
-from daqsvc.diagnosis.level_statements import Limits
+from daqsvc.detectors.levels import plugin as levels_plugin
+from daqsvc.detectors.levels.statements import Limits
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -50,7 +50,7 @@ def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
     assert (rule.group, rule.setpoint.alert, rule.latching) == ("shaft", 45.0, False)
     assert "rms of 2 of probe-x, probe-y" in describe(machine)
     assert "start-up x2" in " ".join(describe(machine).split())
-    assert Limits("rms", 45.0, None) in assembly._limits(machine, "probe-y")
+    assert Limits("rms", 45.0, None) in levels_plugin._limits(machine, "probe-y")
 
 
 def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():

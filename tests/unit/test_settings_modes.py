@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
 
-from daqsvc.assembly import detectors
+from daqsvc.detectors.make import detectors
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 
 TWELVE = MACHINES / "laval-rig-twelve-modes.toml"

@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 from machine_files import LAVAL, MACHINES, MOTOR, changed, only_problem, problems_of
 
-from daqsvc import assembly
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules
 from daqsvc.assembly_mqtt import mqtt_settings
-from daqsvc.diagnosis.levels import LevelDetector
-from daqsvc.diagnosis.trends import TrendDetector
-from daqsvc.publish.settings import Reading
+from daqsvc.detectors.levels.detector import LevelDetector
+from daqsvc.detectors.levels.trends import TrendDetector
+from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.reading import Reading
 from daqsvc.settings import load_machine_file, parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -64,7 +64,7 @@ def test_a_pump_becomes_detectors_rules_and_readings():
     text, _ = changed(PUMP, ("[pipeline]", MQTT))
     machine = parse_machine_file(text, PUMP)
     assert machine.warnings == ()
-    made = assembly.detectors(machine)
+    made = detectors(machine)
     assert [(type(one), one.name, one.block) for one in made] == [
         (TrendDetector, "trends/drive-end", 1),
         (TrendDetector, "trends/other-end", 1),
@@ -93,7 +93,7 @@ def test_a_stream_may_have_waveforms_and_trend_values():
     text, _ = changed(GAPS, ('channel = "y"\nunit = "V"\nok_between', PROBE_Y))
     text = text.replace('name = "probe-y"\ntype = "trend"', 'name = "probe-y"\ntype = "proximity"')
     text = text.replace('"probe-y"\nmeasure = "value"', '"probe-y"\nmeasure = "gap_voltage"')
-    level, trend = assembly.detectors(parse_machine_file(text, GAPS))
+    level, trend = detectors(parse_machine_file(text, GAPS))
     assert (type(level), level.name, level.block) == (LevelDetector, "levels/gap", 20)
     assert (type(trend), trend.name, trend.block) == (TrendDetector, "trends/gap", 20)
     speaking = [said.detector for one in (level, trend) for said in one.silent(2.0, 0)]

@@ -17,13 +17,13 @@ from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.diagnosis.bearing import BearingDetector
-from daqsvc.diagnosis.bearing_housed import HousedBearing
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
+from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.levels import LevelChannel, LevelDetector
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import SILENT_PERIODS, UNKNOWN_NS, Patience
-from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 from daqsvc.settings import parse_machine_file
 
 RATE_HZ = 3200.0

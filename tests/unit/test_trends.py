@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daqsvc.detectors.levels.statements import Limits
+from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.level_statements import Limits
-from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 
 SECOND_NS = 10**9
 NAN = float("nan")

@@ -13,9 +13,9 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.alarms.voting import VotingRule
+from daqsvc.detectors.levels.statements import Limits
+from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.level_statements import Limits
-from daqsvc.diagnosis.trends import TrendChannel, TrendDetector
 
 SECOND_NS = 1_000_000_000
 NAN = float("nan")

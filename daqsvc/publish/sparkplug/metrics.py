@@ -17,8 +17,8 @@ from daqsvc.publish.sparkplug.codec import DataType, Metric
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.publish.settings import Reading
 
 NS_PER_MS = 1_000_000
 UNIT = "engUnit"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.publish.settings import Reading
+    from daqsvc.diagnosis.reading import Reading
 
 
 class Server(NamedTuple):

@@ -1,0 +1,251 @@
+"""The bearings' detector out of a machine file."""
+
+from __future__ import annotations
+
+import logging
+from functools import partial
+from typing import TYPE_CHECKING
+
+from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.identify_change import ChangeRules
+from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.isolation import least_rate_hz
+from daqsvc.bearing.model import BearingParameters
+from daqsvc.bearing.two_sensors import PairModel, TwoSensorMonitor
+from daqsvc.detectors.bearing.detector import SAME_SPEED, BearingDetector
+from daqsvc.detectors.bearing.direction import TwoSensors
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.bearing.settings import BEARING
+from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
+from daqsvc.dsp.levels import STANDARD_GRAVITY
+from daqsvc.settings.models import Keyphasor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.detectors.bearing.settings import Bearing, WatchedBearing
+    from daqsvc.settings.models import MachineFile
+
+log = logging.getLogger(__name__)
+
+SAME_RATE = 1e-3
+"""How far two sampling rates may differ that count as one, as a share."""
+_M_S2_PER_UNIT = {"g": STANDARD_GRAVITY, "m/s2": 1.0}
+
+
+def bearing_detector(
+    machine: MachineFile, given: Bearing, store: Path | None, calibration: Path | None = None
+) -> BearingDetector:
+    """The detector that ``[pipeline.bearing]`` asks for.
+
+    Args:
+        machine: the machine file.
+        given: its bearings.
+        store: directory of the state that survives restarts; None to begin without any and leave none.
+        calibration: file with the healthy machine, in place of what the machine file names.
+
+    Raises:
+        ValueError: a bearing is not in the catalogue, its orders contradict each other, or a file with the
+            healthy machine cannot be used.
+    """
+    stream = machine.sensor(given.bearings[0].sensor).stream
+    rate_hz = machine.streams[stream].rate_hz
+    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
+    speed_rpm = machine.machine.speed_rpm
+    keyphasor = None if given.keyphasor is None else _keyphasor(machine, given.keyphasor)
+    # A measured speed tells by itself when the healthy machine's is another one.
+    same_speed_rpm = speed_rpm if keyphasor is None else None
+    baseline: BearingBaseline | None = None
+    kept: Path | None = None
+    if calibration is not None:
+        baseline = _fitting(calibration, bearings, rate_hz, same_speed_rpm)
+    elif given.calibration is not None:
+        try:
+            baseline = _fitting(machine.resolve(given.calibration), bearings, rate_hz, same_speed_rpm)
+        except BaselineFileError as error:
+            raise BaselineFileError(
+                f"pipeline.bearing.calibration = {str(given.calibration)!r}: {error}"
+            ) from None
+    elif store is not None:
+        kept = store / f"{BEARING}.toml"
+        baseline = _kept(kept, bearings, rate_hz, same_speed_rpm)
+    return BearingDetector(
+        machine=machine.machine.name,
+        stream=stream,
+        rate_hz=rate_hz,
+        speed_rpm=speed_rpm,
+        bearings=bearings,
+        keyphasor=keyphasor,
+        rules=ChangeRules(
+            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+        ),
+        baseline=baseline,
+        calibrate_s=given.calibrate_s,
+        name=BEARING,
+        keep=None if kept is None else partial(_keep, kept),
+    )
+
+
+def pair_models(machine: MachineFile, given: Bearing) -> dict[tuple[str, ...], PairModel]:
+    """Bearings with an accelerometer on rotor and housing, by the names of these in that order.
+
+    Args:
+        machine: the machine file.
+        given: its bearings, or those that a recording has.
+
+    Raises:
+        ValueError: masses and springs cannot be those of a bearing, or the rate is too low for them.
+    """
+    found = ((bearing.sensors, _two_sensors(machine, bearing, i)) for i, bearing in enumerate(given.bearings))
+    return {tuple(sensors): two.model for sensors, two in found if two is not None}
+
+
+def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
+    sensor = machine.sensor(name)
+    assert isinstance(sensor, Keyphasor)  # noqa: S101 - detectors/bearing/checks.py
+    column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+    return KeyphasorProbe(name, column, sensor.threshold_v, sensor.hysteresis_v, sensor.edge)
+
+
+def _housed(machine: MachineFile, index: int, given: WatchedBearing) -> HousedBearing:
+    sensor = machine.sensor(given.sensor)
+    column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+    two = _two_sensors(machine, given, index)
+    return HousedBearing(given.name, given.sensor, column, orders_of(given, index), two)
+
+
+def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> TwoSensors | None:
+    """The accelerometer on the rotor and the masses of a bearing of a machine file; None if it has none.
+
+    Args:
+        machine: the machine file.
+        given: the bearing.
+        index: its place in ``pipeline.bearing.bearings``.
+
+    Raises:
+        ValueError: its masses and springs cannot be those of a bearing, or the rate is too low for them.
+    """
+    if given.rotor_sensor is None or given.model is None:
+        return None
+    model = given.model
+    (m_r, m_b, m_h), (k_s, k_c, k_h), (c_s, c_c, c_h) = (
+        model.masses_kg,
+        model.stiffness_n_per_m,
+        model.damping_n_s_per_m,
+    )
+    rotor, housing = machine.sensor(given.rotor_sensor), machine.sensor(given.sensor)
+    column = machine.streams[rotor.stream].layout.channel_names.index(rotor.channel)
+    m_s2_per_unit = (_M_S2_PER_UNIT[rotor.unit], _M_S2_PER_UNIT[housing.unit])
+    try:
+        parameters = BearingParameters(
+            m_r=m_r, m_b=m_b, m_h=m_h, k_s=k_s, k_c=k_c, k_h=k_h, c_s=c_s, c_c=c_c, c_h=c_h
+        )
+    except ValueError as error:
+        raise ValueError(f"pipeline.bearing.bearings[{index}].model: {error}") from None
+    rate_hz, least_hz = machine.streams[housing.stream].rate_hz, least_rate_hz(parameters)
+    if rate_hz < least_hz:
+        raise ValueError(
+            f"pipeline.bearing.bearings[{index}].model: at {rate_hz:g} samples a second the races of this "
+            f"bearing look alike; sample at {least_hz:.0f} Hz or faster, or remove model and rotor_sensor"
+        )
+    return TwoSensors(rotor.name, column, PairModel(parameters, m_s2_per_unit, model.mismatch))
+
+
+def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
+    """Fault orders of a bearing of a machine file.
+
+    Args:
+        given: the bearing.
+        index: its place in ``pipeline.bearing.bearings``.
+
+    Raises:
+        ValueError: the catalogue does not know it, or its orders contradict each other.
+    """
+    at = f"pipeline.bearing.bearings[{index}]"
+    if given.orders is None:
+        assert given.type is not None  # noqa: S101 - detectors/bearing/checks.py: one of the two
+        try:
+            return bearing_orders(given.type)
+        except KeyError as error:
+            raise ValueError(f"{at}.type: {error.args[0]}") from None
+    orders = given.orders
+    try:
+        return BearingOrders(inner=orders.bpfi, outer=orders.bpfo, ball=orders.bsf, cage=orders.ftf)
+    except ValueError as error:
+        raise ValueError(f"{at}.orders: {error}") from None
+
+
+def _fitting(
+    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
+) -> BearingBaseline:
+    """The healthy machine of a file, if it is that of these accelerometers at this rate and speed.
+
+    Args:
+        path: the file.
+        bearings: the bearings.
+        rate_hz: sampling rate.
+        speed_rpm: speed of the shaft; None: any.
+
+    Raises:
+        BaselineFileError: it is not, or the file cannot be used.
+    """
+    found = load_bearing_baseline(path)
+    lacking = [
+        name
+        for b in bearings
+        for name in b.sensors
+        if b.sensors not in found.residuals or b.sensor not in found.races
+    ]
+    if lacking:
+        known = ", ".join(found.races) or "none"
+        raise BaselineFileError(
+            f"{path}: holds nothing of {', '.join(lacking)}, but of {known}; calibrate with all of them"
+        )
+    for what, value, wanted, tolerance in (
+        ("sampled at {:g} Hz", found.rate_hz, rate_hz, SAME_RATE),
+        ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm or found.speed_rpm), SAME_SPEED),
+    ):
+        if abs(value / wanted - 1.0) > tolerance:
+            raise BaselineFileError(
+                f"{path}: is {what.format(value)}, not {what.format(wanted)}; calibrate as it is watched"
+            )
+    for bearing in bearings:
+        if bearing.two is None:
+            continue
+        pair = found.pairs.get(bearing.sensors)
+        names = " and ".join(bearing.sensors)
+        if pair is None:
+            raise BaselineFileError(f"{path}: holds nothing of {names} together; calibrate with both")
+        if pair.parameters != bearing.two.model.parameters:
+            raise BaselineFileError(
+                f"{path}: was learnt with other masses, springs or dampers of {bearing.name} than "
+                "pipeline.bearing.bearings has now; calibrate again, or restore them"
+            )
+        try:
+            TwoSensorMonitor(pair)
+        except ValueError as error:
+            raise BaselineFileError(f"{path}: pair of {names}: {error}; calibrate again") from None
+    return found
+
+
+def _kept(
+    path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
+) -> BearingBaseline | None:
+    """The healthy machine that was learnt before a restart."""
+    if not path.exists():
+        return None
+    try:
+        return _fitting(path, bearings, rate_hz, speed_rpm)
+    except BaselineFileError as error:
+        log.warning("the healthy state of the bearings is learnt anew: %s", error)
+        return None
+
+
+def _keep(path: Path, baseline: BearingBaseline) -> None:
+    """Keep the healthy state, so that a restart does not take a faulty machine for a healthy one."""
+    try:
+        save_bearing_baseline(baseline, path)
+    except BaselineFileError as error:
+        log.error("the healthy state of the bearings will be lost at the next restart: %s", error)  # noqa: TRY400

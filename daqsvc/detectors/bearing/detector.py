@@ -1,0 +1,414 @@
+"""Rolling bearings as a detector: accelerometers on their housings in, the damaged part out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.bearing.identify_change import ChangeRules, compare_residual
+from daqsvc.bearing.race.rules import RaceRules
+from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
+from daqsvc.detectors.bearing.direction import Direction, RaceDirection
+from daqsvc.detectors.bearing.finding import SOUND, find
+from daqsvc.detectors.bearing.learning import HealthyGathering
+from daqsvc.detectors.bearing.look import (
+    LARGE,
+    Look,
+    evidence_of,
+    figures_of,
+    thresholds_of,
+    units_of,
+)
+from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
+from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
+from daqsvc.detectors.bearing.standing import Standing, Steadfast
+from daqsvc.diagnosis.record import Diagnosis, silence_reason
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.bearing.race.verdict import RaceVerdict
+    from daqsvc.detectors.bearing.housed import HousedBearing
+    from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
+    from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.record import DataQuality, Severity
+
+    Floats = NDArray[np.float64]
+
+MODEL = "bearing-race/1"
+
+_BLOCKS_PER_LOOK = 5
+_LEAST_LAST = 0.5
+"""Part of a look that is worth a last one."""
+_MISSING = 0.01
+"""Part of a look's samples that may be missing; single ones are bridged."""
+_NO_LONGER_LARGE = 8.0
+"""Danger stays until the innovations are less than so many times the healthy ones."""
+SAME_SPEED = 0.05
+"""A shaft that turns faster or slower by more than this share is not compared with the healthy one."""
+
+
+class BearingDetector:
+    """Says whether a rolling bearing is damaged, and which part of it; see `Detector`.
+
+    Every 2.5 s the last ten seconds are looked at (`RaceWatch`), each bearing by the accelerometer on its
+    housing; the bearing that shows most decides. What the healthy machine's own vibration cannot predict
+    says whether anything has changed. The first seconds, or a baseline of an earlier time, are the healthy
+    machine; seconds that show a fault or are not steady are not taken for it, and the reason is said.
+
+    Decisions are ``undetermined``, ``normal``, ``changed``, ``inner``, ``outer``, ``ball`` and
+    ``inner_or_outer``. Two looks must agree before a fault is raised, eight before it is taken back. Any
+    fault is alert; danger from ten times the healthy innovations on.
+
+    A look with missing samples, or at a dead or clipped accelerometer, or at a machine that stands still,
+    clears nothing: the decision is held and the reason said, unless another bearing shows a fault by itself.
+
+    A bearing with two accelerometers is also watched by direction (`RaceDirection`); `find` says how that
+    joins what the lines say. With a keyphasor the lines are looked for at the measured speed. Where that
+    leaves the tolerance of the race test, the evidence begins anew; at another speed than the healthy
+    machine's nothing is compared with it. Neither clears anything.
+
+    Args:
+        machine: name of the machine.
+        stream: name of the stream with all sensors.
+        rate_hz: sampling rate.
+        speed_rpm: shaft speed, right to about 1 %; of a shaft with a keyphasor, what it turns at mostly.
+        bearings: the bearings.
+        keyphasor: what measures the speed, if anything does.
+        rules: what counts as a change.
+        race: settings of the race test.
+        baseline: the healthy machine; made of the first ``calibrate_s`` seconds if not given.
+        calibrate_s: how much of it is needed.
+        name: name of the detector.
+        keep: called with the baseline that was made of the first seconds, on the detector's thread.
+    """
+
+    def __init__(
+        self,
+        *,
+        machine: str,
+        stream: str,
+        rate_hz: float,
+        speed_rpm: float,
+        bearings: Sequence[HousedBearing],
+        keyphasor: KeyphasorProbe | None = None,
+        rules: ChangeRules | None = None,
+        race: RaceRules | None = None,
+        baseline: BearingBaseline | None = None,
+        calibrate_s: float = 30.0,
+        name: str = "bearing",
+        keep: Callable[[BearingBaseline], None] | None = None,
+    ) -> None:
+        self.name = name
+        self.stream = stream
+        self.block = round(WINDOW_S / _BLOCKS_PER_LOOK * rate_hz)
+        self.bearings = tuple(bearings)
+        self.baseline = baseline
+        self._machine = machine
+        self._rate_hz = rate_hz
+        self._speed_rpm = abs(speed_rpm)
+        self.rules = rules or ChangeRules()
+        self._race = race or RaceRules()
+        self.keyphasor = keyphasor
+        self._learning = HealthyGathering(self.bearings, rate_hz, calibrate_s)
+        self._keep = keep
+        self._watches, self._directions = self._new_watches(), self._new_directions()
+        self._pending: list[NDArray[np.float32]] = []
+        self._steadfast = Steadfast()
+        self.seen: Look | None = None
+        """The last look at good samples."""
+        self._large = False
+        self._end_index = 0
+        self._speed_unknown = self._has_looked = False
+
+    @property
+    def standing(self) -> Standing:
+        """What it stands by."""
+        return self._steadfast.standing
+
+    def warm(self) -> None:
+        """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
+        samples = round(WINDOW_S * self._rate_hz)
+        noise = np.random.default_rng(1).standard_normal((samples, 2))
+        RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).take(noise[:, 0])
+        for direction in self._directions.values():
+            direction.judge(noise)
+
+    def process(self, window: Window) -> Sequence[Diagnosis]:
+        """See `Detector.process`."""
+        if window.snapshot:
+            return [self._snapshot(window)]
+        if window.first_index != self._end_index:
+            self._forget()
+        said = []
+        count = len(window.samples) // self.block
+        for number in range(count):
+            self._pending.append(window.samples[number * self.block : (number + 1) * self.block])
+            self._end_index = window.first_index + (number + 1) * self.block
+            if len(self._pending) == _BLOCKS_PER_LOOK:
+                after = len(window.samples) - (number + 1) * self.block
+                said.append(self._look(window.t_end_ns - round(after * window.period_ns)))
+        return said
+
+    def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+        """See `Detector.silent`."""
+        look = Look({}, {}, "missing", silence_reason(self.stream, silence_s), None)
+        return [self._statement(look, self._end_index, t_ns, changed=False)]
+
+    def finish(self, rest: NDArray[np.float32], t_ns: int) -> Diagnosis | None:
+        """A last look, at the end of a recording.
+
+        Args:
+            rest: float32 ``[n, channels]``, what did not fill a block.
+            t_ns: time of its last sample.
+
+        Returns:
+            None if there is too little that has not been looked at.
+        """
+        if len(rest):
+            self._pending.append(rest)
+            self._end_index += len(rest)
+        left = sum(map(len, self._pending))
+        if left == 0 or (self.seen is not None and left < _LEAST_LAST * _BLOCKS_PER_LOOK * self.block):
+            return None
+        return self._look(t_ns, last=True)
+
+    def _snapshot(self, window: Window) -> Diagnosis:
+        """A look at a block by itself: evidence is not gathered over several, but they must agree as ever."""
+        self._end_index = window.first_index + len(window.samples)
+        for watch in self._watches.values():
+            watch.forget()
+        least = _LEAST_LAST * WINDOW_S
+        if len(window.samples) < least * self._rate_hz:
+            length_s = len(window.samples) / self._rate_hz
+            reason = (
+                f"a block of {self.stream} is {length_s:.3g} s long, and a bearing is judged by {least:g} s "
+                "or more; make the device take longer blocks"
+            )
+            look = Look({}, {}, "missing", reason, None)
+            return self._statement(look, window.first_index, window.t_end_ns, changed=False)
+        # What follows is another block: a row without samples keeps them apart.
+        apart = np.full((1, window.samples.shape[1]), np.nan, np.float32)
+        self._pending = [window.samples]
+        return self._look(window.t_end_ns, apart=apart)
+
+    def _look(self, t_ns: int, *, last: bool = False, apart: NDArray[np.float32] | None = None) -> Diagnosis:
+        """Judge what is pending; ``apart`` keeps it from what follows where that does not go on from it."""
+        samples = np.concatenate(self._pending)
+        self._pending = []
+        first_index = self._end_index - len(samples)
+        look = self._judge(samples.astype(np.float64))
+        if look.quality != "good":
+            self._steadfast.interrupt()
+            return self._statement(look, first_index, t_ns, changed=False)
+        assert look.finding is not None  # noqa: S101 - good
+        self.seen = look
+        changed = self._steadfast.look(look.finding, last=last)
+        if self.baseline is None:
+            learnt_from = samples if apart is None else np.concatenate((samples, apart))
+            self.baseline = self._learning.take(learnt_from, look.finding, self._speed_rpm)
+            if self.baseline is not None:
+                self._watches, self._directions = self._new_watches(), self._new_directions()
+                if self._keep is not None:
+                    self._keep(self.baseline)
+        return self._statement(look, first_index, t_ns, changed=changed)
+
+    def _judge(self, samples: Floats) -> Look:
+        """What the bearings show, one by one and together."""
+        samples = np.where(np.isfinite(samples), samples, np.nan)
+        unfit = list(self._follow_speed(samples))
+        races: dict[str, RaceVerdict] = {}
+        changes: dict[str, ResidualChange] = {}
+        directions: dict[str, Direction] = {}
+        for bearing in () if self._speed_unknown else self.bearings:
+            signal = samples[:, bearing.column]
+            missing = int(np.isnan(signal).sum())
+            if missing > _MISSING * len(signal):
+                self._watches[bearing.name].forget()
+                lost = f"{missing} of {len(signal)} samples are missing"
+                unfit.append(("missing", f"{bearing.sensor}: {lost}; check the bus and the device"))
+                continue
+            try:
+                refuse_clipped(signal)
+                race = self._watches[bearing.name].take(signal)
+                departed = self._departed(bearing, samples)
+            except (ClippedError, RaceInputError, _StandsStillError) as error:
+                self._watches[bearing.name].forget()
+                unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
+                continue
+            races[bearing.name] = race
+            # "Normal" of samples that had to be put right clears nothing; a fault seen through them is one.
+            unfit += [("not_ok", f"{bearing.sensor}: {repair}") for repair in race.repairs]
+            if departed is not None:
+                changes[bearing.name] = departed
+            suspected = race.verdict not in SOUND or (departed is not None and departed.changed)
+            directions |= self._directed(bearing, samples, suspected=suspected)
+        change = max(changes.values(), key=lambda one: one.departure, default=None)
+        finding = find(races, change, self.rules.false_alarm_probability, directions) if races else None
+        reason = "; ".join(why for _, why in unfit)
+        if unfit and (finding is None or finding.verdict in SOUND):
+            # What one bearing does not show says nothing about another that cannot be seen.
+            return Look(races, changes, unfit[0][0], reason, finding, directions)
+        return Look(races, changes, "good", reason, finding, directions)
+
+    def _follow_speed(self, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
+        """Measure the speed; begin anew where it has changed. Yields what is against the look."""
+        self._speed_unknown = False
+        if self.keyphasor is None:
+            return
+        volts = samples[:, self.keyphasor.column]
+        try:
+            speed = measure_speed(volts, self.keyphasor, self._rate_hz)
+        except SpeedError as error:
+            self._speed_unknown = True
+            self._begin_anew()
+            missing = int(np.isnan(volts).sum())
+            if missing > _MISSING * len(volts):
+                lost = f"{missing} of {len(volts)} samples are missing, and pulses with them"
+                yield "missing", f"{self.keyphasor.name}: {lost}; check the bus and the device"
+            else:
+                yield "not_ok", str(error)
+            return
+        before, tolerance = self._speed_rpm, self._race.speed_tolerance
+        if speed.drift > tolerance:
+            self._speed_unknown = True
+            self._begin_anew()
+            drifts = f"the speed changes by {speed.drift:.1%} within {len(samples) / self._rate_hz:.2g} s"
+            yield (
+                "not_ok",
+                f"{drifts}: the bearings are judged again when it is steady within {tolerance:.1%}",
+            )
+            return
+        if abs(speed.rpm / before - 1.0) > tolerance:
+            self._speed_rpm = speed.rpm
+            self._begin_anew()
+            if self._has_looked:
+                yield (
+                    "not_ok",
+                    f"the speed has gone from {before:.0f} to {speed.rpm:.0f} rpm: the evidence begins anew",
+                )
+        self._has_looked = True
+        if self.baseline is not None and not self._comparable:
+            healthy = f"the healthy state is that at {self.baseline.speed_rpm:.0f} rpm"
+            yield "not_ok", f"the speed is {speed.rpm:.0f} rpm, and {healthy}: only damage with lines shows"
+
+    @property
+    def _comparable(self) -> bool:
+        """Whether the shaft turns as fast as the healthy one did."""
+        return (
+            self.baseline is not None and abs(self._speed_rpm / self.baseline.speed_rpm - 1.0) <= SAME_SPEED
+        )
+
+    def _directed(self, bearing: HousedBearing, samples: Floats, *, suspected: bool) -> dict[str, Direction]:
+        """What the two accelerometers of a bearing tell; empty if it has one only."""
+        if bearing.name not in self._directions or not self._comparable:
+            return {}
+        pair = samples[:, list(bearing.columns)]
+        found = self._directions[bearing.name].judge(pair, suspected=suspected)
+        return {} if found is None else {bearing.name: found}
+
+    def _departed(self, bearing: HousedBearing, samples: Floats) -> ResidualChange | None:
+        """How the innovations at a bearing differ from the healthy machine's.
+
+        Raises:
+            _StandsStillError: the machine does not run, or the sensor is loose.
+        """
+        if self.baseline is None or not self._comparable:
+            return None
+        if bearing.sensors not in self.baseline.residuals:
+            return None
+        healthy = self.baseline.residuals[bearing.sensors]
+        levels = healthy.levels_db(samples[:, list(bearing.columns)])
+        if not np.isfinite(levels).any():
+            return None
+        change = compare_residual(healthy, levels, self.rules)
+        if change.quiet:
+            raise _StandsStillError(
+                f"{-change.rise_db[0]:.1f} dB quieter than the healthy machine; it stands still, or the "
+                "sensor is loose"
+            )
+        return change
+
+    def _new_watches(self) -> dict[str, RaceWatch]:
+        """Race tests of the bearings at this speed, with the healthy machine where it is known at that."""
+        races = self.baseline.races if self.baseline is not None and self._comparable else {}
+        return {
+            bearing.name: RaceWatch(
+                self._rate_hz, self._speed_rpm, bearing.orders, self._race, races.get(bearing.sensor)
+            )
+            for bearing in self.bearings
+        }
+
+    def _new_directions(self) -> dict[str, RaceDirection]:
+        """Of the bearings with two accelerometers, when the healthy machine is known."""
+        pairs = {} if self.baseline is None else self.baseline.pairs
+        return {
+            bearing.name: RaceDirection(bearing.two, pairs[bearing.sensors], self.rules)
+            for bearing in self.bearings
+            if bearing.two is not None and bearing.sensors in pairs
+        }
+
+    def _begin_anew(self) -> None:
+        """The speed is another one."""
+        self._learning.forget()
+        self._steadfast.interrupt()
+        self._watches = self._new_watches()
+
+    def _forget(self) -> None:
+        """Samples are missing: evidence from before and after does not belong together."""
+        self._pending = []
+        self._learning.forget()
+        self._steadfast.interrupt()
+        for watch in self._watches.values():
+            watch.forget()
+
+    def _severity(self, change: ResidualChange | None) -> Severity:
+        if self._steadfast.standing.sound:
+            self._large = False
+            return "normal"
+        if change is not None:
+            self._large = change.ratio > (_NO_LONGER_LARGE if self._large else LARGE)
+        return "danger" if self._large else "alert"
+
+    def _statement(self, look: Look, first_index: int, t_ns: int, *, changed: bool) -> Diagnosis:
+        standing = self._steadfast.standing
+        where = standing.where or (look.finding.where if look.finding is not None else "")
+        good = look.quality == "good"
+        figures = figures_of(look, where)
+        said = Diagnosis(
+            machine=self._machine,
+            detector=self.name,
+            t_ns=t_ns,
+            stream=self.stream,
+            first_index=first_index,
+            end_index=self._end_index,
+            decision=standing.decision,
+            changed=changed,
+            severity=self._severity(look.change),
+            probabilities={str(k): p for k, p in look.finding.probabilities.items()} if look.finding else {},
+            group=standing.group,
+            statistics=figures,
+            units=units_of(figures),
+            thresholds=thresholds_of(look, where),
+            evidence=evidence_of(look, where),
+            quality=look.quality,
+            reason=look.reason,
+            sensors=tuple(bearing.sensor for bearing in self.bearings if bearing.name == standing.where)
+            or tuple(bearing.sensor for bearing in self.bearings),
+            model=MODEL,
+            where=standing.where,
+        )
+        if good and not look.reason and self.baseline is None:
+            return replace(said, reason=self._learning.reason)
+        return said
+
+
+class _StandsStillError(ValueError):
+    """The machine does not run."""

@@ -1,0 +1,129 @@
+"""From the bearings of a machine, each judged by itself, to one statement about the machine.
+
+A fault is heard at the far bearing, too: the bearing that shows most is the faulty one. That the machine has
+changed at all is for the innovations of its healthy model to say, where there is one, and for the residual of
+two accelerometers, where a bearing has them.
+
+Lines and direction join so. Lines that stand out name a part by themselves. The direction settles which race
+if they leave it open, and contradicts them if it is sure of the other race: the verdict is then
+``inner_or_outer``. Where no lines stand out the direction names the part that is hit, or leaves it open; if
+nothing is hit, for the change is steady, the machine has ``changed``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, get_args
+
+from daqsvc.bearing.race.verdict import PARTS, RaceVerdict, RaceWord
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.detectors.bearing.direction import Direction
+
+BearingWord = RaceWord
+
+WORDS: tuple[RaceWord, ...] = get_args(RaceWord)
+"""All verdicts, healthy first."""
+
+SoundWord = Literal["normal", "changed"]
+SOUND: tuple[SoundWord, ...] = get_args(SoundWord)
+"""Verdicts that name no part."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BearingFinding:
+    """What the bearings of a machine show together.
+
+    Attributes:
+        verdict: the word.
+        group: parts that the evidence cannot tell apart; the verdict alone where it names no part.
+        where: the bearing that the verdict is about; the one that shows most if none is faulty.
+        probabilities: of every word, summing to one.
+        severity: of the evidence for that part at that bearing, significance times size.
+    """
+
+    verdict: RaceWord
+    group: tuple[str, ...]
+    where: str
+    probabilities: Mapping[RaceWord, float] = field(default_factory=dict)
+    severity: float = 0.0
+
+
+def find(
+    verdicts: Mapping[str, RaceVerdict],
+    change: ResidualChange | None,
+    false_alarm_probability: float,
+    directions: Mapping[str, Direction] | None = None,
+) -> BearingFinding:
+    """Compare the bearings of a machine.
+
+    Args:
+        verdicts: of each bearing that could be judged, by name; at least one.
+        change: of the innovations; None without a healthy machine to compare with.
+        false_alarm_probability: that ``change`` was judged at.
+        directions: what the two accelerometers of a bearing tell, of those that have two.
+    """
+    directions = directions or {}
+    told = {name: one for name, one in directions.items() if one.decides}
+    faulty = {name: said for name, said in verdicts.items() if said.verdict not in SOUND}
+    felt = {name: one for name, one in directions.items() if one.detected}
+    if not faulty and (felt or told):
+        among = {name: told[name] for name in felt if name in told} or felt or told
+        where = max(among, key=lambda name: among[name].change_nats / among[name].limit_nats)
+    else:
+        where = max(faulty or verdicts, key=lambda name: severity_of(verdicts[name]))
+    said = verdicts[where]
+    shares = _probabilities(said)
+    verdict: RaceWord = said.verdict
+    group = said.group
+    if faulty:
+        if where in told:
+            verdict, group = _corroborated(said, told[where])
+    else:
+        changed = any(v.verdict == "changed" for v in verdicts.values()) if change is None else change.changed
+        verdict = "changed" if changed or felt else "normal"
+        group = (verdict,)
+        if verdict == "changed" and where in directions and directions[where].group:
+            group = directions[where].group
+            verdict = group[0] if directions[where].decides else "inner_or_outer"
+        doubt = 0.0 if verdict == "normal" else false_alarm_probability
+        sound = shares["normal"] + shares["changed"]
+        shares |= {"normal": sound * doubt, "changed": 0.0}
+        shares[verdict] += sound * (1.0 - doubt)
+    if verdict == "inner_or_outer":
+        # What cannot be told apart is one word.
+        shares |= {"inner_or_outer": shares["inner_or_outer"] + shares["inner"] + shares["outer"]}
+        shares |= {"inner": 0.0, "outer": 0.0}
+    elif verdict != said.verdict and said.verdict == "inner_or_outer":
+        shares |= {verdict: shares["inner"] + shares["outer"], _OTHER[verdict]: 0.0}
+    return BearingFinding(
+        verdict=verdict, group=group, where=where, probabilities=shares, severity=severity_of(said)
+    )
+
+
+_OTHER: Mapping[RaceWord, RaceWord] = {"inner": "outer", "outer": "inner"}
+
+
+def _corroborated(said: RaceVerdict, told: Direction) -> tuple[RaceWord, tuple[str, ...]]:
+    """A verdict by lines, with what the direction says of the races: it settles a doubt, or raises one."""
+    race = told.group[0]
+    if len(told.group) == 1 and race in _OTHER:
+        if said.verdict == "inner_or_outer":
+            return race, (race,)
+        if race == _OTHER.get(said.verdict):
+            return "inner_or_outer", (said.verdict, race)
+    return said.verdict, said.group
+
+
+def severity_of(said: RaceVerdict) -> float:
+    """Of the part that a verdict names; of the one that shows most if it names none."""
+    parts = [part for part in PARTS if part in said.group] or PARTS
+    return max(said.evidence[part].severity for part in parts)
+
+
+def _probabilities(said: RaceVerdict) -> dict[RaceWord, float]:
+    """Of every word."""
+    return {word: said.probability.get(word, 0.0) for word in WORDS}

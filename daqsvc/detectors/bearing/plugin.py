@@ -1,0 +1,88 @@
+"""The bearings' detector as a plugin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.detectors.bearing.checks import bearing_checks
+from daqsvc.detectors.bearing.settings import BEARING, Bearing
+from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.reading import Reading
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daqsvc.detectors.bearing.settings import WatchedBearing
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import Finding
+
+
+class BearingPlugin(DetectorPlugin[Bearing]):
+    """Bearings judged by the lines of their kinematics, and against the healthy machine."""
+
+    settings = Bearing
+    about = "the rolling bearings"
+    detector = BEARING
+    place = 3
+
+    def checks(self, draft: MachineFile, given: Bearing) -> Iterator[Iterator[Finding]]:
+        """See `PipelineTable.checks`."""
+        return bearing_checks(draft, given)
+
+    def describe(self, machine: MachineFile, given: Bearing) -> str:
+        """See `PipelineTable.describe`."""
+        del machine
+        return _described(given)
+
+    def build(self, machine: MachineFile, given: Bearing, store: Path | None) -> tuple[Detector, ...]:
+        """See `DetectorPlugin.build`."""
+        from daqsvc.detectors.bearing.build import bearing_detector  # noqa: PLC0415 - SciPy's statistics
+
+        try:
+            return (bearing_detector(machine, given, store),)
+        except ValueError as error:
+            raise AssemblyError(f"{machine.path}: {error}") from error
+
+    def check_files(self, machine: MachineFile, given: Bearing) -> None:
+        """See `DetectorPlugin.check_files`: its calibration, and that its bearings are known."""
+        self.build(machine, given, None)
+
+    def readings(self, machine: MachineFile, given: Bearing) -> Iterator[Reading]:
+        """See `DetectorPlugin.readings`."""
+        from daqsvc.detectors.bearing.finding import WORDS  # noqa: PLC0415 - brings SciPy's statistics
+
+        del machine, given
+        for word in WORDS:
+            yield Reading(BEARING, "probabilities", word)
+
+
+def _described(given: Bearing) -> str:
+    healthy = (
+        f"the first {given.calibrate_s:g} s are the healthy state, kept over restarts"
+        if given.calibration is None
+        else f"healthy state in {given.calibration}"
+    )
+    return "; ".join(
+        [
+            *(_watched(bearing) for bearing in given.bearings),
+            *(() if given.keyphasor is None else (f"speed by {given.keyphasor}",)),
+            healthy,
+            f'false alarms of "changed" {given.false_alarm_probability:g} a look',
+        ]
+    )
+
+
+def _watched(bearing: WatchedBearing) -> str:
+    orders = bearing.orders
+    kinematics = (
+        f"{bearing.type}"
+        if orders is None
+        else f"BPFI {orders.bpfi:g}, BPFO {orders.bpfo:g}, BSF {orders.bsf:g}, FTF {orders.ftf:g}"
+    )
+    by = bearing.sensor
+    if bearing.rotor_sensor is not None:
+        by += f", races also by direction with {bearing.rotor_sensor}"
+    return f"{bearing.name} ({kinematics}) by {by}"

@@ -1,0 +1,1 @@
+"""Levels of vibration, window by window, and values that the device measures itself."""

@@ -1,0 +1,282 @@
+"""The level detector: how much each sensor shakes, and whether the sensor is to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from daqsvc.detectors.levels.partial import (
+    LEAST_KNOWN_ERROR,
+    MIN_PRESENT,
+    MOST_ERROR,
+    MOST_MISSING,
+    level_bounds,
+    not_judged,
+    nothing_known,
+    partly_missing,
+)
+from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
+from daqsvc.diagnosis.record import silence_reason
+from daqsvc.dsp.gapped_band import gapped_band_rms
+from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
+from daqsvc.dsp.standstill import StandstillWatch
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.detectors.levels.partial import Bounds
+    from daqsvc.detectors.levels.statements import Limits
+    from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.record import DataQuality, Diagnosis
+    from daqsvc.dsp.standstill import Standstill
+
+_LEAST_SAMPLES = 4
+"""Fewer make no spectrum."""
+
+_GLITCH = 2
+"""So few samples beyond the gap limits inside a window are interference, not the probe."""
+
+SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
+
+# How a band velocity in mm/s comes from the samples: factor, and whether to integrate.
+_TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
+    "g": (1000.0 * STANDARD_GRAVITY, True),
+    "m/s2": (1000.0, True),
+    "mm/s": (1.0, False),
+}
+
+
+class GapCheck(NamedTuple):
+    """OK limits of a proximity probe (API 670): its gap voltage must lie between them all the time.
+
+    Attributes:
+        volts_per_unit: gap voltage per unit of displacement.
+        zero_v: gap voltage at displacement zero.
+        low_v: lower limit.
+        high_v: upper limit.
+    """
+
+    volts_per_unit: float
+    zero_v: float
+    low_v: float
+    high_v: float
+
+
+@dataclass(frozen=True, slots=True)
+class LevelChannel:
+    """One sensor as the level detector sees it.
+
+    Attributes:
+        sensor: its name.
+        column: its column in the stream.
+        unit: unit of its samples.
+        limits: setpoints of its measures.
+        gap: OK limits, for a proximity probe.
+    """
+
+    sensor: str
+    column: int
+    unit: SensorUnit
+    limits: Sequence[Limits] = ()
+    gap: GapCheck | None = None
+
+
+class LevelDetector:
+    """RMS, peak, peak-to-peak, crest factor and band velocity of every sensor of a stream, window by window.
+
+    Emits one `Diagnosis` per sensor and window, as detector ``levels/<sensor>``. A snapshot is a window by
+    itself, whatever its length.
+
+    Where samples are missing the levels are those of the samples that are there, and the band velocity is
+    estimated from these (`gapped_band_rms`). Above `MOST_MISSING` they are uncertain (`Diagnosis.bounds`),
+    below `MIN_PRESENT` not given at all.
+
+    Args:
+        machine: name of the machine.
+        stream: name of the stream.
+        rate_hz: its sampling rate.
+        channels: the sensors.
+        window_s: length of a window.
+        velocity_band_hz: band of the velocity, in Hz.
+    """
+
+    def __init__(
+        self,
+        machine: str,
+        stream: str,
+        rate_hz: float,
+        channels: Sequence[LevelChannel],
+        *,
+        window_s: float = 0.5,
+        velocity_band_hz: tuple[float, float] = (10.0, 1000.0),
+    ) -> None:
+        self.name = f"levels/{stream}"
+        self.stream = stream
+        self.block = max(_LEAST_SAMPLES, round(window_s * rate_hz))
+        self._statements = LevelStatements(machine, stream, "levels/1")
+        self._rate_hz = rate_hz
+        self._channels = tuple(channels)
+        self._band_hz = velocity_band_hz
+        self._standstills = {channel.sensor: StandstillWatch() for channel in self._channels}
+        self._next_index = 0
+
+    def warm(self) -> None:
+        """Make the taper and the band's weights; there is nothing to compile."""
+        for channel in self._channels:
+            self._measure(channel, np.sin(np.arange(self.block, dtype=np.float32)), 0.0)
+
+    def process(self, window: Window) -> list[Diagnosis]:
+        """See `daqsvc.diagnosis.detector.Detector.process`."""
+        said = [self._skipped(channel, window) for channel in self._channels if window.skipped]
+        self._next_index = window.first_index + len(window.samples)
+        block = len(window.samples) if window.snapshot else self.block
+        for start in range(0, len(window.samples), block):
+            part = window.samples[start : start + block]
+            after = len(window.samples) - start - len(part)
+            t_ns = window.t_end_ns - round(after * window.period_ns)
+            said += [
+                self._judge(c, part[:, c.column], window.first_index + start, t_ns) for c in self._channels
+            ]
+        return said
+
+    def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
+        """See `daqsvc.diagnosis.detector.Detector.silent`."""
+        reason = silence_reason(self.stream, silence_s)
+        nothing = Evidence(self._next_index, self._next_index, t_ns)
+        return [self._state(c, nothing, {}, "missing", reason) for c in self._channels]
+
+    def _skipped(self, channel: LevelChannel, window: Window) -> Diagnosis:
+        """Nobody has seen what lies between two windows: no delay goes on over it."""
+        first = window.first_index - window.skipped
+        t_ns = window.t_end_ns - round(len(window.samples) * window.period_ns)
+        unseen = Evidence(first, window.first_index, t_ns)
+        measures = ["mean", "rms", "peak", "peak_to_peak", "crest_factor"]
+        measures += ["gap_voltage"] * (channel.gap is not None) + ["velocity_rms"] * (
+            channel.unit in _TO_VELOCITY
+        )
+        reason = not_judged(channel.sensor, window.skipped)
+        return self._state(channel, unseen, {}, "missing", reason, 1.0, nothing_known(measures))
+
+    def _judge(
+        self, channel: LevelChannel, samples: NDArray[np.float32], first_index: int, t_ns: int
+    ) -> Diagnosis:
+        present = np.isfinite(samples)
+        count = int(present.sum())
+        evidence = Evidence(first_index, first_index + len(samples), t_ns)
+        share = 1.0 - count / len(samples)
+        if count < max(MIN_PRESENT * len(samples), _LEAST_SAMPLES):
+            reason = (
+                f"only {count} of {len(samples)} samples of {channel.sensor} are there, the others were lost "
+                "or the device had none; check bus, device and sensor"
+            )
+            return self._state(channel, evidence, {}, "missing", reason, share)
+        statistics, bounds = self._measure(channel, samples, share)
+        known = samples[present]
+        still = self._standstills[channel.sensor].take(known)
+        if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
+            return self._state(channel, evidence, statistics, "not_ok", reason, share)
+        reason = partly_missing(channel.sensor, len(samples) - count, len(samples), bounds)
+        quality: DataQuality = "missing" if reason else "good"
+        return self._state(channel, evidence, statistics, quality, reason, share, bounds)
+
+    def _state(
+        self,
+        channel: LevelChannel,
+        evidence: Evidence,
+        statistics: dict[str, float],
+        quality: DataQuality,
+        reason: str,
+        missing_share: float = 1.0,
+        bounds: Bounds = NO_BOUNDS,
+    ) -> Diagnosis:
+        units = {name: _unit(name, channel.unit) for name in statistics if name != "crest_factor"}
+        return self._statements.state(
+            channel.sensor,
+            channel.limits,
+            evidence,
+            statistics,
+            units,
+            quality,
+            reason,
+            missing_share,
+            bounds,
+        )
+
+    def _measure(
+        self, channel: LevelChannel, samples: NDArray[np.float32], share: float
+    ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+        """The measures of a window that lacks a ``share`` of its samples, and the bounds of the uncertain."""
+        found = levels(samples)
+        known = samples[np.isfinite(samples)]
+        bounds = level_bounds(found, float(known.min()), float(known.max()), share)
+        statistics = {
+            "mean": found.mean,
+            "rms": found.rms,
+            "peak": found.peak,
+            "peak_to_peak": found.peak_to_peak,
+            "crest_factor": found.crest_factor,
+        }
+        if channel.gap is not None:
+            gap = channel.gap
+            statistics["gap_voltage"] = gap.zero_v + found.mean * gap.volts_per_unit
+            if "mean" in bounds:
+                volts = sorted(gap.zero_v + end * gap.volts_per_unit for end in bounds["mean"])
+                bounds["gap_voltage"] = (volts[0], volts[1])
+        if channel.unit in _TO_VELOCITY:
+            factor, integrate = _TO_VELOCITY[channel.unit]
+            if share:
+                values = samples.astype(np.float64)
+                about = gapped_band_rms(values, self._rate_hz, *self._band_hz, integrate=integrate)
+                if about.error <= LEAST_KNOWN_ERROR:
+                    statistics["velocity_rms"] = factor * about.rms
+                if share > MOST_MISSING or about.error > MOST_ERROR:
+                    bounds["velocity_rms"] = (factor * about.low, factor * about.high)
+            else:
+                rms = band_rms(samples.astype(np.float64), self._rate_hz, *self._band_hz, integrate=integrate)
+                statistics["velocity_rms"] = factor * rms
+        return statistics, bounds
+
+
+def _beyond_gap(channel: LevelChannel, statistics: Mapping[str, float], known: NDArray[np.float32]) -> str:
+    gap = channel.gap
+    if gap is None:
+        return ""
+    volts = gap.zero_v + known.astype(np.float64) * gap.volts_per_unit
+    beyond = (volts < gap.low_v) | (volts > gap.high_v)
+    count, mean_v = int(beyond.sum()), statistics["gap_voltage"]
+    within = gap.low_v <= mean_v <= gap.high_v
+    # A gap that leaves its limits at the end of a window, or comes back at its beginning, is no glitch: the
+    # step would be taken for vibration.
+    if within and count <= _GLITCH and not (beyond[0] or beyond[-1]):
+        return ""
+    limits = f"its OK limits {gap.low_v:g} to {gap.high_v:g} V; check probe, cable and driver"
+    if not within:
+        return f"gap voltage of {channel.sensor} is {mean_v:.2f} V, outside {limits}"
+    farthest = volts[np.abs(volts - (gap.low_v + gap.high_v) / 2).argmax()]
+    return (
+        f"gap voltage of {channel.sensor} reached {farthest:.2f} V, for {count} of {len(known)} samples "
+        f"outside {limits}"
+    )
+
+
+def _dead(channel: LevelChannel, count: int, still: Standstill | None) -> str:
+    if still is None:
+        return ""
+    value = f"{round(still.value, 6) + 0.0:g} {channel.unit}"  # + 0.0: no "-0"
+    if still.samples == count:
+        return (
+            f"{channel.sensor} does not move at all ({value}): dead or disconnected; "
+            "check sensor, cable and supply"
+        )
+    return (
+        f"{channel.sensor} stood still at {value} for {still.samples} of {count} samples: dead or "
+        "disconnected for a part of the time; check sensor, cable and supply"
+    )
+
+
+def _unit(statistic: str, unit: str) -> str:
+    return {"velocity_rms": "mm/s", "gap_voltage": "V"}.get(statistic, unit)

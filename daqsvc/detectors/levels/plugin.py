@@ -1,0 +1,159 @@
+"""The level detectors as a plugin: from ``[pipeline.levels]`` to one detector a stream."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.detectors.levels.checks import level_checks
+from daqsvc.detectors.levels.settings import Levels
+from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.reading import STALE_S, Reading
+from daqsvc.diagnosis.snapshots import patience
+from daqsvc.settings.models import (
+    Accelerometer,
+    Keyphasor,
+    ProximityProbe,
+    SetpointAlarm,
+    TrendValue,
+    VelocitySensor,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from daqsvc.detectors.levels.detector import GapCheck
+    from daqsvc.detectors.levels.statements import Limits
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.settings.models import MachineFile, Sensor
+    from daqsvc.settings.problems import Finding
+
+
+class LevelsPlugin(DetectorPlugin[Levels]):
+    """Levels of every vibration sensor, and values that a device measures itself."""
+
+    settings = Levels
+    about = "level detectors"
+    measures_levels = True
+    place = 0
+
+    def checks(self, draft: MachineFile, given: Levels) -> Iterator[Iterator[Finding]]:
+        """See `PipelineTable.checks`."""
+        return level_checks(draft, given)
+
+    def start_up_signals(self, draft: MachineFile, given: Levels) -> Mapping[str, tuple[str, ...]]:
+        """See `PipelineTable.start_up_signals`: a trend value may be the speed."""
+        del given
+        trends = (sensor.name for sensor in draft.sensors if sensor.type == "trend")
+        return {f"levels/{name}": ("value",) for name in trends}
+
+    def describe(self, machine: MachineFile, given: Levels) -> str:
+        """See `PipelineTable.describe`."""
+        return _described(machine, given)
+
+    def build(self, machine: MachineFile, given: Levels, store: Path | None) -> Iterator[Detector]:
+        """See `DetectorPlugin.build`."""
+        del store
+        for stream in machine.streams:
+            yield from _of_stream(machine, given, stream)
+
+    def readings(self, machine: MachineFile, given: Levels) -> Iterator[Reading]:
+        """See `DetectorPlugin.readings`."""
+        del given
+        for sensor in _measured(machine):
+            rate_hz = machine.streams[sensor.stream].rate_hz
+            silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
+            yield from _readings(sensor, max(STALE_S, math.ceil(silent_s)))
+
+    def quality_alarms(self, machine: MachineFile, given: Levels) -> Iterator[str]:
+        """See `DetectorPlugin.quality_alarms`."""
+        del given
+        return (f"sensor-ok/{sensor.name}" for sensor in _measured(machine))
+
+
+def _of_stream(machine: MachineFile, given: Levels, stream: str) -> Iterator[Detector]:
+    """What measures the levels of waveforms, and what takes levels as the device has measured them."""
+    # Here, not above: they bring SciPy, which `daqsvc check` need not wait for.
+    from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector  # noqa: PLC0415
+    from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector  # noqa: PLC0415
+
+    sensors = [sensor for sensor in machine.sensors if sensor.stream == stream]
+    name, rate_hz = machine.machine.name, machine.streams[stream].rate_hz
+    channels = [
+        LevelChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), _gap_check(s))
+        for s in sensors
+        if isinstance(s, ProximityProbe | Accelerometer | VelocitySensor)
+    ]
+    if channels:
+        yield LevelDetector(
+            name,
+            stream,
+            rate_hz,
+            channels,
+            window_s=given.window_s,
+            velocity_band_hz=given.velocity_band_hz,
+        )
+    trends = [
+        TrendChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), s.ok_between)
+        for s in sensors
+        if isinstance(s, TrendValue)
+    ]
+    if trends:
+        yield TrendDetector(name, stream, rate_hz, trends, window_s=given.window_s)
+
+
+def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
+    from daqsvc.detectors.levels.statements import Limits  # noqa: PLC0415 - as above
+
+    return [
+        Limits(alarm.measure, alarm.alert, alarm.danger, alarm.alert_low, alarm.danger_low)
+        for alarm in machine.alarms
+        if isinstance(alarm, SetpointAlarm) and sensor in alarm.watched
+    ]
+
+
+def _gap_check(sensor: Sensor) -> GapCheck | None:
+    from daqsvc.detectors.levels.detector import GapCheck  # noqa: PLC0415 - as above
+
+    if not isinstance(sensor, ProximityProbe) or sensor.sensitivity_mv_per_unit is None:
+        return None
+    if sensor.gap_ok_v is None:
+        return None
+    return GapCheck(sensor.sensitivity_mv_per_unit / 1000.0, sensor.zero_v, *sensor.gap_ok_v)
+
+
+def _measured(machine: MachineFile) -> Iterator[Sensor]:
+    return (sensor for sensor in machine.sensors if not isinstance(sensor, Keyphasor))
+
+
+def _readings(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
+    detector = f"levels/{sensor.name}"
+    if isinstance(sensor, TrendValue):
+        yield Reading(detector, "statistics", "value", sensor.unit, stale_s)
+        return
+    yield Reading(detector, "statistics", "rms", sensor.unit, stale_s)
+    yield Reading(detector, "statistics", "peak", sensor.unit, stale_s)
+    if isinstance(sensor, ProximityProbe):
+        if sensor.sensitivity_mv_per_unit is not None:
+            yield Reading(detector, "statistics", "gap_voltage", "V", stale_s)
+    else:
+        yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)
+
+
+def _described(machine: MachineFile, given: Levels) -> str:
+    casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
+    waveforms = [s.name for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
+    trends = [s.name for s in machine.sensors if isinstance(s, TrendValue)]
+    parts: list[str] = []
+    if waveforms:
+        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(waveforms)}")
+    if casing:
+        low_hz, high_hz = given.velocity_band_hz
+        parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
+    if trends:
+        parts.append(
+            f"{', '.join(trends)} as they come, or averaged over {given.window_s:g} s if they are faster"
+        )
+    return "; ".join(parts)

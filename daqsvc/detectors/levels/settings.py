@@ -1,0 +1,33 @@
+"""The table of the level detectors: ``[pipeline.levels]``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.section import Section
+
+
+def _ordered_band(band_hz: tuple[float, float]) -> tuple[float, float]:
+    low_hz, high_hz = band_hz
+    if not 0 < low_hz < high_hz:
+        raise PydanticCustomError(
+            "band_order",
+            "is not a band: it needs 0 < lower edge < upper edge, in Hz",
+            {"remedy": "write e.g. [10.0, 1000.0]"},
+        )
+    return band_hz
+
+
+BandHz = Annotated[float, Field(ge=0.001, le=5_000_000)]
+
+
+class Levels(Section):
+    """RMS, peak, crest factor and velocity RMS of every vibration sensor, window by window."""
+
+    window_s: Annotated[float, Field(ge=1e-3, le=600)] = Field(default=0.5, description="length of a window")
+    velocity_band_hz: Annotated[tuple[BandHz, BandHz], AfterValidator(_ordered_band), Field(strict=False)] = (
+        Field(default=(10.0, 1000.0), description="band of the velocity RMS (ISO 20816-3: 10 Hz to 1000 Hz)")
+    )

@@ -1,0 +1,46 @@
+"""From a machine file to its detectors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+from daqsvc.settings.registry import configured
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.plugin import DetectorPlugin
+    from daqsvc.settings.models import MachineFile
+
+
+def plugins(machine: MachineFile) -> Iterator[tuple[DetectorPlugin[Any], Any]]:
+    """The kinds of detectors that a machine file has a table for, each with its table."""
+    for _, plugin, given in configured(machine.pipeline):
+        yield cast("DetectorPlugin[Any]", plugin), given
+
+
+def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]:
+    """Every detector that the pipeline section asks for.
+
+    Args:
+        machine: the machine file.
+        store: directory of the state that survives restarts; None to begin without any and leave none.
+
+    Raises:
+        AssemblyError: a calibration that the machine file names cannot be used.
+    """
+    return [
+        detector for plugin, given in plugins(machine) for detector in plugin.build(machine, given, store)
+    ]
+
+
+def check_files(machine: MachineFile) -> None:
+    """See whether the calibrations that a machine file names can be used, and its bearings are known.
+
+    Raises:
+        AssemblyError: one cannot, or is not; the message names file, key, value and remedy.
+    """
+    for plugin, given in plugins(machine):
+        plugin.check_files(machine, given)

@@ -1,0 +1,178 @@
+"""Whether what is said of a rotor bank fits sensors and machine, and its modes what they are called."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from daqsvc.detectors.shaft.checks import check_geometry, check_rotor, check_sensors, named
+from daqsvc.settings.layout_checks import unique
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.section import UnusableValueError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from daqsvc.detectors.rotor_bank.settings import Mode, RotorBank
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import KeyPath
+
+_BANK: KeyPath = ("pipeline", "rotor_bank")
+_MOST_PER_1000_REV = 1000.0
+_LEAST_FOR_PULSES = 4.0
+
+
+def bank_checks(draft: MachineFile, bank: RotorBank) -> Iterator[Iterator[Finding]]:
+    """Every check of a rotor bank.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+        bank: its rotor bank.
+    """
+    yield check_rotor(draft, _BANK, "the model bank")
+    yield _modelled(draft)
+    yield check_sensors(draft, _BANK, bank.probes, bank.keyphasor)
+    yield check_geometry(draft, _BANK, bank.probes)
+    yield _pulses(draft, bank)
+    yield _healthy_mode(draft, bank)
+    for index, mode in enumerate(bank.modes):
+        at: KeyPath = (*_BANK, "modes", index)
+        yield _mode_fault(draft, mode, at)
+        yield _static_load(draft, mode, at)
+    yield _mode_names(bank)
+    yield _rates(bank)
+
+
+def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
+    """An alarm can follow the bank: it decides between its modes.
+
+    Args:
+        bank: the rotor bank.
+        at: where the alarm stands in the file.
+    """
+    if bank.rule == "paper":
+        yield Finding(
+            (*at, "detector"),
+            'would never raise it: pipeline.rotor_bank.rule = "paper" gives probabilities only',
+            'write rule = "cusum", or remove the alarm',
+        )
+
+
+def _modelled(draft: MachineFile) -> Iterator[Finding]:
+    """What only the models of the bank need to know of the rotor."""
+    rotor = draft.machine.rotor
+    if rotor is None:
+        return  # said already
+    for key, about, example in (
+        ("eccentricity_um", "mass eccentricity", "10.0"),
+        ("contact_stiffness", "stiffness of the stator", "30.0"),
+    ):
+        with suppress(UnusableValueError):
+            if getattr(rotor, key) is None:
+                yield Finding(
+                    ("machine", "rotor", key),
+                    f"is missing: {about}; the model bank needs it",
+                    f"add e.g. {key} = {example} to [machine.rotor], or remove [pipeline.rotor_bank]",
+                )
+
+
+def _pulses(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
+    """A revolution has enough samples for the keyphasor's pulse."""
+    keyphasor = named(draft).get(bank.keyphasor)
+    if keyphasor is None or keyphasor.stream not in draft.streams:
+        return
+    rate_hz, speed_rpm = draft.streams[keyphasor.stream].rate_hz, abs(draft.machine.speed_rpm)
+    samples = 60.0 * rate_hz / speed_rpm
+    if samples < _LEAST_FOR_PULSES:
+        yield Finding(
+            (*_BANK, "keyphasor"),
+            f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
+            f"need {_LEAST_FOR_PULSES:g}",
+            f"sample at {_LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
+        )
+
+
+def _healthy_mode(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
+    """The first mode is healthy, and the rotor that [machine.rotor] describes."""
+    healthy, at = bank.modes[0], (*_BANK, "modes", 0)
+    if healthy.severity != "normal":
+        yield Finding(
+            (*at, "severity"),
+            "the first mode is the healthy one",
+            'write severity = "normal", or put the healthy mode first',
+        )
+    if healthy.fault is not None:
+        yield Finding((*at, "fault"), "the first mode is the healthy one", "remove it")
+    for key in healthy.differs:
+        if key != "damping_ratio":
+            yield Finding(
+                (*at, key),
+                "the first mode is the healthy one: the rotor as [machine.rotor] describes it",
+                "remove it, and correct [machine.rotor]",
+            )
+    rotor = draft.machine.rotor
+    if rotor is not None and healthy.damping_ratio not in {None, rotor.damping_ratio}:
+        yield Finding(
+            (*at, "damping_ratio"),
+            f"differs from damping_ratio = {rotor.damping_ratio:g} of [machine.rotor], the healthy rotor",
+            "remove it, or correct one of the two",
+        )
+
+
+def _mode_fault(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding]:
+    """A mode that is called a fault has what makes it one, and every mode but the first differs."""
+    rotor = draft.machine.rotor
+    healthy = None if rotor is None else rotor.damping_ratio
+    less_damping = mode.damping_ratio is not None and (healthy is None or mode.damping_ratio < healthy)
+    makes = {
+        "unbalance": (mode.unbalance_ratio != 1.0, "unbalance_ratio = 1.8"),
+        "damping_loss": (less_damping, f"damping_ratio = {0.5 * (healthy or 0.1):g}, below the healthy one"),
+        "static_load": (mode.static_load_um != (0.0, 0.0), "static_load_um = [0.0, -10.0]"),
+        "stiffness_loss": (mode.stiffness_ratio < 1.0, "stiffness_ratio = 0.9"),
+        "rub": (mode.rub, "rub = true"),
+    }
+    if mode.fault is not None:
+        made, example = makes[mode.fault]
+        if not made:
+            yield Finding((*at, "fault"), "nothing in this mode makes it that", f"write e.g. {example}")
+    elif at[-1] != 0 and not any(made for made, _ in makes.values()):
+        examples = ", ".join(example.split(" = ")[0] for _, example in makes.values())
+        yield Finding(
+            at,
+            f'mode "{mode.name}" does not differ from the healthy rotor for the worse',
+            f"set one of {examples}, or remove the mode",
+        )
+
+
+def _static_load(draft: MachineFile, mode: Mode, at: KeyPath) -> Iterator[Finding]:
+    """Nobody looks for a static load with probes that show none."""
+    if mode.static_load_um != (0.0, 0.0) and draft.ac_coupled:
+        yield Finding(
+            (*at, "static_load_um"),
+            "cannot be seen: a probe of the bank is AC-coupled and shows no static position",
+            "use DC-coupled probes (ac_coupled = false), or remove the mode",
+        )
+
+
+def _mode_names(bank: RotorBank) -> Iterator[Finding]:
+    """Names tell the modes apart."""
+    yield from unique([mode.name for mode in bank.modes], (*_BANK, "modes"), "mode")
+
+
+def _rates(bank: RotorBank) -> Iterator[Finding]:
+    """A threshold is given in nats or by a rate, not both, and the rate asks for evidence at all."""
+    for rate, nats in (
+        ("false_alarms_per_1000_rev", "threshold_nats"),
+        ("mtbf_hours", "back_threshold_nats"),
+    ):
+        if getattr(bank, rate) is not None and nats in bank.model_fields_set:
+            yield Finding(
+                (*_BANK, nats), f"is given by {rate} already", f"remove one of the two, e.g. {nats}"
+            )
+    wanted = bank.false_alarms_per_1000_rev
+    if wanted is not None and wanted >= _MOST_PER_1000_REV:
+        yield Finding(
+            (*_BANK, "false_alarms_per_1000_rev"),
+            "would be a false alarm at every revolution",
+            "write e.g. 0.02, which takes 16 nats of evidence on a bank of four modes",
+        )

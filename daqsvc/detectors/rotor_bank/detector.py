@@ -1,0 +1,395 @@
+"""The rotor bank as a detector: two proximity probes and a keyphasor in, the rotor's mode out."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of
+from daqsvc.detectors.rotor_bank.orbit_checks import OrbitWatch
+from daqsvc.detectors.rotor_bank.statements import DEPARTURE, UNDETERMINED_DECISION, BankStater, Moment
+from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe, Verdict, stands_still
+from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
+from daqsvc.dsp.keyphasor import KeyphasorTracker
+from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
+from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
+from daqsvc.rotor.decision import DecisionRules
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.diagnosis.detector import Window
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.rotor.discretise import BankMode
+    from daqsvc.rotor.model import RotorParameters
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["DEPARTURE", "KeyphasorProbe", "Probe", "RotorBankDetector", "RotorMode"]
+
+_MIN_PROBE_SPREAD = 0.5
+"""Least |sin| of the angle between the probes: 30 degrees apart they still see both axes."""
+_RETUNE = 0.003
+"""Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
+_BLIND_REVOLUTIONS = 3.0
+"""So long the angle is trusted without an edge."""
+_MISSING = 0.5
+"""Part of the last revolution's samples that the observers predict through."""
+_DEAD = 0.05
+"""A probe that moves less than this part of what it must is dead."""
+
+
+class RotorBankDetector:
+    """Diagnoses a rotor by the bank of the paper; see `Detector`.
+
+    Says one `Diagnosis` a revolution, and one at once for every change of the declared mode. The
+    probabilities in it are those of the rule that decides: under ``cusum`` the posterior odds of the
+    evidence ``lead_M``; under ``paper``, and while nothing is declared yet, the paper's conditional
+    probabilities, which are always there as statistics ``paper.M`` too. The
+    evidence, in nats: ``lead.M``, of the declared mode over mode M, and ``cusum.M``, of M against the
+    declared one since the onset of its evidence. Under the paper's rule every severity is normal: a
+    posterior of 0.9 is no ground for an alarm.
+
+    When the evidence against the declared mode is past its threshold, but does not yet favour one other
+    mode, the decision is ``departure`` with the candidates as group, at once and until the cause is known;
+    the declared mode has not changed by that.
+
+    A gap of up to a revolution is predicted through; after a longer one the observers start anew. While
+    the quality is not good there is no evidence, and the decision is held.
+
+    Args:
+        machine: name of the machine.
+        stream: name of the stream with all three sensors.
+        rate_hz: sampling rate.
+        speed_rpm: expected speed; negative if the shaft turns clockwise. The keyphasor refines it.
+        probes: two proximity probes.
+        keyphasor: the keyphasor.
+        rotor: the rotor; its exponent and friction are those of the rub observer.
+        modes: the modes, healthiest first.
+        noise_um: standard deviation of the sensor noise, the same in every mode.
+        process_noise: power spectral density q of the linear observers, normalised.
+        rub_process_noise: that of the rub observers; large, so that they follow what they do not know.
+        rules: decision rule and thresholds.
+        calibrate_revolutions: healthy revolutions at the start over which unbalance and static position are
+            measured, to stand in every mode in place of the stated ones; 0 to trust what is stated.
+        ac_coupled: whether the probes show no static position.
+        name: name of the detector.
+
+    Raises:
+        ValueError: the figures cannot make a bank, or the probes look in nearly the same direction.
+    """
+
+    def __init__(
+        self,
+        *,
+        machine: str,
+        stream: str,
+        rate_hz: float,
+        speed_rpm: float,
+        probes: tuple[Probe, Probe],
+        keyphasor: KeyphasorProbe,
+        rotor: RotorParameters,
+        modes: Sequence[RotorMode],
+        noise_um: float,
+        process_noise: float = 1e-4,
+        rub_process_noise: float = 0.1,
+        rules: DecisionRules | None = None,
+        calibrate_revolutions: int = 0,
+        ac_coupled: bool = False,
+        name: str = "rotor-bank",
+    ) -> None:
+        if not (math.isfinite(speed_rpm) and speed_rpm != 0.0 and math.isfinite(rate_hz) and rate_hz > 0.0):
+            raise ValueError(
+                f"rotor bank of {machine!r}: a speed of {speed_rpm} rpm sampled at {rate_hz} Hz cannot be "
+                "followed; both must be finite, the rate above 0 and the speed not 0"
+            )
+        self.name = name
+        self.stream = stream
+        self._probes = probes
+        self._keyphasor = keyphasor
+        self._modes = tuple(modes)
+        self._rules = rules or DecisionRules()
+        self._direction = math.copysign(1.0, speed_rpm)
+        self._duration = rotor.natural_frequency_rad_s / rate_hz
+        self._nominal_period = 60.0 * rate_hz / abs(speed_rpm)
+        self._rate_hz = rate_hz
+        self.block = max(1, round(self._nominal_period / 4.0))
+
+        spread = math.sin(math.radians(probes[1].angle_deg - probes[0].angle_deg))
+        if abs(spread) < _MIN_PROBE_SPREAD:
+            raise ValueError(
+                f"rotor bank of {machine!r}: {probes[0].name!r} at {probes[0].angle_deg} and "
+                f"{probes[1].name!r} at {probes[1].angle_deg} degrees look in nearly the same direction; "
+                "the orbit needs two probes 30 to 150 degrees apart"
+            )
+        angles = np.radians([probe.angle_deg for probe in probes])
+        self._units = np.array([probes[0].um_per_unit, probes[1].um_per_unit, 1.0])
+        self._to_xy = np.linalg.inv(np.vstack((np.cos(angles), np.sin(angles)))) / rotor.clearance_um
+        self._bank_modes = bank_modes(
+            self._modes,
+            rotor,
+            speed_rpm,
+            process_noise=process_noise,
+            rub_process_noise=rub_process_noise,
+            ac_coupled=ac_coupled,
+        )
+        self._stater = BankStater(
+            machine=machine,
+            detector=name,
+            stream=stream,
+            sensors=(probes[0].name, probes[1].name, keyphasor.name),
+            modes=self._modes,
+            rules=self._rules,
+        )
+        self._judge = RevolutionJudge(probes, missing=_MISSING, pooled=1)
+        self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
+        # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
+        self._noise = noise_um / rotor.clearance_um / abs(spread)
+        self._bank = self._new_bank()
+        self._tracker = KeyphasorTracker(
+            threshold=keyphasor.threshold_v,
+            hysteresis=keyphasor.hysteresis_v,
+            period_samples=self._nominal_period,
+            edge=keyphasor.edge,
+        )
+        healthy = abs(self._bank_modes[0].rotor.orbit()) * rotor.clearance_um
+        self._least_motion_um = _DEAD * math.hypot(noise_um, healthy / math.sqrt(2.0))
+        self._watch = OrbitWatch(
+            noise=self._noise,
+            rest=self._bank_modes[0].rotor.rest,
+            probes=(probes[0].name, probes[1].name),
+            keyphasor=keyphasor.name,
+        )
+        if calibrate_revolutions < 0:
+            raise ValueError(
+                f"rotor bank of {machine!r}: calibrate_revolutions is {calibrate_revolutions}; "
+                "write 0 to trust the stated rotor, or 20 or more"
+            )
+        self._calibrate_revolutions = calibrate_revolutions
+        self._calibration = SteadyFit() if calibrate_revolutions else None
+        self._departed = False
+        self._last_revolution = np.empty((0, 3))
+        self._next_index: int | None = None
+        self._revolutions = 0.0
+        self._progress_index: int | None = None
+        self._decision = UNDETERMINED_DECISION
+
+    @property
+    def faults(self) -> Mapping[str, str]:
+        """What each mode is in the words of a verdict, by name: ``"normal"``, ``"unbalance"``, ..."""
+        return self._faults
+
+    @property
+    def bank_modes(self) -> tuple[BankMode, ...]:
+        """The models behind the modes, healthy first, as they stand by now."""
+        return self._bank_modes
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the measured position, in clearances."""
+        return self._noise
+
+    @property
+    def duration(self) -> float:
+        """Normalised time between samples."""
+        return self._duration
+
+    @property
+    def rules(self) -> DecisionRules:
+        """Thresholds and the rule that declares."""
+        return self._rules
+
+    def warm(self) -> None:
+        """Compile the kernels on a bank that is thrown away."""
+        n = self.block
+        bank = self._new_bank()
+        bank.process(np.zeros((n, 2)), np.ones(n), np.zeros(n))
+        bank.retune(bank.speed, 0.0)
+
+    def process(self, window: Window) -> Sequence[Diagnosis]:
+        """See `Detector.process`."""
+        samples = np.asarray(window.samples, dtype=np.float64)[:, self._columns]
+        samples = np.where(np.isfinite(samples), samples, np.nan) * self._units
+        first_index = window.first_index
+        gap = 0 if self._next_index is None else first_index - self._next_index
+        if 0 < gap <= self._nominal_period:
+            samples = np.concatenate((np.full((gap, 3), np.nan), samples))
+            first_index -= gap
+        elif gap:
+            self._tracker.reset()
+            self._bank.reseed()
+            self._watch.reset()
+            self._last_revolution = np.empty((0, 3))
+        self._next_index = end_index = first_index + len(samples)
+        said: list[Diagnosis] = []
+        for begin in range(0, len(samples), self.block):
+            part = samples[begin : begin + self.block]
+            last_index = first_index + begin + len(part) - 1
+            t_ns = window.t_end_ns - round((end_index - 1 - last_index) * window.period_ns)
+            said += self._step(part, last_index + 1 - len(part), t_ns, window.period_ns)
+        return said
+
+    def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
+        """See `Detector.silent`."""
+        index = self._next_index or 0
+        return [self._stater.silence(silence_s, self._decision, index, t_ns, self._revolutions)]
+
+    @property
+    def _columns(self) -> list[int]:
+        return [self._probes[0].column, self._probes[1].column, self._keyphasor.column]
+
+    def _new_bank(self, *, variance_factor: float = 1.0, decision: int = UNDETERMINED) -> ModelBank:
+        return ModelBank(
+            self._bank_modes,
+            noise=self._noise,
+            duration=self._duration,
+            rules=self._rules,
+            variance_factor=variance_factor,
+            decision=decision,
+        )
+
+    def _step(self, samples: Floats, first_index: int, t_ns: int, period_ns: float) -> list[Diagnosis]:
+        """A block of probe, probe and keyphasor samples; ``t_ns`` is the time of its last one."""
+        end_index = first_index + len(samples)
+        track = self._tracker.process(samples[:, 2])
+        revolution = round(self._tracker.period_samples)
+        self._last_revolution = np.concatenate((self._last_revolution, samples))[-revolution:]
+        angle = self._direction * track.angle_rad
+        cos, sin = np.cos(angle), np.sin(angle)
+        xy = samples[:, :2] @ self._to_xy
+        if stands_still(samples[:, :2]):
+            xy[:] = np.nan
+        self._watch.add(xy, cos, sin, revolution)
+        verdict = self._verdict()
+        self._follow_speed(float(angle[0]))
+        unsure = self._bank.decision == UNDETERMINED and not self._watch.confirmed
+        if verdict.quality != "good" or unsure:
+            xy[:] = np.nan
+
+        before = self._revolutions
+        self._revolutions = before + len(samples) / self._tracker.period_samples
+        if self._progress_index is None:
+            self._progress_index = first_index
+        if self._calibration is not None:
+            said = self._calibrate(xy, cos, sin, verdict, end_index, t_ns)
+            report = self._bank.process(xy * np.nan, cos, sin)  # only time passes
+        else:
+            report = self._bank.process(xy, cos, sin)
+            said = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
+            said += self._departures(report, verdict, end_index, t_ns, period_ns)
+        if math.floor(self._revolutions) > math.floor(before):
+            began, self._progress_index = self._progress_index, end_index
+            said.append(
+                self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=False)
+            )
+        return said
+
+    def _changes(
+        self,
+        report: BankReport,
+        verdict: Verdict,
+        first_index: int,
+        n: int,
+        before: float,
+        t_ns: int,
+        period_ns: float,
+    ) -> list[Diagnosis]:
+        """One statement for every change of the declared mode."""
+        said = []
+        after = self._revolutions
+        for change in report.declarations:
+            self._decision = self._modes[change.mode].name
+            self._revolutions = before + (change.sample + 1) / self._tracker.period_samples
+            at_ns = t_ns - round((n - 1 - change.sample) * period_ns)
+            onset = first_index + min(change.onset, change.sample)
+            end = first_index + change.sample + 1
+            said.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
+        self._revolutions = after
+        return said
+
+    def _departures(
+        self, report: BankReport, verdict: Verdict, end_index: int, t_ns: int, period_ns: float
+    ) -> list[Diagnosis]:
+        """The statement that the machine has left the declared mode, once."""
+        departure, departed = report.departure, self._departed
+        self._departed = departure is not None
+        if departure is None or departed:
+            return []
+        at_ns = t_ns + round(departure.sample * period_ns)
+        onset, end = end_index - 1 + departure.onset, end_index + departure.sample
+        return [
+            self._diagnosis(report, verdict, min(onset, end - 1), end, at_ns, report.decision, changed=False)
+        ]
+
+    def _calibrate(
+        self, xy: Floats, cos: Floats, sin: Floats, verdict: Verdict, end_index: int, t_ns: int
+    ) -> list[Diagnosis]:
+        """Measure the healthy motion; at the end, put it into every mode and say so."""
+        assert self._calibration is not None  # noqa: S101 - the caller asks while there is one
+        self._calibration.add(xy, cos, sin)
+        if self._calibration.samples < self._calibrate_revolutions * self._tracker.period_samples:
+            return []
+        motion = self._calibration.solve()
+        speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
+        self._bank_modes = adapted(self._bank_modes, motion, speed)
+        self._bank = self._new_bank(variance_factor=VARIANCE_FACTOR, decision=0)
+        self._calibration = None
+        self._decision = self._modes[0].name
+        report = self._bank.process(np.empty((0, 2)), np.empty(0), np.empty(0))
+        onset = end_index - motion.samples
+        return [self._diagnosis(report, verdict, onset, end_index, t_ns, 0, changed=True)]
+
+    def _follow_speed(self, angle_rad: float) -> None:
+        if math.isnan(angle_rad):
+            return
+        speed = self._direction * 2.0 * math.pi / self._tracker.period_samples / self._duration
+        if abs(speed / self._bank.speed - 1.0) > _RETUNE:
+            self._bank.retune(speed, angle_rad)
+
+    def _verdict(self) -> Verdict:
+        """What the last revolution is worth."""
+        probes = self._last_revolution[:, :2]
+        if len(probes) < round(self._tracker.period_samples):
+            bad = self._judge.missing(probes) or Verdict()
+        else:
+            bad = self._judge.judge(probes, self._least_motion_um)
+        if bad.quality != "good":
+            return bad
+        if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
+            expected_rpm = 60.0 * self._rate_hz / self._nominal_period
+            return Verdict(
+                "missing",
+                f"{self._keyphasor.name}: no pulse for {blind:.0f} revolutions at {expected_rpm:.0f} rpm; "
+                "check that the shaft turns at that speed, and that the pulse crosses "
+                f"{self._keyphasor.threshold_v} V",
+            )
+        if doubt := self._watch.doubt():
+            return Verdict("not_ok", doubt)
+        return Verdict()
+
+    def _diagnosis(
+        self,
+        report: BankReport,
+        verdict: Verdict,
+        first_index: int,
+        end_index: int,
+        t_ns: int,
+        decision: int,
+        *,
+        changed: bool,
+    ) -> Diagnosis:
+        speed_rpm = 60.0 * self._rate_hz / self._tracker.period_samples
+        moment = Moment(first_index, end_index, t_ns, self._revolutions, speed_rpm)
+        return self._stater.state(
+            report,
+            verdict,
+            moment,
+            decision=decision,
+            stated=self._decision,
+            changed=changed,
+            missing_share=float(np.isnan(self._last_revolution[:, :2]).any(axis=1).mean()),
+        )

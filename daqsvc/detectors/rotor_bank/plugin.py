@@ -1,0 +1,106 @@
+"""The rotor's model bank as a plugin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from daqsvc.detectors.rotor_bank.checks import bank_checks, check_bank_alarm
+from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK, RotorBank
+from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.reading import Reading
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
+    from daqsvc.detectors.rotor_bank.settings import Mode
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import Finding, KeyPath
+
+
+class RotorBankPlugin(DetectorPlugin[RotorBank]):
+    """One observer per mode of the rotor, and the rule that decides between them."""
+
+    settings = RotorBank
+    about = "the rotor's model bank"
+    detector = ROTOR_BANK
+    states_speed = True
+    place = 1
+
+    def sampled_together(self, given: RotorBank) -> tuple[str, ...]:
+        """See `PipelineTable.sampled_together`."""
+        return given.sampled_together
+
+    def checks(self, draft: MachineFile, given: RotorBank) -> Iterator[Iterator[Finding]]:
+        """See `PipelineTable.checks`."""
+        return bank_checks(draft, given)
+
+    def alarm_checks(self, given: RotorBank, at: KeyPath) -> Iterator[Finding]:
+        """See `PipelineTable.alarm_checks`."""
+        return check_bank_alarm(given, at)
+
+    def start_up_signals(self, draft: MachineFile, given: RotorBank) -> Mapping[str, tuple[str, ...]]:
+        """See `PipelineTable.start_up_signals`."""
+        del draft, given
+        return {ROTOR_BANK: ("speed",)}
+
+    def describe(self, machine: MachineFile, given: RotorBank) -> str:
+        """See `PipelineTable.describe`."""
+        del machine
+        text = (
+            f"{given.probes[0]}, {given.probes[1]} and {given.keyphasor}; noise {given.noise_um:g} um; "
+            f"rule {given.rule}, {_thresholds(given)}; "
+        )
+        if given.calibrate_revolutions:
+            text += f"unbalance and sag from the first {given.calibrate_revolutions} revolutions; "
+        return f"{text}modes {', '.join(map(_mode, given.modes))}"
+
+    def build(
+        self, machine: MachineFile, given: RotorBank, store: Path | None
+    ) -> tuple[RotorBankDetector, ...]:
+        """See `DetectorPlugin.build`."""
+        del store
+        # Here, not above: the kernels bring a compiler, which costs a second.
+        from daqsvc.detectors.rotor_bank.build import bank_detector  # noqa: PLC0415
+
+        try:
+            return (bank_detector(machine, given),)
+        except (ValueError, ArithmeticError) as error:
+            raise AssemblyError(
+                f"{machine.path}: pipeline.rotor_bank: its observers cannot be made of these figures "
+                f"({error}); correct noise_um, process_noise, modes, or [machine.rotor]"
+            ) from error
+
+    def check_files(self, machine: MachineFile, given: RotorBank) -> None:
+        """See `DetectorPlugin.check_files`: whether observers can be made of the figures."""
+        self.build(machine, given, None)
+
+    def readings(self, machine: MachineFile, given: RotorBank) -> Iterator[Reading]:
+        """See `DetectorPlugin.readings`."""
+        del machine
+        yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
+        for mode in given.modes:
+            yield Reading(ROTOR_BANK, "probabilities", mode.name)
+
+
+def _thresholds(bank: RotorBank) -> str:
+    forward, back = f"{bank.threshold_nats:g} nats forward", f"{bank.back_threshold_nats:g} back"
+    if bank.false_alarms_per_1000_rev is not None:
+        forward = f"at most {bank.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions"
+    if bank.mtbf_hours is not None:
+        back = f"MTBF {bank.mtbf_hours:g} h"
+    return f"{forward}, {back}"
+
+
+def _mode(mode: Mode) -> str:
+    words = {
+        "damping_ratio": f"zeta {mode.damping_ratio:g}" if mode.damping_ratio is not None else "",
+        "unbalance_ratio": f"unbalance x {mode.unbalance_ratio:g}",
+        "stiffness_ratio": f"stiffness x {mode.stiffness_ratio:g}",
+        "static_load_um": f"static load {mode.static_load_um[0]:g}, {mode.static_load_um[1]:g} um",
+        "rub": "rub",
+    }
+    differs = ", ".join(words[key] for key in mode.differs) or "as stated"
+    return f"{mode.name} ({differs}: {mode.severity})"

@@ -1,0 +1,179 @@
+"""What a rotor bank says to the alarms: a `Diagnosis` of its report, and one of its silence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.diagnosis.record import Diagnosis, Severity, silence_reason
+from daqsvc.rotor.bank import UNDETERMINED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.detectors.rotor_bank.modes import RotorMode
+    from daqsvc.detectors.shaft.probe_checks import Verdict
+    from daqsvc.rotor.bank import BankReport
+    from daqsvc.rotor.decision import DecisionRules
+
+    Floats = NDArray[np.float64]
+
+MODEL = "laval-rotor-rub/1"
+
+DEPARTURE = "departure"
+"""Decision while the machine has left the declared mode and the cause is not yet known."""
+
+UNDETERMINED_DECISION = "undetermined"
+_SEVERITIES: tuple[Severity, ...] = ("normal", "alert", "danger")
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Where in the stream something is said.
+
+    Attributes:
+        first_index: first sample of the evidence.
+        end_index: one past its last sample.
+        t_ns: monotonic time of that last sample.
+        revolutions: of the shaft until then.
+        speed_rpm: of the shaft.
+    """
+
+    first_index: int
+    end_index: int
+    t_ns: int
+    revolutions: float
+    speed_rpm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BankStater:
+    """Puts a bank's reports into words.
+
+    Attributes:
+        machine: name of the machine.
+        detector: name of the detector.
+        stream: name of the stream.
+        sensors: names of the sensors.
+        modes: the modes, healthiest first.
+        rules: thresholds and the rule that declares.
+    """
+
+    machine: str
+    detector: str
+    stream: str
+    sensors: tuple[str, ...]
+    modes: tuple[RotorMode, ...]
+    rules: DecisionRules
+
+    def state(
+        self,
+        report: BankReport,
+        verdict: Verdict,
+        moment: Moment,
+        *,
+        decision: int,
+        stated: str,
+        changed: bool,
+        missing_share: float,
+    ) -> Diagnosis:
+        """A diagnosis.
+
+        Args:
+            report: the bank's.
+            verdict: whether the samples can be trusted.
+            moment: where in the stream.
+            decision: index of the declared mode, -1 while undetermined.
+            stated: its name, as it was last stated.
+            changed: whether this states a change.
+            missing_share: share of the samples of the last revolution that are missing.
+        """
+        names = [mode.name for mode in self.modes]
+        paper, departure = report.probabilities, report.departure
+        probabilities, evidence = paper, {}
+        if decision != UNDETERMINED and self.rules.rule == "cusum":
+            probabilities, evidence = _odds(report), _evidence(report, names)
+        group, severity = report.group, self.severity(decision)
+        if departure is not None and not changed:
+            group, stated = departure.candidates, DEPARTURE
+            mildest = min(_SEVERITIES.index(self.severity(i)) for i in group)
+            severity = _SEVERITIES[max(mildest, _SEVERITIES.index(severity))]
+        statistics = {"speed": moment.speed_rpm}
+        statistics |= {f"paper.{name}": float(p) for name, p in zip(names, paper, strict=True)}
+        return Diagnosis(
+            machine=self.machine,
+            detector=self.detector,
+            t_ns=moment.t_ns,
+            stream=self.stream,
+            first_index=moment.first_index,
+            end_index=moment.end_index,
+            decision=stated,
+            changed=changed,
+            severity=severity,
+            probabilities=dict(zip(names, probabilities.tolist(), strict=True)),
+            group=tuple(names[i] for i in group),
+            statistics=statistics,
+            units={"speed": "rpm"},
+            thresholds={
+                "cusum": self.rules.threshold_nats,
+                "cusum.back": self.rules.back_threshold_nats,
+                "probability": self.rules.probability_threshold,
+            },
+            evidence=evidence,
+            revolutions=moment.revolutions,
+            quality=verdict.quality,
+            reason=verdict.reason,
+            sensors=self.sensors,
+            model=MODEL,
+            missing_share=missing_share,
+        )
+
+    def silence(self, silence_s: float, stated: str, index: int, t_ns: int, revolutions: float) -> Diagnosis:
+        """That there are no samples.
+
+        Args:
+            silence_s: for how long.
+            stated: the decision that is held.
+            index: the sample that would be next.
+            t_ns: now.
+            revolutions: of the shaft until the last sample.
+        """
+        names = [mode.name for mode in self.modes]
+        return Diagnosis(
+            machine=self.machine,
+            detector=self.detector,
+            t_ns=t_ns,
+            stream=self.stream,
+            first_index=index,
+            end_index=index,
+            decision=stated,
+            severity=self.severity(names.index(stated) if stated in names else UNDETERMINED),
+            revolutions=revolutions,
+            quality="missing",
+            reason=silence_reason(self.stream, silence_s),
+            sensors=self.sensors,
+            model=MODEL,
+        )
+
+    def severity(self, mode: int) -> Severity:
+        """How bad a declared mode is; the paper's rule raises no alarm."""
+        known = mode != UNDETERMINED and self.rules.rule == "cusum"
+        return self.modes[mode].severity if known else "normal"
+
+
+def _odds(report: BankReport) -> Floats:
+    """Posterior probabilities of the modes by the evidence of the declared one over each."""
+    against = report.lead_nats
+    against[report.decision] = 0.0  # it leads itself by infinity in the report
+    odds = np.exp(against.min() - against)
+    return np.asarray(odds / odds.sum(), dtype=np.float64)
+
+
+def _evidence(report: BankReport, names: Sequence[str]) -> dict[str, float]:
+    others = [i for i in range(len(names)) if i != report.decision]
+    lead, cusum = report.lead_nats.tolist(), report.cusum_nats.tolist()
+    return {f"lead.{names[i]}": lead[i] for i in others} | {f"cusum.{names[i]}": cusum[i] for i in others}

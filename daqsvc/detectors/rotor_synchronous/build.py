@@ -1,0 +1,128 @@
+"""The calibrated rotor out of a machine file: its detector, and its healthy state."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
+from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS
+from daqsvc.detectors.shaft.build import keyphasor, probes
+from daqsvc.rotor.calibration.file import (
+    CalibrationFileError,
+    load_calibration,
+    load_healthy,
+    save_calibration,
+)
+from daqsvc.rotor.laval import LavalRotor
+from daqsvc.rotor.synchronous.watch import WatchRules
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.detectors.rotor_synchronous.detector import SpeedReference
+    from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.settings.models import MachineFile
+
+log = logging.getLogger(__name__)
+
+
+def healthy_rotor(
+    machine: MachineFile, given: RotorSynchronous, calibration: Path | None = None
+) -> tuple[LavalRotor, tuple[Calibration, ...]]:
+    """What is known of the calibrated rotor: by its calibration if there is one, else by the machine file.
+
+    Args:
+        machine: the machine file.
+        given: its calibrated rotor.
+        calibration: file to take in place of the one that the machine file names.
+
+    Returns:
+        See `load_healthy`: at most one baseline, that of the machine's speed.
+
+    Raises:
+        CalibrationFileError: the calibration cannot be used at the machine's speed.
+    """
+    rotor = machine.machine.rotor
+    assert rotor is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]
+    if calibration is None and given.calibration is not None:
+        calibration = machine.resolve(given.calibration)
+    if calibration is not None:
+        return load_healthy(calibration, machine.machine.speed_rpm, rotor.clearance_um)
+    stated = LavalRotor(
+        natural_frequency_hz=rotor.natural_frequency_hz,
+        damping_ratio=rotor.damping_ratio,
+        natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
+        damping_tolerance=given.damping_tolerance_percent / 100.0,
+        clearance_um=rotor.clearance_um,
+        static_sag_um=rotor.static_sag_um,
+    )
+    return stated, ()
+
+
+def rotor_synchronous(
+    machine: MachineFile,
+    given: RotorSynchronous,
+    known: tuple[LavalRotor, tuple[Calibration, ...]],
+    store: Path | None,
+) -> Detector:
+    """The detector that ``[pipeline.rotor_synchronous]`` asks for.
+
+    Args:
+        machine: the machine file.
+        given: its calibrated rotor.
+        known: what `healthy_rotor` says of it.
+        store: directory of the state that survives restarts; None to begin without any and leave none.
+    """
+    rotor, baselines = known
+    calibration, kept = (baselines[0] if baselines else None), None
+    if calibration is None and store is not None:
+        kept = store / f"{ROTOR_SYNCHRONOUS}.toml"
+        calibration = _kept_calibration(kept, machine.machine.speed_rpm, rotor)
+    grid = machine.grid(given.sampled_together)
+    reference: SpeedReference
+    if given.reference == "keyphasor":
+        assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
+        reference = keyphasor(machine, grid, given.keyphasor)
+    else:
+        reference = given.reference
+    return RotorSynchronousDetector(
+        machine=machine.machine.name,
+        stream=grid.name,
+        rate_hz=grid.rate_hz,
+        speed_rpm=machine.machine.speed_rpm,
+        probes=probes(machine, grid, given.probes),
+        reference=reference,
+        rotor=rotor,
+        rules=WatchRules(
+            calibrate_revolutions=given.calibrate_revolutions,
+            false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
+            probe_drift_um=given.probe_drift_um,
+        ),
+        calibration=calibration,
+        ac_coupled=machine.ac_coupled,
+        keep=None if kept is None else partial(_keep_calibration, kept),
+    )
+
+
+def _kept_calibration(path: Path, speed_rpm: float, rotor: LavalRotor) -> Calibration | None:
+    """The healthy state that was measured before a restart, with what the file says of the rotor now."""
+    if not path.exists():
+        return None
+    try:
+        return replace(load_calibration(path, speed_rpm), rotor=rotor)
+    except CalibrationFileError as error:
+        log.warning("the healthy state of the rotor is measured anew: %s", error)
+        return None
+
+
+def _keep_calibration(path: Path, calibration: Calibration) -> None:
+    """Keep the healthy state, so that a restart does not take a faulty machine for a healthy one."""
+    try:
+        save_calibration(calibration, path, source="the running service")
+    except CalibrationFileError as error:
+        log.error("the healthy state of the rotor will be lost at the next restart: %s", error)  # noqa: TRY400

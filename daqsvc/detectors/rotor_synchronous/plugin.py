@@ -1,0 +1,112 @@
+"""The calibrated rotor as a plugin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, get_args
+
+from daqsvc.detectors.rotor_synchronous.checks import synchronous_checks
+from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS, RotorSynchronous
+from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.reading import Reading
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.rotor.laval import LavalRotor
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.problems import Finding
+
+
+class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
+    """The rotor against its own healthy state."""
+
+    settings = RotorSynchronous
+    about = "the rotor against its own healthy state"
+    detector = ROTOR_SYNCHRONOUS
+    states_speed = True
+    place = 2
+
+    def sampled_together(self, given: RotorSynchronous) -> tuple[str, ...]:
+        """See `PipelineTable.sampled_together`."""
+        return given.sampled_together
+
+    def checks(self, draft: MachineFile, given: RotorSynchronous) -> Iterator[Iterator[Finding]]:
+        """See `PipelineTable.checks`."""
+        return synchronous_checks(draft, given)
+
+    def start_up_signals(self, draft: MachineFile, given: RotorSynchronous) -> Mapping[str, tuple[str, ...]]:
+        """See `PipelineTable.start_up_signals`."""
+        del draft, given
+        return {ROTOR_SYNCHRONOUS: ("speed", "1x.amplitude")}
+
+    def describe(self, machine: MachineFile, given: RotorSynchronous) -> str:
+        """See `PipelineTable.describe`."""
+        return _described(machine, given)
+
+    def build(
+        self, machine: MachineFile, given: RotorSynchronous, store: Path | None
+    ) -> tuple[Detector, ...]:
+        """See `DetectorPlugin.build`."""
+        from daqsvc.detectors.rotor_synchronous.build import rotor_synchronous  # noqa: PLC0415 - brings SciPy
+
+        return (rotor_synchronous(machine, given, _healthy_rotor(machine, given), store),)
+
+    def check_files(self, machine: MachineFile, given: RotorSynchronous) -> None:
+        """See `DetectorPlugin.check_files`: whether its calibration can be used."""
+        _healthy_rotor(machine, given)
+
+    def readings(self, machine: MachineFile, given: RotorSynchronous) -> Iterator[Reading]:
+        """See `DetectorPlugin.readings`."""
+        from daqsvc.rotor.synchronous.signatures import RotorFault  # noqa: PLC0415 - brings NumPy's solvers
+
+        del machine, given
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "speed", "rpm")
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.amplitude", "um")
+        yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.phase", "deg")
+        for fault in get_args(RotorFault):
+            yield Reading(ROTOR_SYNCHRONOUS, "probabilities", fault)
+
+
+def _healthy_rotor(
+    machine: MachineFile, given: RotorSynchronous
+) -> tuple[LavalRotor, tuple[Calibration, ...]]:
+    from daqsvc.detectors.rotor_synchronous.build import healthy_rotor  # noqa: PLC0415 - brings SciPy
+    from daqsvc.rotor.calibration.file import CalibrationFileError  # noqa: PLC0415 - likewise
+
+    try:
+        return healthy_rotor(machine, given)
+    except CalibrationFileError as error:
+        raise AssemblyError(
+            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(given.calibration)!r}: {error}"
+        ) from error
+
+
+def _described(machine: MachineFile, synchronous: RotorSynchronous) -> str:
+    *others, last = synchronous.sensors
+    speed_rpm = abs(machine.machine.speed_rpm)
+    angle = {
+        "keyphasor": "angle from the keyphasor",
+        "fixed": f"angle from {speed_rpm:g} rpm, taken as exact",
+        "orbit": f"angle from the orbit's 1X around {speed_rpm:g} rpm",
+    }
+    healthy = (
+        f"the first {synchronous.calibrate_revolutions} revolutions are the healthy state, kept over restarts"
+        if synchronous.calibration is None
+        else f"healthy state in {synchronous.calibration} (that of the first "
+        f"{synchronous.calibrate_revolutions} revolutions if a run-up is all that it holds)"
+    )
+    parts = [
+        f"{', '.join(others)} and {last}",
+        angle[synchronous.reference],
+        healthy,
+        f"at most {synchronous.false_alarms_per_1000_rev:g} false alarms in 1000 revolutions",
+        f"natural frequency within {synchronous.natural_frequency_tolerance_percent:g} %",
+        f"damping within {synchronous.damping_tolerance_percent:g} %",
+    ]
+    if machine.ac_coupled:
+        parts.append("no mean position from AC-coupled probes, so no static load is seen")
+    return "; ".join(parts)

@@ -1,0 +1,186 @@
+"""What the revolutions of two probes are worth: missing, standing still, dead (for a part too), clipped.
+
+A revolution that is worth nothing must not reach a bank or the synchronous vectors: a dead probe makes a
+straight orbit and a clipped one makes harmonics, and both look like a fault of the machine.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from daqsvc.detectors.shaft.probe_checks import Verdict, clipped_at, stands_still
+from daqsvc.dsp.standstill import StandstillWatch
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.detectors.shaft.probe_checks import Probe
+    from daqsvc.dsp.standstill import Standstill
+
+    Complexes = NDArray[np.complex128]
+    Floats = NDArray[np.float64]
+
+POOLED_REVOLUTIONS = 4
+"""So many revolutions together are searched for clipping."""
+_DROP_STEPS = 4.0
+"""A drop is more than so many of the signal's finest steps."""
+_MISSING = 0.25
+"""Part of a revolution's samples that may be missing."""
+_DEAD = 0.05
+"""A probe that moves less than this part of what it must is dead."""
+_SURE = 3.0
+_BELIEVED = 0.1
+"""A probe is called blind if its motion is known to this part of the other's ..."""
+_CLEAR = 4.0
+"""... or if it saw so many times the uncertainty when it was calibrated."""
+
+
+class RevolutionJudge:
+    """Looks at the samples of a revolution: of one after the other, or of the last one again and again.
+
+    Args:
+        probes: the two probes, in the order of the columns.
+        missing: part of a revolution's samples that may be missing.
+        pooled: clipping is looked for in so many revolutions together as well: in noise it shows in some of
+            them only. 1 where the revolutions overlap.
+    """
+
+    def __init__(
+        self, probes: tuple[Probe, Probe], *, missing: float = _MISSING, pooled: int = POOLED_REVOLUTIONS
+    ) -> None:
+        self._probes = probes
+        self._missing = missing
+        self._pool: deque[Floats] = deque(maxlen=pooled)
+
+    def reset(self) -> None:
+        """Forget the revolutions before a gap."""
+        self._pool.clear()
+
+    def missing(self, samples: Floats) -> Verdict | None:
+        """Whether too many samples of a revolution, or of a part of one, are missing.
+
+        Args:
+            samples: float64 ``[n, 2]``, NaN where missing.
+        """
+        present = np.isfinite(samples)
+        n, missing = len(samples), int(np.count_nonzero(~present.all(axis=1)))
+        if n and missing <= self._missing * n:
+            return None
+        worst = int(present.sum(axis=0).argmin())
+        return Verdict(
+            "missing",
+            f"{self._probes[worst].name}: {'all' if missing == n else f'{missing} of {n}'} samples of a "
+            "revolution are missing; check the bus and the device",
+        )
+
+    def judge(self, samples: Floats, least_motion_um: float) -> Verdict:
+        """What a revolution is worth.
+
+        Args:
+            samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
+            least_motion_um: standard deviation that each probe must show at least.
+        """
+        if (missing := self.missing(samples)) is not None:
+            return missing
+        known = samples[np.isfinite(samples).all(axis=1)]
+        self._pool.append(known)
+        signals = [known] if len(self._pool) == 1 else [known, np.concatenate(self._pool)]
+        deviations = known.std(axis=0)
+        for column, probe in enumerate(self._probes):
+            if stands_still(known[:, column : column + 1]):
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
+                    "check the probe, its cable and driver",
+                )
+            least = max(least_motion_um, _DEAD * float(deviations[1 - column]))
+            if deviations[column] < least:
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: moved by {deviations[column]:.3g} um rms in a revolution, at least "
+                    f"{least:.3g} um is expected; check the probe, its cable and driver",
+                )
+            for signal in signals:
+                if (clipped := clipped_at(signal[:, column])) is not None:
+                    return Verdict(
+                        "not_ok",
+                        f"{probe.name}: clipped at {clipped:.6g} um; "
+                        "check the gap and the range of the converter",
+                    )
+            still = _dropped_to(known[:, column])
+            if still is not None:
+                return Verdict(
+                    "not_ok",
+                    f"{probe.name}: stood still at {still.value:.6g} um for {still.samples} of {len(known)} "
+                    "samples of a revolution; check the probe, its cable and driver",
+                )
+        return Verdict()
+
+
+def _dropped_to(signal: Floats) -> Standstill | None:
+    """The value that a signal dropped to, or came back from, for a part of a revolution; None if it did not.
+
+    A flat crest rests on one value of a coarse converter, too, but is reached in its finest steps.
+    """
+    still = StandstillWatch().take(signal)
+    if still is None:
+        return None
+    steps = np.abs(np.diff(signal))
+    ends = steps[[i for i in (still.first - 1, still.first + still.samples - 1) if 0 <= i < len(steps)]]
+    return still if ends.max(initial=0.0) > _DROP_STEPS * steps[steps > 0].min(initial=np.inf) else None
+
+
+def seen_by(vector: Complexes, axis_deg: float) -> float:
+    """1X amplitude that a probe sees.
+
+    Args:
+        vector: complex128 ``[5]``, synchronous vector.
+        axis_deg: where the probe points.
+    """
+    axis = cmath.exp(-1j * math.radians(axis_deg))
+    return float(abs(vector[1] * axis + np.conj(vector[2] * axis)))
+
+
+def blind_probe(
+    vector: Complexes,
+    deviation_um: float,
+    probes: Sequence[Probe],
+    axes_deg: Sequence[float],
+    healthy: Complexes | None = None,
+) -> str:
+    """Whether one probe does not see the whirl that the other sees, so that the orbit is a line along it.
+
+    No shaft moves so: a probe that still shows noise, but no 1X, is not connected. What it saw when it was
+    calibrated makes that clear in few revolutions.
+
+    Args:
+        vector: complex128 ``[5]``, mean synchronous vector in um.
+        deviation_um: standard deviation of one component of it.
+        probes: the two probes.
+        axes_deg: where they point, in the coordinates of the vector.
+        healthy: complex128 ``[5]``, the calibrated vector, if there is one.
+
+    Returns:
+        What is wrong and what to do; empty if nothing is.
+    """
+    amplitudes = [seen_by(vector, axis) for axis in axes_deg]
+    deaf, seeing = (0, 1) if amplitudes[0] < amplitudes[1] else (1, 0)
+    doubt = _SURE * math.sqrt(2.0) * deviation_um
+    known_by = amplitudes[seeing] / _CLEAR
+    if healthy is None:
+        known_by = _BELIEVED * amplitudes[seeing]
+    else:
+        known_by = min(known_by, seen_by(healthy, axes_deg[deaf]) / _CLEAR)
+    if doubt > known_by or amplitudes[deaf] > max(_DEAD * amplitudes[seeing], doubt):
+        return ""
+    return (
+        f"{probes[deaf].name}: sees no 1X ({amplitudes[deaf]:.2g} um) where {probes[seeing].name} sees "
+        f"{amplitudes[seeing]:.3g} um; check the probe, its cable and driver"
+    )

@@ -1,0 +1,55 @@
+"""What a detector brings to the service, registered as an entry point in the group ``daqsvc.detectors``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+from daqsvc.settings.registry import PipelineTable
+from daqsvc.settings.section import Section
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.reading import Reading
+    from daqsvc.settings.models import MachineFile
+
+SettingsT = TypeVar("SettingsT", bound=Section)
+
+
+class DetectorPlugin(PipelineTable[SettingsT]):
+    """A kind of detector: its table in ``[pipeline]``, and what makes the detectors of it.
+
+    Importing one must be cheap: what brings kernels is imported when a detector is made.
+    """
+
+    def build(self, machine: MachineFile, given: SettingsT, store: Path | None) -> Iterable[Detector]:
+        """The detectors that the table asks for.
+
+        Args:
+            machine: the machine file.
+            given: the table.
+            store: directory of the state that survives restarts; None to begin without any and leave none.
+
+        Raises:
+            AssemblyError: a file that the table names cannot be used, or its figures cannot go together.
+        """
+        raise NotImplementedError
+
+    def check_files(self, machine: MachineFile, given: SettingsT) -> None:
+        """See whether what the table names beside the machine file can be used.
+
+        Raises:
+            AssemblyError: it cannot; the message names file, key, value and remedy.
+        """
+
+    def readings(self, machine: MachineFile, given: SettingsT) -> Iterable[Reading]:
+        """The figures that are shown by themselves."""
+        del machine, given
+        return ()
+
+    def quality_alarms(self, machine: MachineFile, given: SettingsT) -> Iterable[str]:
+        """Names of the alarms about what its detectors rest on: that these say ``detector-ok`` is enough."""
+        del machine, given
+        return () if self.detector is None else (f"detector-ok/{self.detector}",)

@@ -1,0 +1,28 @@
+"""A figure of a detector that is shown by itself: in Home Assistant, to a Sparkplug host, on a page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+STALE_S = 120
+"""A figure that has not been told for so long is no longer true, unless it is told more seldom."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A figure of a detector's statements that is shown by itself.
+
+    Attributes:
+        detector: whose statements.
+        kind: where it stands in them.
+        key: its name there, e.g. ``"rms"`` or ``"F1"``.
+        unit: its unit as in the statements, e.g. ``"um"``; empty for none.
+        stale_s: a figure that has not been told for so long is no longer true.
+    """
+
+    detector: str
+    kind: Literal["statistics", "probabilities"]
+    key: str
+    unit: str = ""
+    stale_s: int = STALE_S
