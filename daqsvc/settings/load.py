@@ -16,6 +16,7 @@ from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
+from daqsvc.settings.registry import broken_detectors
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
@@ -73,6 +74,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     except TomlTextError as error:
         raise MachineFileError([Problem(path, error.line, "", "", str(error), error.remedy)]) from None
     reading = _Reading(document, spots, path)
+    reading.leave_out_broken()
     draft = reading.validate()
     messages = _read_dbc(draft, path, reading.findings)
     reading.findings += check(draft, messages)
@@ -92,6 +94,16 @@ class _Reading:
         self._path = path
         self._written_as: dict[KeyPath, str] = {}
         self.findings: list[Finding] = []
+
+    def leave_out_broken(self) -> None:
+        """Take out the tables of detectors that are installed and cannot be loaded; each is a finding."""
+        pipeline = self._document.get("pipeline")
+        if not isinstance(pipeline, dict):
+            return
+        for key in broken_detectors().keys() & pipeline.keys():
+            del pipeline[key]
+            remedy = f"install the package that brings it again, or remove [pipeline.{key}]"
+            self.findings.append(Finding(("pipeline", key), broken_detectors()[key], remedy))
 
     def validate(self) -> MachineFile:
         """Check every value for itself; returns the file, or what is valid of it."""

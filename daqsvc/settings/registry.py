@@ -108,9 +108,15 @@ def _installed() -> _Installed:
         try:
             found[point.name] = point.load()()
         except Exception as error:  # noqa: BLE001  whatever a plugin does when it is imported
-            broken[point.name] = f"cannot be loaded from {point.value}: {error}"
+            broken[point.name] = f"the detector cannot be loaded from {point.value}: {error}"
     ordered = sorted(found.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
+
+
+def forget() -> None:
+    """Look for plugins anew: for whoever installs one in a running process."""
+    _installed.cache_clear()
+    pipeline_model.cache_clear()
 
 
 def detector_tables() -> Mapping[str, PipelineTable[Any]]:

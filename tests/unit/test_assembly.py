@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daqsvc import assembly_drivers
+from daqsvc import assembly_drivers, cli
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
-from daqsvc.detectors.make import cli, detectors
+from daqsvc.detectors.make import detectors
 from daqsvc.settings import load_machine_file
 from drivers.frames import FrameLayout
 
@@ -41,11 +41,11 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     made = assembly_drivers.drivers(machine, SystemClock(), lambda _: None)
     assert [driver.name for driver in made] == list(machine.buses)
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
-    made_detectors = detectors(machine)
-    watched = any(isinstance(detector, LevelDetector | TrendDetector) for detector in made_detectors)
+    watching = detectors(machine)
+    watched = any(isinstance(detector, LevelDetector | TrendDetector) for detector in watching)
     assert watched == (machine.pipeline.levels is not None)
     assert [rule.alarm for rule in alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
-    for detector in detectors:
+    for detector in watching:
         detector.warm()
 
 

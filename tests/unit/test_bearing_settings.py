@@ -10,11 +10,11 @@ import pytest
 from bearing_signals import healthy
 from machine_files import MACHINES, changed, only_problem, problems_of
 
-from daqsvc import assembly_bearing
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_file import save_bearing_baseline
 from daqsvc.cli import main
+from daqsvc.detectors.bearing.build import pair_models
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.make import detectors
 from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
@@ -168,7 +168,7 @@ def test_a_calibration_of_other_masses_or_without_the_pair_stops_it(right, tmp_p
     samples = dict(zip(names, (healthy(8.0, seed, rate_hz=25_600.0) for seed in (1, 2)), strict=True))
     bearings = {"accel-de": orders, "accel-fe": orders}
     together = [names, ("accel-fe",)]
-    models = assembly_bearing.pair_models(given, given.pipeline.bearing)
+    models = pair_models(given, given.pipeline.bearing)
     learnt = learn_baseline(samples, 25_600.0, 1772.0, bearings, together, pairs=models)
     named = ("calibrate_s = 30.0", f'calibration = "{path}"')
     save_bearing_baseline(learnt, path)
