@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import os
+import signal
 import threading
 import time
 from pathlib import Path
@@ -27,6 +28,11 @@ settings.load_profile("daqsvc")
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()
 GRACE_S = 2.0
+
+
+# A shell's background job, and nohup, ignore these, and what the tests start would inherit it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Coroutine, Iterator, Mapping
     from types import FrameType
 
     from daqsvc.recording.recording import Recording
@@ -131,22 +131,42 @@ def _run(arguments: argparse.Namespace) -> int:
     )
 
 
+async def _interruptible(playing: Coroutine[Any, Any, Outcome]) -> Outcome:
+    """Have SIGTERM and a lost terminal cancel what is played, as Ctrl-C does: it then ends in order.
+
+    Raises:
+        KeyboardInterrupt: one of them came.
+    """
+    loop, task, interrupted = asyncio.get_running_loop(), asyncio.current_task(), False
+    assert task is not None  # noqa: S101 - a coroutine runs in one
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        task.cancel()
+
+    for number in _ends_on():
+        loop.add_signal_handler(number, interrupt)
+    try:
+        return await playing
+    except asyncio.CancelledError:
+        if interrupted:
+            raise KeyboardInterrupt from None
+        raise
+
+
+def _ends_on() -> list[signal.Signals]:
+    return [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
+
+
 @contextlib.contextmanager
 def _sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM and a lost terminal do what Ctrl-C does: everything is closed and removed on the way out."""
+    """SIGTERM and a lost terminal do what Ctrl-C does, also while no event loop runs."""
 
-    def interrupt(_number: int, frame: FrameType | None) -> None:
-        # While the event loop runs, the handler of Ctrl-C is asyncio's, which cancels the main task.
-        handler = signal.getsignal(signal.SIGINT)
-        if not callable(handler):
-            raise KeyboardInterrupt  # a shell's background job ignores Ctrl-C
-        handler(signal.SIGINT, frame)
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
 
-    before = {
-        number: signal.signal(number, interrupt)
-        for number in (signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) is not signal.SIG_IGN
-    }
+    before = {number: signal.signal(number, interrupt) for number in _ends_on()}
     try:
         yield
     finally:
@@ -169,7 +189,7 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
 
     def play(hear: Callable[[Received], None]) -> Outcome:
         session = Session(script, speed=arguments.speed, broker_url=arguments.broker, hear=hear)
-        return asyncio.run(session.run())
+        return asyncio.run(_interruptible(session.run()))
 
     if arguments.json:
         summary = summarise(script, play(_print_message), speed=arguments.speed)

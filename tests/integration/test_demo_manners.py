@@ -274,6 +274,19 @@ def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
     assert left_behind(tmp_path) == []
 
 
+def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path: Path) -> None:
+    path = save(tmp_path / "rig.npz", a=noise(600))
+    playing = ["--recording", str(path), "--json", "--speed", "2"]
+    ignoring = lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)  # noqa: E731
+    with demo(*playing, env=elsewhere(tmp_path), preexec_fn=ignoring) as running:
+        assert running.stdout is not None
+        running.stdout.readline()
+        running.send_signal(signal.SIGTERM)
+        _, said = running.communicate()
+    assert (said, running.returncode) == ("daqsvc demo: interrupted\n", 1)
+    assert left_behind(tmp_path) == []
+
+
 def test_an_interrupt_during_the_imports_is_no_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

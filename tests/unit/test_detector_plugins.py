@@ -24,9 +24,7 @@ class Kurtosis(Section):
     """How peaked an acceleration is."""
 
     sensor: Annotated[Name, Field(description="the accelerometer", examples=["accel-de"])]
-    most: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=6.0, description="above it, something knocks"
-    )
+    most: Annotated[float, Field(ge=0, le=1000)] = Field(default=6.0, description="above it, it knocks")
 
 
 class Knocks:
@@ -113,8 +111,6 @@ def test_one_that_cannot_be_loaded_is_said_where_it_is_asked_for(installed):
     installed(kurtosis="nobody_has_this:KurtosisPlugin")
     assert parse_machine_file(text(), EXAMPLE).detectors == ()
     problem = the_problem(text(TABLE))
-    assert "the detector cannot be loaded from nobody_has_this:KurtosisPlugin: No module named" in str(
-        problem
-    )
+    assert "the detector cannot be loaded from nobody_has_this:KurtosisPlugin: No module" in str(problem)
     assert "install the package that brings it again, or remove [pipeline.kurtosis]" in str(problem)
     assert problem.line == text(TABLE).splitlines().index("[pipeline.kurtosis]") + 1
