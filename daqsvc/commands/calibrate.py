@@ -19,8 +19,6 @@ from daqsvc.commands.calibrate_bearing import (
 )
 from daqsvc.commands.option_types import SpeedOption
 from daqsvc.commands.signals import signals_to_end
-from daqsvc.detectors.bearing.settings import Bearing
-from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 
 if TYPE_CHECKING:
     import argparse
@@ -72,6 +70,7 @@ class CalibrateCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
+        from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - pydantic
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
         set_memory(arguments.max_memory)
@@ -114,6 +113,8 @@ class CalibrateCommand:
     def _without_rotor(
         self, recordings: Sequence[str], arguments: argparse.Namespace, machine: MachineFile
     ) -> int:
+        from daqsvc.detectors.bearing.settings import Bearing  # noqa: PLC0415 - brings pydantic
+
         if machine.pipeline.table(Bearing) is None:
             self._parser.error(
                 f"{machine.path} has neither [pipeline.rotor_synchronous] nor [pipeline.bearing] to be "

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.option_types import positive
-from daqsvc.detectors.rotor_bank.settings import RotorBank
-from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 
 if TYPE_CHECKING:
     import argparse
@@ -87,6 +85,8 @@ class DetectabilityCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
+        from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
+
         machine = self._load(arguments.file)
         if machine is None:
             return _BAD_FILE
@@ -111,6 +111,9 @@ class DetectabilityCommand:
 
 def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
     """What is wrong with the options for this machine; empty if nothing is."""
+    from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
+    from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - brings pydantic
+
     pipeline = machine.pipeline
     if pipeline.table(RotorBank) is None and pipeline.table(RotorSynchronous) is None:
         return (
@@ -157,6 +160,7 @@ def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability
     """Detectability of the bank that the service would run for this machine file."""
     from daqsvc.detectors.make import detectors  # noqa: PLC0415
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector  # noqa: PLC0415
+    from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
     from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
     from daqsvc.rotor.detectability.foretell import detectability  # noqa: PLC0415
 

@@ -15,8 +15,9 @@ from conformance.rig import samples_of
 from live_service import running
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.assembly_drivers import drivers, frame_layout
 from daqsvc.settings import load_machine_file, parse_machine_file
-from daqsvc.settings.problems import AssemblyError, drivers, frame_layout
+from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
