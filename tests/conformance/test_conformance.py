@@ -341,6 +341,7 @@ async def test_a_consumer_that_cannot_keep_up_costs_samples_and_not_memory(trans
     assert rig.counters.samples_lost > 0
 
 
+@pytest.mark.long
 async def test_samples_get_the_time_at_which_they_were_taken(transport: Transport) -> None:
     async with Rig(transport) as rig:
         await rig.until_up()

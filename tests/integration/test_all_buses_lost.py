@@ -130,6 +130,7 @@ class QuickClock(SystemClock):
         await asyncio.sleep(duration_ns / NS_PER_S / 10)
 
 
+@pytest.mark.long
 async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) -> None:
     rng = np.random.default_rng(20)
     channel = f"all-lost-{next(_run)}"

@@ -100,6 +100,7 @@ def test_a_log_is_judged_as_its_samples_are(analyze, machine, tmp_path, ending):
     assert same(of_log, of_table)
 
 
+@pytest.mark.long
 def test_what_is_recorded_off_a_bus_is_judged_as_what_was_sent(analyze, tmp_path):
     address = tmp_path / "bus"
     machine = machine_file(tmp_path / "machine.toml")

@@ -183,6 +183,7 @@ async def test_a_day_in_the_life_of_a_latching_alarm(tmp_path: Path) -> None:
             await stands(store, "peak", "normal")
 
 
+@pytest.mark.long
 async def test_a_service_that_was_killed_leaves_a_journal_that_can_be_read(tmp_path: Path) -> None:
     file, store = tmp_path / "motor.toml", tmp_path / "store"
     async with CanGateway() as gateway:

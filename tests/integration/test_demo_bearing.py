@@ -29,6 +29,7 @@ def damaged(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_damaged_race_of_a_recording_is_named_and_alarmed_live(
     damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -249,6 +249,7 @@ def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
     assert left_behind(tmp_path) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_an_alarm_is_shown_once_where_no_terminal_is(form: list[str], tmp_path: Path) -> None:
     path = save(tmp_path / "rig.npz", a=3.0 * noise(6))

@@ -15,7 +15,7 @@ from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.scenario import builtin_scenarios
 
 SHIPPED = sorted((Path(__file__).parents[2] / "config/scenarios").glob("*.toml"))
-LONG = {"bearing-damage", "healthy", "link-faults", "paper"}
+LONG = {"bad-bus", "bearing-damage", "healthy", "link-faults", "paper"}
 """What else the demo is tested with plays the built-in ones."""
 
 

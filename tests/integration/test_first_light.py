@@ -211,6 +211,7 @@ def demo(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
 
 
+@pytest.mark.long
 def test_the_demo_prints_one_json_object_a_line() -> None:
     done = demo("--scenario", "paper", "--json", "--seed", "7", "--speed", "200")
     assert (done.returncode, done.stderr.count("Traceback")) == (0, 0)

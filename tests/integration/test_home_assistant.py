@@ -65,7 +65,7 @@ def entity(live, name):
     return rendered(found["value_template"], states[-1]) if states else None
 
 
-@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+@pytest.mark.parametrize("protocol", ["5", pytest.param("3.1.1", marks=pytest.mark.long)])
 async def test_alarms_show_up_and_follow(mosquitto, outbox, protocol):
     async with (
         Consumer(mosquitto.port) as live,

@@ -64,6 +64,7 @@ def vibration_g(mm_s, first, count, rate_hz=RATE_HZ):
     return (amplitude_g * np.sin(2 * np.pi * 50.0 * t) + noise)[:, np.newaxis]
 
 
+@pytest.mark.long
 async def test_a_live_alert_does_not_return_while_frames_are_lost(tmp_path: Path) -> None:
     text = MOTOR.read_text().partition("[[alarms]]")[0] + ALARM
     text = text.replace('interface = "socketcan"', 'interface = "virtual"').replace('"can0"', '"lossy"', 1)

@@ -116,6 +116,7 @@ async def test_one_log_line_per_message_above_ten_in_flight(mosquitto, outbox, c
     assert len([r for r in caplog.records if r.name.startswith(("daqsvc", "aiomqtt", "paho", "mqtt"))]) < 10
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_availability_flaps_when_two_boxes_share_a_client_id(tmp_path, mosquitto, outbox, caplog):
     """frigate#3280: each connection ends the other, and the availability goes on and off for ever."""
@@ -247,6 +248,7 @@ async def test_telemetry_that_the_broker_refuses_holds_up_the_alarms(tmp_path, o
     assert len([r for r in caplog.records if "is dropped and counted" in r.getMessage()]) == 1
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_alarms_wait_behind_a_backlog_of_telemetry(mosquitto, outbox):
     """One queue for everything: the alarm of today comes after the status of the whole night."""

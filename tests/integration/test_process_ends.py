@@ -283,6 +283,7 @@ def test_a_terminal_that_goes_away_stops_the_service_in_order(tmp_path: Path) ->
     assert closed(tmp_path)
 
 
+@pytest.mark.long
 def test_a_service_that_is_to_outlive_its_terminal_does(tmp_path: Path) -> None:
     with on_a_terminal(tmp_path, nohup=True) as (process, master):
         os.close(master)

@@ -166,6 +166,7 @@ def test_what_cannot_be_recorded_is_said_in_one_line(machine: Path, tmp_path: Pa
     assert "there is none" in refused(modbus, "--out", tmp_path / "run.log")
 
 
+@pytest.mark.long
 def test_the_service_records_while_it_watches(machine: Path, tmp_path: Path) -> None:
     folder = tmp_path / "can"
     folder.mkdir()

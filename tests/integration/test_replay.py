@@ -149,6 +149,7 @@ async def test_the_samples_of_a_log_are_counted_on_when_it_is_played_again(tmp_p
     np.testing.assert_allclose(np.diff(t_ns), np.diff([b.first_index for b in played.blocks]) * 1e6, atol=2e5)
 
 
+@pytest.mark.long
 async def test_the_samples_of_a_table_are_counted_on_when_it_is_played_again(tmp_path: Path) -> None:
     x, y = np.arange(250.0), np.linspace(-1, 1, 250)
     np.savez(tmp_path / "run.npz", probe_x=x, probe_y=y)

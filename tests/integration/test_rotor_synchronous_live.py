@@ -105,6 +105,7 @@ async def test_a_change_is_one_alarm_refined_from_departure_to_name(rebalanced) 
     assert outcome.figures["streams"]["shaft"]["samples_lost"] > 0
 
 
+@pytest.mark.long
 async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
     machine = scenario((60.0, {"eccentricity": 0.25}), revolutions=90.0).simulate(5)
     async with EmbeddedBroker() as broker:

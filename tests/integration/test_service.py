@@ -88,6 +88,7 @@ async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -
     assert told["cause"]["quality"] == "not_ok"
 
 
+@pytest.mark.long
 async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Path) -> None:
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
         machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), broker.url)

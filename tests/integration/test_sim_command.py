@@ -61,6 +61,7 @@ def figures(consumer: Consumer, group: str, name: str, figure: str) -> Any:
     return status_of(consumer).get(group, {}).get(name, {}).get(figure)
 
 
+@pytest.mark.long
 @pytest.mark.mosquitto
 async def test_run_counts_to_the_sample_what_sim_has_sent_and_spoilt(
     tmp_path: Path, bad_link: Path, mosquitto: Mosquitto
@@ -203,6 +204,7 @@ def test_a_recording_is_played_by_the_names_of_the_sensors(tmp_path: Path) -> No
     assert json.loads(output)["streams"]["shaft"]["samples_sent"] == 640
 
 
+@pytest.mark.long
 async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) -> None:
     path, damage = tmp_path / "can0", tmp_path / "damage.toml"
     damage.write_text((SCENARIOS / "bearing-damage.toml").read_text().replace("at_s = 10.0", "at_s = 1.0"))
@@ -227,6 +229,7 @@ async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) 
     np.testing.assert_allclose(received, np.clip(played, -largest_g, largest_g), atol=0.00051)
 
 
+@pytest.mark.long
 def test_a_gap_in_a_recording_is_sent_as_not_available(tmp_path: Path) -> None:
     lateral, vertical = np.linspace(-5.0, 5.0, 100), np.full(100, 9.8)
     lateral[40:60] = np.nan

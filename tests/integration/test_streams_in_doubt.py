@@ -58,6 +58,7 @@ class Events:
         return [event.message for event in self.all if event.alarm == alarm]
 
 
+@pytest.mark.long
 async def test_streams_in_doubt_are_quality_alarms_and_no_others(tmp_path: Path) -> None:
     await be_in_doubt(tmp_path, and_recover=False)
 

@@ -109,6 +109,7 @@ async def test_an_alarm_comes_and_goes_with_the_velocity(tmp_path):
         assert alarm("de-temperature").since is None
 
 
+@pytest.mark.long
 async def test_a_dead_unit_raises_quality_and_clears_nothing(tmp_path):
     async with watched(tmp_path) as (sensor, alarm):
         sensor.shake(3.1)
