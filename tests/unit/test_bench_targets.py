@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import runpy
+import socket
+import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    import pytest
+import pytest
 
 BENCH = Path(__file__).resolve().parents[1] / "bench"
 
@@ -30,3 +30,33 @@ def test_every_benchmark_that_asks_for_something_ends_with_what_came_of_it() -> 
     for name, text in asking.items():
         assert "sys.exit(main())" in text, name
         assert "targets.exit_code" in text, name
+
+
+@pytest.mark.parametrize(("takes", "least", "most"), [(True, 2000, 2000), (False, 1, 1000)])
+def test_a_load_counts_only_what_the_other_end_has_taken(
+    monkeypatch: pytest.MonkeyPatch,
+    takes: bool,  # noqa: FBT001  pytest names it
+    least: int,
+    most: int,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCH))
+    bench = runpy.run_path(str(BENCH / "bench_hostile_counters.py"))
+    send = bench["send"]
+    monkeypatch.setitem(send.__globals__, "LOAD_S", 0.2)
+    monkeypatch.setitem(send.__globals__, "PATIENCE_S", 20.0 if takes else 0.1)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+    def read_all() -> None:
+        while theirs.recv(100):
+            pass
+
+    reader = threading.Thread(target=read_all)
+    if takes:
+        reader.start()
+    with theirs:
+        with ours:
+            sent, took_s = send(bench["Load"]("can", "sound", 10_000), ours.fileno())
+        if takes:
+            reader.join(10)
+    assert least <= sent <= most
+    assert took_s >= 0.2
