@@ -28,8 +28,8 @@ log = logging.getLogger(__name__)
 MARK_LINGER_S = 0.05
 """How long a mark may wait for company: nobody waits for it, and each commit costs the disk a sync."""
 
-CROWD_LINGER_S = 0.02
-"""How long messages wait for company while they come in a crowd: a commit for each costs more than they."""
+CROWD_LINGER_S = 0.05
+"""How long messages wait for company while they come in a crowd: a commit costs more than 20 of them."""
 
 CROWD_OVER_S, CROWD = 0.1, 20
 """So many messages within so long are a crowd."""

@@ -80,6 +80,7 @@ class Summary:
     ) -> None:
         self._machine = machine
         self._topics = topics
+        self._prefix = topics.alarm_prefix(machine)
         self._alarms: dict[str, bytes] = {}
         self._standings: dict[str, StandingPayload] = {}
         self._rests_on = {alarm: frozenset(services) for alarm, services in rests_on.items()}
@@ -97,7 +98,7 @@ class Summary:
         Raises:
             ValueError: it is on an alarm's topic and no alarm's message.
         """
-        if not message.topic.startswith(self._topics.alarm_prefix(self._machine)):
+        if not message.topic.startswith(self._prefix):
             return False
         told = _Told.model_validate_json(message.payload)
         problem: Literal["ON", "OFF"] = "OFF" if told.state in _GONE else "ON"

@@ -14,7 +14,7 @@ import pytest
 from brokers import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.outbox.journal import TRIM_EVERY
+from daqsvc.outbox.journal import TRIM_EVERY, Journal
 from daqsvc.outbox.sequence import STEP
 from daqsvc.outbox.store import Outbox, OutboxError, OutboxLimits
 
@@ -52,6 +52,27 @@ def connections(monkeypatch):
 
     monkeypatch.setattr("daqsvc.outbox.files.sqlite3.connect", spy)
     return made
+
+
+async def test_messages_of_a_flood_share_commits_and_one_alone_waits_for_no_other(outbox, monkeypatch):
+    commits, commit = [], Journal.commit
+
+    def spy(journal, drafts, sent):
+        commits.append(len(drafts))
+        return commit(journal, drafts, sent)
+
+    monkeypatch.setattr(Journal, "commit", spy)
+    for _ in range(5):
+        await outbox.append(TOPIC, payload, retain=True)
+    assert commits == [1] * 5
+    commits.clear()
+    flood = []
+    for _ in range(50):
+        flood += [outbox.submit(TOPIC, payload, retain=True) for _ in range(4)]
+        await asyncio.sleep(0.005)
+    assert sorted(await asyncio.gather(*flood)) == [one.result() for one in flood]
+    assert sum(commits) == len(flood)
+    assert len(commits) < 25, f"{len(commits)} commits for 50 bursts"
 
 
 async def test_appended_is_on_disk_in_order_and_waits_until_it_is_sent(outbox, tmp_path):
