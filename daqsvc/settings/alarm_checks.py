@@ -96,6 +96,7 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
         yield Finding(_START_UP, "has neither between nor change_per_s", "add one of the two, or both")
     if start_up.between is not None and not start_up.between[0] < start_up.between[1]:
         yield Finding((*_START_UP, "between"), "is no range", "write the lower end first")
+    yield from _never_up(draft, start_up)
     yield from _start_up_signal(draft, start_up)
     if not any(isinstance(alarm, SetpointAlarm) and alarm.trip_multiply > 1 for alarm in draft.alarms):
         yield Finding(
@@ -103,6 +104,20 @@ def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
             "has no effect: no alarm has a trip_multiply",
             "write e.g. trip_multiply = 2.0 in an alarm on a level, or remove it",
             fatal=False,
+        )
+
+
+def _never_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
+    """A machine at its nominal speed has started up."""
+    speed_rpm = abs(draft.machine.speed_rpm)
+    if start_up.between is None or start_up.measure != "speed":
+        return
+    low, high = start_up.between
+    if low <= speed_rpm <= high:
+        yield Finding(
+            (*_START_UP, "between"),
+            f"holds machine.speed_rpm, {speed_rpm:g} rpm: the machine would always be starting up",
+            f"end it below {speed_rpm:g}, e.g. between = [{0.1 * speed_rpm:g}, {0.9 * speed_rpm:g}]",
         )
 
 

@@ -28,13 +28,14 @@ from daqsvc.settings.layout_checks import (
     unique,
 )
 from daqsvc.settings.memory_checks import check_memory
-from daqsvc.settings.modbus_checks import check_modbus
+from daqsvc.settings.modbus_checks import check_line_load, check_modbus
 from daqsvc.settings.modbus_overlaps import check_writes_and_samples
 from daqsvc.settings.mqtt_files import credential_files
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.record_checks import check_recorded_buses
 from daqsvc.settings.registry import configured
 from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
+from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
     check_alarm_reach,
@@ -97,12 +98,14 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
     yield check_can_owners(draft)
     yield check_can_keys(draft)
     yield check_serial_ports(draft)
+    yield check_line_load(draft)
     yield check_replay_buses(draft)
     yield check_recorded_buses(draft)
     yield from _sensor_checks(draft, messages)
     yield check_memory(draft)
     yield _names(draft)
     yield check_writes_and_samples(draft)
+    yield from physics_checks(draft)
     with suppress(UnusableValueError):
         for _, plugin, given in configured(draft.pipeline, valid_only=True):
             with suppress(UnusableValueError):

@@ -13,7 +13,7 @@ from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.replay import TableLayout
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.serial import SerialLayout
-from daqsvc.settings.wire import CLASSIC_MAX_LENGTH, frame_time
+from daqsvc.settings.wire import BUSY, CLASSIC_MAX_LENGTH, frame_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -230,16 +230,25 @@ def check_frame_length(
 def check_bus_load(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
     """A bus has time for all the frames on it."""
     for bus in draft.buses:
-        load = 0.0
+        load = most = 0.0
+        remedy = "correct the rates of the streams, put more samples in a frame, or use a faster bus"
         for name, stream in draft.streams.items():
             with suppress(UnusableValueError):
                 share = bus_share(draft, name, messages.get(name)) if stream.bus == bus else None
-                load += 0.0 if share is None else share[0]
+                load, most = (load, most) if share is None else (load + share[0], most + share[1])
         if load > 1.0:
             yield Finding(
                 ("buses", bus, "bitrate"),
                 f"is too slow: the streams on the bus would take it {100 * load:,.0f} % of the time at least",
-                "correct the rates of the streams, put more samples in a frame, or use a faster bus",
+                remedy,
+            )
+        elif load > BUSY:
+            yield Finding(
+                ("buses", bus, "bitrate"),
+                f"leaves little room: the streams take {100 * load:.0f} % of the bus's time without stuff "
+                f"bits, {100 * most:.0f} % with the most there can be; frames of low priority come late",
+                remedy,
+                fatal=False,
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.modbus import (
@@ -14,8 +15,11 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
+from daqsvc.settings.modbus_load import USUAL_ANSWER_S, line_load
 from daqsvc.settings.modbus_overlaps import check_channel_overlaps
 from daqsvc.settings.problems import Finding
+from daqsvc.settings.section import UnusableValueError
+from daqsvc.settings.wire import BUSY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -58,6 +62,32 @@ def check_modbus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
     yield from check_channel_overlaps(layout, path)
     yield from _check_room(layout, path)
     yield from _check_writes(bus, stream.bus, layout, path)
+
+
+def check_line_load(draft: MachineFile) -> Iterator[Finding]:
+    """A serial line has time for all that it is asked."""
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            if not isinstance(bus, ModbusRtuBus):
+                continue
+            load = line_load(draft, name, bus)
+            asked = f"{load.requests_per_s:.3g} requests a second take {100 * load.least:.3g} % of its time"
+            remedy = "poll more seldom, let requests read more at once (max_gap), or use a faster line"
+            if load.least > 1.0:
+                yield Finding(
+                    ("buses", name, "baud"),
+                    f"is too slow: {asked} at least, with units that answer at once",
+                    remedy,
+                )
+            elif load.usual > BUSY:
+                yield Finding(
+                    ("buses", name, "baud"),
+                    f"leaves little room: {asked}, and {100 * load.usual:.3g} % if units answer after "
+                    f"{1e3 * USUAL_ANSWER_S:g} ms; what does not fit is lost, and a request without reply "
+                    "holds all others up",
+                    remedy,
+                    fatal=False,
+                )
 
 
 def _check_bits(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from daqsvc.settings.modbus import ModbusRtuBus
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
+from daqsvc.settings.wire import BUSY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import KeyPath
 
-LINE_CHARACTERS = 4
-"""A line has at least a digit, a separator, another digit and an end."""
+_CHECKSUM_CHARACTERS = {"none": 0, "xor": 3, "crc16": 5}
+"""An asterisk and hexadecimal digits."""
 
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 
@@ -191,11 +192,9 @@ def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Fi
             mark: object
             if isinstance(layout, LineLayout):
                 mark, what, where = layout.prefix, "prefix", "a prefix"
-                characters = len(layout.prefix or "") + LINE_CHARACTERS
             else:
                 mark, what = layout.stream_id, "stream_id"
                 where = f"a stream_id (with stream_ids = true in [buses.{name}])"
-                characters = layout.payload_length + 1
             if mark is None and isinstance(bus, CobsBus | SyncBus) and bus.stream_ids:
                 continue  # that is reported already
             if owners and (mark is None or None in owners or mark in owners):
@@ -206,11 +205,28 @@ def _check_streams(draft: MachineFile, name: str, bus: SerialBus) -> Iterator[Fi
                     f"give each stream of a port {where} of its own, as the device sends it",
                 )
             owners[mark] = key
-            characters_per_s += stream.rate_hz / layout.samples_per_frame * characters
+            characters_per_s += stream.rate_hz / layout.samples_per_frame * _least_characters(bus, layout)
     needed = characters_per_s * bus.bits_per_character
-    if needed > bus.baud:
+    if needed > BUSY * bus.baud:
+        fits = needed <= bus.baud
         yield Finding(
             ("buses", name, "baud"),
-            f"is too slow: the streams on the port need {needed:,.0f} bit/s at least",
+            f"{'leaves little room' if fits else 'is too slow'}: the streams on the port need "
+            f"{needed:,.0f} bit/s at least, {100 * needed / bus.baud:,.0f} % of it",
             "correct the rates of the streams, or set port and device to a faster rate",
+            fatal=not fits,
         )
+
+
+def _least_characters(bus: SerialBus, layout: LineLayout | SerialLayout) -> int:
+    """Characters that a frame or line takes at least."""
+    if isinstance(layout, LineLayout):
+        # A digit in each column, separators between them, and an end.
+        prefix = 0 if layout.prefix is None else len(layout.prefix) + 1
+        checksum = _CHECKSUM_CHARACTERS[bus.checksum] if isinstance(bus, LinesBus) else 0
+        return prefix + 2 * len(layout.line) + checksum
+    if not isinstance(bus, CobsBus | SyncBus):
+        return layout.payload_length
+    length = layout.payload_length + bus.crc_bytes + bus.stream_ids
+    # COBS: a byte in front of every 254 and a zero behind them all.
+    return length + (len(bus.sync_word) // 2 if isinstance(bus, SyncBus) else -(-length // 254) + 1)

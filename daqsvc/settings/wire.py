@@ -1,10 +1,13 @@
-"""How much of a CAN bus a frame takes: an estimate from its bits (ISO 11898-1)."""
+"""How much of a CAN bus a frame takes: an estimate from its bits (ISO 11898-1); and how much is too much."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 CLASSIC_MAX_LENGTH = 8
+
+BUSY = 0.8
+"""A bus or line that takes a larger share of its time for streams leaves no room for anything else."""
 
 _TAIL_BITS = 13
 """CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and intermission (3)."""

@@ -142,6 +142,56 @@ ERRORS = [
 ]
 
 
+# Figures of a rotor, and of a bearing, that cannot be true together.
+BEARING = MACHINES / "bearing.toml"
+START_UP = '[alarm_handling.start_up]\ndetector = "rotor-bank"\nbetween = [{}, {}]\n[alarm_handling]'
+ORDERS = "orders = { bpfi = 5.415, bpfo = 3.585, bsf = 2.357, ftf = 0.398 }"
+ERRORS += [
+    (
+        LAVAL,
+        [("eccentricity_um = 10.0", "eccentricity_um = 120.0")],
+        "machine.rotor.eccentricity_um",
+        "at 600 rpm it would whirl by 333.3 um about a rest at 10 um, in a clearance of 100 um",
+        "correct eccentricity_um",
+    ),
+    (
+        LAVAL,
+        [("static_sag_um = 10.0", "static_sag_um = 130.0")],
+        "machine.rotor.static_sag_um",
+        "lays the shaft on the stator: it would rest 130 um from the middle of a clearance of 100 um",
+        "correct the sag",
+    ),
+    (
+        LAVAL,
+        [("natural_frequency_hz = 10.0", "natural_frequency_hz = 330.0")],
+        "machine.rotor.natural_frequency_hz",
+        "is not seen at 640 Hz, the rate of the bank's probes",
+        "sample faster than 660 Hz",
+    ),
+    (
+        LAVAL,
+        [("noise_um = 2.0", "noise_um = 200.0")],
+        "pipeline.rotor_bank.noise_um",
+        "hides every motion within clearance_um = 100",
+        "correct one of the two",
+    ),
+    (
+        LAVAL,
+        [("[alarm_handling]", START_UP.format(60.0, 660.0))],
+        "alarm_handling.start_up.between",
+        "holds machine.speed_rpm, 600 rpm: the machine would always be starting up",
+        "between = [60, 540]",
+    ),
+    (
+        BEARING,
+        [('type = "6205-2RS"', ORDERS), ("speed_rpm = 1772.0", "speed_rpm = 150_000.0")],
+        "pipeline.bearing.bearings[0].sensor",
+        "and the inner race's line lies at 13538 Hz: samples tell nothing above 12800 Hz",
+        "sample at 33844 Hz or faster",
+    ),
+]
+
+
 @pytest.mark.parametrize(("path", "replacements", "key", "message", "remedy"), ERRORS)
 def test_a_contradiction_is_refused(path, replacements, key, message, remedy):
     text, _ = changed(path, *replacements)
@@ -181,6 +231,68 @@ WARNINGS = [
         "buses.can0.data_bitrate",
         "no effect",
         "fd = true",
+    ),
+]
+
+WARNINGS += [
+    (
+        LAVAL,
+        [
+            ("speed_rpm = 600.0", "speed_rpm = 200.0"),
+            ("eccentricity_um = 10.0", "eccentricity_um = 120.0"),
+        ],
+        "machine.rotor.eccentricity_um",
+        "is not less than clearance_um = 100: near its natural frequency, and at any speed above",
+        "correct eccentricity_um",
+    ),
+    (
+        LAVAL,
+        [("eccentricity_um = 10.0", "eccentricity_um = 19.0")],
+        "pipeline.rotor_bank.modes[1]",
+        'mode "F1" would touch the stator: a whirl of 95 um about a rest at 10 um',
+        "rub = true",
+    ),
+    (
+        LAVAL,
+        [("speed_rpm = 600.0", "speed_rpm = 6.0")],
+        "machine.rotor.natural_frequency_hz",
+        "is 100 times the speed of 0.1 Hz",
+        "in Hz",
+    ),
+    (
+        LAVAL,
+        [("danger = 60.0", "danger = 160.0")],
+        "alarms[0].danger",
+        "is more than the stator lets the shaft move: in a clearance of 100 um rms is 100 um at most",
+        "clearance_um",
+    ),
+    (
+        MOTOR,
+        [("window_s = 0.5", "window_s = 0.1")],
+        "pipeline.levels.window_s",
+        "0.1 s hold 1 periods of 10 Hz",
+        "write window_s = 0.2 or more, or begin the band at 20 Hz",
+    ),
+    (
+        BEARING,
+        [('type = "6205-2RS"', ORDERS.replace("5.415", "5.95"))],
+        "pipeline.bearing.bearings[0].orders",
+        "make 9.535 balls, for which bpfo + bpfi stands",
+        "data sheet",
+    ),
+    (
+        BEARING,
+        [('type = "6205-2RS"', ORDERS.replace("0.398", "0.45"))],
+        "pipeline.bearing.bearings[0].orders.ftf",
+        "with 9 balls the cage turns 0.3983 times a revolution",
+        "ftf = 0.3983",
+    ),
+    (
+        BEARING,
+        [('type = "6205-2RS"', ORDERS.replace("2.357", "4.714"))],
+        "pipeline.bearing.bearings[0].orders.bsf",
+        "is more than 2.357, how often a ball",
+        "write half of it",
     ),
 ]
 
@@ -404,3 +516,75 @@ def test_the_rings_of_all_streams_are_added_up(monkeypatch):
 def test_a_peak_to_peak_limit_of_a_probe_is_no_contradiction():
     text, _ = changed(LAVAL, ('measure = "rms" ', 'measure = "peak_to_peak" '))
     assert outcome(text) == ({}, {})
+
+
+def test_the_orders_of_a_real_bearing_go_together():
+    text, _ = changed(BEARING, ('type = "6205-2RS"', ORDERS))
+    problems, warnings = outcome(text, BEARING)
+    assert not problems
+    assert not any("orders" in key for key in warnings)
+
+
+RTU = 'transport = "rtu", serial_port = "/dev/ttyS0", baud = {baud}'
+
+
+def polled(baud, rate_hz, channels=8, step=1, **more):
+    """A line with a stream of that many registers."""
+    listed = ", ".join(
+        f'{{ name = "{"abcdefgh"[n]}", address = {n * step}, type = "uint16" }}' for n in range(channels)
+    )
+    text = registers(listed, **more).replace("rate_hz = 1.0", f"rate_hz = {rate_hz}")
+    return text.replace('transport = "tcp", host = "192.0.2.1"', RTU.format(baud=baud))
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate_hz", "figures", "refused"),
+    [
+        # 8 and 5 + 16 characters of 11 bits, and twice 3.5 characters of silence: 41.25 ms.
+        (9600, 30.0, "30 requests a second take 124 % of its time at least", True),
+        (9600, 24.0, "24 requests a second take 99 % of its time, and 113 % if units answer", False),
+        (9600, 20.0, "20 requests a second take 82.5 % of its time, and 94.5 % if units answer", False),
+        (9600, 16.0, None, False),
+        # From 19,200 bit/s on the silences are 1.75 ms long.
+        (115_200, 100.0, "100 requests a second take 62.7 % of its time, and 145 % if", False),
+        (115_200, 50.0, None, False),
+    ],
+)
+def test_a_serial_line_that_is_too_slow_for_its_polling(baud, rate_hz, figures, refused):
+    problems, warnings = outcome(polled(baud, rate_hz))
+    found = (problems if refused else warnings).get("buses.io.baud")
+    assert ("buses.io.baud" in problems) is refused
+    assert (found is None) if figures is None else (figures in found.message)
+
+
+def test_what_shares_a_request_takes_less_of_a_line():
+    apart = outcome(polled(9600, 6.0, step=4, max_gap=0))[0]["buses.io.baud"]
+    assert "48 requests a second take 121 %" in apart.message
+    assert outcome(polled(9600, 6.0, step=4)) == ({}, {})
+
+
+def test_streams_of_one_unit_share_requests_and_a_line_counts_all_of_its_streams():
+    def two(unit):
+        one = polled(9600, 20.0, channels=2)
+        begin, end = one.index("[streams.s]"), one.index("[[sensors]]")
+        other = one[begin:end].replace("streams.s", "streams.t").replace("unit = 1", f"unit = {unit}")
+        other = other.replace("address = 0", "address = 2").replace("address = 1,", "address = 3,")
+        return outcome(one[:end] + other + one[end:])
+
+    assert "40 requests a second take 110 % of its time at least" in two(2)[0]["buses.io.baud"].message
+    assert two(1) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "figures", "refused"),
+    [
+        (5.0e3, "111 % of the time at least", True),
+        (4.0e3, "take 89 % of the bus's time", False),
+        (3.5e3, None, False),
+    ],
+)
+def test_a_can_bus_that_is_nearly_or_more_than_full(rate_hz, figures, refused):
+    text, _ = changed(TRIAXIAL, ("rate_hz = 1000.0", f"rate_hz = {rate_hz}"))
+    problems, warnings = outcome(text, TRIAXIAL)
+    found = (problems if refused else warnings).get("buses.can0.bitrate")
+    assert (found is None) if figures is None else (figures in found.message)

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from daqsvc.detectors.bearing.settings import WINDOW_S
-from daqsvc.detectors.shaft.checks import named
+from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
 from daqsvc.settings.layout_checks import unique
 from daqsvc.settings.modbus import WaveformLayout
 from daqsvc.settings.problems import Finding, choice
@@ -14,7 +14,7 @@ from daqsvc.settings.problems import Finding, choice
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.detectors.bearing.settings import Bearing, WatchedBearing
+    from daqsvc.detectors.bearing.settings import Bearing, FaultOrders, WatchedBearing
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import KeyPath
 
@@ -22,6 +22,8 @@ _BEARING: KeyPath = ("pipeline", "bearing")
 _LEAST_RATE_HZ = 2500.0
 """Whatever tells of a bearing lies from 400 Hz up, and a band of less than 1.6 octaves tells little."""
 _DIRECTION_RATE_HZ = 24_000.0
+_OFF, _OFF_BSF = 0.02, 0.1
+"""By so large a share orders may be rounded; bsf rests on a difference."""
 _LEAST_REVOLUTIONS = 25.0
 _RING_WINDOWS = 2
 _LEAST_BLOCK_S = 0.5 * WINDOW_S
@@ -41,8 +43,10 @@ def bearing_checks(draft: MachineFile, given: Bearing) -> Iterator[Iterator[Find
         yield _kinematics(bearing, at)
         yield _sensors(draft, bearing, at)
         yield _direction(draft, bearing, at)
+        yield _lines(draft, bearing, at)
     yield _one_stream(draft, given)
     yield _keyphasor(draft, given)
+    yield _pulses(draft, given)
     yield _speed(draft)
     yield _ring(draft)
     yield _blocks(draft, given)
@@ -62,6 +66,41 @@ def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
             (*at, "orders"),
             "are not those of a bearing whose outer ring stands still: ftf < 0.5 < bpfo < bpfi",
             "give them per revolution of the shaft, not in Hz",
+        )
+    elif orders is not None:
+        yield from _geometry(orders, (*at, "orders"))
+
+
+def _geometry(orders: FaultOrders, at: KeyPath) -> Iterator[Finding]:
+    """What any bearing with a standing outer ring has, whatever its contact angle.
+
+    Of z balls of diameter d on a circle of diameter D, with g = d / D times the cosine of the contact angle:
+    bpfo = z (1 - g) / 2 = z ftf, bpfi = z (1 + g) / 2, bsf = D / (2 d) (1 - g^2).
+    """
+    balls = orders.bpfo + orders.bpfi
+    if abs(balls - round(balls)) > _OFF * balls:
+        yield Finding(
+            at,
+            f"make {balls:.4g} balls, for which bpfo + bpfi stands: a bearing has a whole number of them",
+            "compare bpfo and bpfi with the data sheet of the bearing",
+            fatal=False,
+        )
+    elif abs(orders.bpfo / orders.ftf / balls - 1.0) > _OFF:
+        yield Finding(
+            (*at, "ftf"),
+            f"does not go with bpfo and bpfi: with {balls:.3g} balls the cage turns "
+            f"{orders.bpfo / balls:.4g} times a revolution",
+            f"write ftf = {orders.bpfo / balls:.4g}, or compare all of them with the data sheet",
+            fatal=False,
+        )
+    ratio = 1.0 - 2.0 * orders.bpfo / balls
+    most = (1.0 - ratio**2) / (2.0 * ratio)
+    if orders.bsf > (1.0 + _OFF_BSF) * most:
+        yield Finding(
+            (*at, "bsf"),
+            f"is more than {most:.4g}, how often a ball of this bearing can turn about itself",
+            "write half of it if the data sheet counts both races that a damaged ball meets in a turn",
+            fatal=False,
         )
 
 
@@ -165,6 +204,38 @@ def _speed(draft: MachineFile) -> Iterator[Finding]:
             f"a window of {WINDOW_S:g} s has {revolutions:.3g} revolutions at {speed_rpm:g} rpm; the lines "
             f"of a bearing need {_LEAST_REVOLUTIONS:g}",
             "remove it: this machine is too slow for it",
+        )
+
+
+def _pulses(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+    """A revolution has enough samples for the keyphasor's pulse."""
+    keyphasor = None if given.keyphasor is None else named(draft).get(given.keyphasor)
+    if keyphasor is None or keyphasor.stream not in draft.streams:
+        return
+    rate_hz, speed_rpm = draft.streams[keyphasor.stream].rate_hz, abs(draft.machine.speed_rpm)
+    samples = 60.0 * rate_hz / speed_rpm
+    if samples < LEAST_FOR_PULSES:
+        yield Finding(
+            (*_BEARING, "keyphasor"),
+            f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
+            f"need {LEAST_FOR_PULSES:g}",
+            f"sample at {LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
+        )
+
+
+def _lines(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
+    """The lines of a bearing lie below half the rate, where samples tell them."""
+    sensor = named(draft).get(bearing.sensor)
+    if bearing.orders is None or sensor is None or sensor.stream not in draft.streams:
+        return
+    rate_hz = draft.streams[sensor.stream].rate_hz
+    line_hz = bearing.orders.bpfi * abs(draft.machine.speed_rpm) / 60.0
+    if line_hz >= rate_hz / 2.0:
+        yield Finding(
+            (*at, "sensor"),
+            f"is sampled at {rate_hz:g} Hz, and the inner race's line lies at {line_hz:.0f} Hz: samples tell "
+            f"nothing above {rate_hz / 2.0:g} Hz",
+            f"sample at {2.5 * line_hz:.0f} Hz or faster, or correct the orders or machine.speed_rpm",
         )
 
 

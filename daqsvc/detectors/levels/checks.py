@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 _RING_WINDOWS = 2
 _LEAST_WINDOW_SAMPLES = 16
+_LEAST_PERIODS = 2.0
+"""A taper of Hann spreads each frequency by two of its bins."""
 _WAVEFORMS = ("proximity", "accelerometer", "velocity")
 """Types of sensors whose levels are measured here, window by window."""
 
@@ -28,6 +30,7 @@ def level_checks(draft: MachineFile, levels: Levels) -> Iterator[Iterator[Findin
     """
     yield _window(draft, levels)
     yield _velocity_band(draft, levels)
+    yield _lowest_frequency(draft, levels)
 
 
 def _rate_hz(draft: MachineFile, sensor: Sensor) -> float | None:
@@ -83,6 +86,22 @@ def _velocity_band(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
                 remedy + _if_no_waveform(draft, sensor.stream),
             )
             return
+
+
+def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
+    """A window holds the lowest frequency of the velocity band: below, the mean value leaks into it."""
+    if not any(sensor.type in {"accelerometer", "velocity"} for sensor in draft.sensors):
+        return
+    low_hz, window_s = levels.velocity_band_hz[0], levels.window_s
+    if low_hz * window_s < _LEAST_PERIODS:
+        yield Finding(
+            ("pipeline", "levels", "window_s"),
+            f"{window_s:g} s hold {low_hz * window_s:.3g} periods of {low_hz:g} Hz, the lowest frequency of "
+            "velocity_band_hz: its velocity is not told from the mean value",
+            f"write window_s = {_LEAST_PERIODS / low_hz:.3g} or more, or begin the band at "
+            f"{_LEAST_PERIODS / window_s:.3g} Hz",
+            fatal=False,
+        )
 
 
 def _if_no_waveform(draft: MachineFile, stream: str) -> str:

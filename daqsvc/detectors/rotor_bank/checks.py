@@ -5,7 +5,14 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.detectors.shaft.checks import check_geometry, check_rotor, check_sensors, named
+from daqsvc.detectors.rotor_bank.physics import physics_checks
+from daqsvc.detectors.shaft.checks import (
+    LEAST_FOR_PULSES,
+    check_geometry,
+    check_rotor,
+    check_sensors,
+    named,
+)
 from daqsvc.settings.layout_checks import unique
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
@@ -19,7 +26,6 @@ if TYPE_CHECKING:
 
 _BANK: KeyPath = ("pipeline", "rotor_bank")
 _MOST_PER_1000_REV = 1000.0
-_LEAST_FOR_PULSES = 4.0
 
 
 def bank_checks(draft: MachineFile, bank: RotorBank) -> Iterator[Iterator[Finding]]:
@@ -41,6 +47,7 @@ def bank_checks(draft: MachineFile, bank: RotorBank) -> Iterator[Iterator[Findin
         yield _static_load(draft, mode, at)
     yield _mode_names(bank)
     yield _rates(bank)
+    yield from physics_checks(draft, bank)
 
 
 def check_bank_alarm(bank: RotorBank, at: KeyPath) -> Iterator[Finding]:
@@ -83,12 +90,12 @@ def _pulses(draft: MachineFile, bank: RotorBank) -> Iterator[Finding]:
         return
     rate_hz, speed_rpm = draft.streams[keyphasor.stream].rate_hz, abs(draft.machine.speed_rpm)
     samples = 60.0 * rate_hz / speed_rpm
-    if samples < _LEAST_FOR_PULSES:
+    if samples < LEAST_FOR_PULSES:
         yield Finding(
             (*_BANK, "keyphasor"),
             f"is sampled {samples:.3g} times a revolution ({rate_hz:g} Hz at {speed_rpm:g} rpm): its pulses "
-            f"need {_LEAST_FOR_PULSES:g}",
-            f"sample at {_LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
+            f"need {LEAST_FOR_PULSES:g}",
+            f"sample at {LEAST_FOR_PULSES * speed_rpm / 60.0:.4g} Hz or faster",
         )
 
 

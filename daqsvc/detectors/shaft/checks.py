@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from daqsvc.settings.problems import KeyPath
 
 _LEAST_PROBE_ANGLE_DEG = 30.0
+LEAST_FOR_PULSES = 4.0
+"""Samples of a revolution that its keyphasor's pulse takes."""
 
 
 def check_rotor(draft: MachineFile, at: KeyPath, who: str) -> Iterator[Finding]:
