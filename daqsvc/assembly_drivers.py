@@ -19,9 +19,9 @@ from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.serial import LineLayout as LineSettings
 from daqsvc.settings.serial import SerialLayout
 from drivers.base import BusOptionError, BusPort, StreamSpec
-from drivers.dbc import layout_from_dbc
+from drivers.can.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, Kind
-from drivers.modbus_layouts import (
+from drivers.modbus.layouts import (
     Count,
     Fifo,
     ModbusLayout,
@@ -33,9 +33,9 @@ from drivers.modbus_layouts import (
     in_units,
     sample_record,
 )
-from drivers.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
-from drivers.replay_files import ColumnLayout
-from drivers.serial_lines import LineLayout
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
+from drivers.replay.files import ColumnLayout
+from drivers.serial.lines import LineLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -31,7 +31,7 @@ from daqsvc.settings.alignment import Grid
 from daqsvc.supervision import EssentialLostError, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
 from drivers.base import DeviceAbsentError
-from drivers.can_errors import CanCounters
+from drivers.can.errors import CanCounters
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

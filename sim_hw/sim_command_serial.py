@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc import assembly_drivers
 from drivers.base import StreamSpec
-from drivers.serial_port import framing_of
+from drivers.serial.driver import framing_of
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
 from sim_hw.sim_command_order import NodeError

@@ -12,11 +12,11 @@ from can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import ERROR, REMOTE, CanBatch
-from drivers.can_bus import CanDriver
-from drivers.dbc import layout_from_dbc
+from drivers.can.batches import ERROR, REMOTE, CanBatch
+from drivers.can.dbc import layout_from_dbc
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
-from drivers.replay import ReplayDriver
+from drivers.replay.driver import ReplayDriver
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

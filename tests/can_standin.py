@@ -7,8 +7,8 @@ import socket
 import threading
 from typing import TYPE_CHECKING
 
-from drivers.can_batches import EXTENDED
-from drivers.socketcan import CLASSIC_BYTES, FD_BYTES, SocketCan
+from drivers.can.batches import EXTENDED
+from drivers.can.socketcan import CLASSIC_BYTES, FD_BYTES, SocketCan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.base import BusPort
-    from drivers.can_batches import FrameSorter
+    from drivers.can.batches import FrameSorter
 
 
 def frame_bytes(

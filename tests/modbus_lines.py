@@ -13,14 +13,14 @@ from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus import ModbusDriver
+from drivers.modbus.driver import ModbusDriver
 from sim_hw.nodes.modbus_node import ModbusWire
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 
     from daqsvc.acquisition.samples import SampleBlock
-    from drivers.modbus_layouts import ModbusLayout
+    from drivers.modbus.layouts import ModbusLayout
     from sim_hw.nodes.modbus_node import FaultPlan
     from sim_hw.nodes.modbus_unit import ModbusUnit
 

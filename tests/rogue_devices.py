@@ -14,7 +14,7 @@ import numpy as np
 
 from daqsvc import assembly_drivers
 from drivers.base import StreamSpec
-from drivers.serial_port import framing_of
+from drivers.serial.driver import framing_of
 from sim_hw.nodes.modbus_node import Answer, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal

@@ -12,7 +12,7 @@ from daqsvc.acquisition.clock import SystemClock
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from drivers.can_bus import CanDriver
+    from drivers.can.driver import CanDriver
 
 PATIENCE_S = 20.0
 

@@ -22,10 +22,10 @@ from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE
 from daqsvc.recording.recording import Recording
 from daqsvc.settings.models import DbcLayout, PlainLayout
 from drivers.base import StreamSpec
-from drivers.can_adapter import batch_of
-from drivers.can_batches import FrameSorter, Sorted
-from drivers.replay_can import CanLog
-from drivers.replay_files import RecordingError as LogError
+from drivers.can.adapter import batch_of
+from drivers.can.batches import FrameSorter, Sorted
+from drivers.replay.can_log import CanLog
+from drivers.replay.files import RecordingError as LogError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from drivers.modbus_layouts import Trend
+from drivers.modbus.layouts import Trend
 from sim_hw.nodes.modbus_unit import encode, store_for
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.modbus_layouts import ModbusLayout
+    from drivers.modbus.layouts import ModbusLayout
     from sim_hw.nodes.modbus_unit import ModbusUnit
     from sim_hw.nodes.pacing import Pacer
 

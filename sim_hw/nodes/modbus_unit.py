@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from drivers.modbus_layouts import Fifo, Ring, Trend, Waveform
+from drivers.modbus.layouts import Fifo, Ring, Trend, Waveform
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from drivers.modbus_layouts import ModbusLayout, Table
-    from drivers.registers import RegisterRecord
+    from drivers.modbus.layouts import ModbusLayout, Table
+    from drivers.modbus.registers import RegisterRecord
 
 ADDRESSES = 65_536
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.frames import FrameLayout
-    from drivers.serial_framing import Framing
-    from drivers.serial_lines import LineLayout
+    from drivers.serial.framing import Framing
+    from drivers.serial.lines import LineLayout
     from sim_hw.link_faults import LinkFaults
     from sim_hw.node_faults import NodePlan
     from sim_hw.nodes.pacing import Pacer

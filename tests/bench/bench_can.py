@@ -31,18 +31,18 @@ from targets import Targets
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import LONGEST, CanBatch, FrameSorter
-from drivers.can_bus import CanDriver
-from drivers.can_record_files import LogFile
-from drivers.can_record_formats import ENDINGS, encoder_for
+from drivers.can.batches import LONGEST, CanBatch, FrameSorter
+from drivers.can.driver import CanDriver
+from drivers.can.record_files import LogFile
+from drivers.can.record_formats import ENDINGS, encoder_for
+from drivers.can.recvmmsg import SO_TIMESTAMPNS
+from drivers.can.socketcan import SocketCan
 from drivers.frames import FrameLayout
-from drivers.recvmmsg import SO_TIMESTAMPNS
-from drivers.socketcan import SocketCan
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drivers.can_record_formats import LogFormat
+    from drivers.can.record_formats import LogFormat
 
 IDS = tuple(range(0x100, 0x108))
 FRAMES = 16_384

@@ -18,7 +18,7 @@ import numpy as np
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from drivers.base import BusPort, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 FRAMES = 20_000

@@ -30,11 +30,11 @@ from targets import Targets
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from drivers.base import BusPort, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
+from drivers.can.socketcan import SocketCan
 from drivers.frames import FrameLayout
-from drivers.serial_lines import LineLayout
-from drivers.serial_port import SerialDriver
-from drivers.socketcan import SocketCan
+from drivers.serial.driver import SerialDriver
+from drivers.serial.lines import LineLayout
 
 LOAD_S = 4.0
 TICK_S = 0.005

@@ -25,9 +25,9 @@ from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus import ModbusDriver
-from drivers.modbus_layouts import Trend
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.layouts import Trend
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 

@@ -28,9 +28,9 @@ from targets import Targets
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
-from drivers.serial_binary import DELIMITER
-from drivers.serial_lines import LineLayout
-from drivers.serial_port import SerialDriver, framing_of
+from drivers.serial.binary import DELIMITER
+from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.lines import LineLayout
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from conformance.faulty_device import FaultyDevice
 from conformance.transport import CHANNELS, STREAM, SimulatedTime
 
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus import ModbusDriver
-from drivers.modbus_layouts import Count, Fifo, sample_record
-from drivers.registers import RegisterField
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.layouts import Count, Fifo, sample_record
+from drivers.modbus.registers import RegisterField
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit
 

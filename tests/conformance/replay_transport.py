@@ -11,7 +11,7 @@ from conformance.transport import STREAM, SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from drivers.base import BusPort, StreamSpec
-from drivers.replay import POLL_NS, ReplayDriver
+from drivers.replay.driver import POLL_NS, ReplayDriver
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,9 +13,9 @@ from conformance.transport import CHANNELS, STREAM, SimulatedTime
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
-from drivers.serial_binary import CobsFraming
-from drivers.serial_lines import LineFraming, LineLayout
-from drivers.serial_port import SerialDriver, framing_of
+from drivers.serial.binary import CobsFraming
+from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.lines import LineFraming, LineLayout
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:

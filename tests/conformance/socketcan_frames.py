@@ -13,7 +13,7 @@ from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from drivers.base import BusPort, StreamSpec
-from drivers.recvmmsg import SO_TIMESTAMPNS
+from drivers.can.recvmmsg import SO_TIMESTAMPNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
-    from drivers.socketcan import SocketCan
+    from drivers.can.socketcan import SocketCan
 
 RATE_HZ = 1000.0
 

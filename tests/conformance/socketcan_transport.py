@@ -9,8 +9,8 @@ from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
 from vcan_links import VcanLink
 
-from drivers.can_bus import CanDriver
-from drivers.socketcan import dropped_frames, open_socketcan
+from drivers.can.driver import CanDriver
+from drivers.can.socketcan import dropped_frames, open_socketcan
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import BusPort, StartPolicy
-    from drivers.can_batches import FrameSorter
-    from drivers.socketcan import SocketCan
+    from drivers.can.batches import FrameSorter
+    from drivers.can.socketcan import SocketCan
 
 NEEDS = "DAQSVC_HIL"
 RECEIVE_BUFFER_BYTES = 256 << 10

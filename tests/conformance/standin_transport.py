@@ -10,7 +10,7 @@ from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_w
 from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
 
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import BusPort, StartPolicy
-    from drivers.can_batches import FrameSorter
-    from drivers.socketcan import SocketCan
+    from drivers.can.batches import FrameSorter
+    from drivers.can.socketcan import SocketCan
 
 
 class _Device(SocketDevice):

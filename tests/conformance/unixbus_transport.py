@@ -13,7 +13,7 @@ from conformance.transport import STREAM, SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from drivers.base import BusPort, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 

@@ -13,7 +13,7 @@ from conformance.faulty_device import FaultyDevice
 from conformance.transport import CHANNELS, STREAM, SimulatedTime
 
 from drivers.base import BusPort, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:

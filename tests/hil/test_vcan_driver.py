@@ -14,8 +14,8 @@ from running_drivers import CountingDevice, QuickClock, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import ERROR
-from drivers.can_bus import CanDriver
+from drivers.can.batches import ERROR
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:

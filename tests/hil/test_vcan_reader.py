@@ -15,8 +15,8 @@ import pytest
 from can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from drivers.can_batches import ERROR, EXTENDED, REMOTE, STANDARD_ID, CanBatch, IdMatch
-from drivers.socketcan import SocketCan, dropped_frames, open_socketcan
+from drivers.can.batches import ERROR, EXTENDED, REMOTE, STANDARD_ID, CanBatch, IdMatch
+from drivers.can.socketcan import SocketCan, dropped_frames, open_socketcan
 
 if TYPE_CHECKING:
     from vcan_links import VcanLink

@@ -15,15 +15,15 @@ from running_drivers import running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort
-from drivers.can_batches import ERROR
-from drivers.can_bus import CanDriver
+from drivers.can.batches import ERROR
+from drivers.can.driver import CanDriver
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from vcan_links import VcanLink
 
-    from drivers.replay import ReplayDriver
+    from drivers.replay.driver import ReplayDriver
 
 GENERATED = 2000
 REMOTE_FRAMES = 100

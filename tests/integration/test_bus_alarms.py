@@ -9,14 +9,14 @@ from machine_files import MACHINES
 
 from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file
-from drivers.can_batches import Sorted
-from drivers.can_errors import ErrorCounts
+from drivers.can.batches import Sorted
+from drivers.can.errors import ErrorCounts
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.service import Service
-    from drivers.can_bus import CanDriver
+    from drivers.can.driver import CanDriver
 
 MOTOR = MACHINES / "motor-accelerometer.toml"
 

@@ -12,7 +12,7 @@ from fake_can import FaultyBus
 from running_drivers import QuickClock, begun, until
 
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 from sim_hw.bus_socket_wire import overflow_message
 

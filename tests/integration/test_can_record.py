@@ -30,19 +30,19 @@ from can_standin import StandInBus, frame_bytes
 from running_drivers import running, until
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
-from drivers import can_record
 from drivers.base import BusPort
-from drivers.can_adapter import batch_of
-from drivers.can_errors import CanCounters
-from drivers.can_record import CanRecorder
-from drivers.can_record_files import LogFile, LogFolder, OneLog
+from drivers.can import record as can_record
+from drivers.can.adapter import batch_of
+from drivers.can.errors import CanCounters
+from drivers.can.record import CanRecorder
+from drivers.can.record_files import LogFile, LogFolder, OneLog
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
-    from drivers.can_record_files import Logs
+    from drivers.can.record_files import Logs
 
 FORMATS = list(ENDINGS)
 

@@ -15,11 +15,11 @@ from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.assembly_drivers import drivers
 from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
-from drivers.can_adapter import batch_of
-from drivers.can_batches import FrameSorter
-from drivers.dbc import layout_from_dbc
-from drivers.replay import ReplayCounters
-from drivers.replay_can import CanLog
+from drivers.can.adapter import batch_of
+from drivers.can.batches import FrameSorter
+from drivers.can.dbc import layout_from_dbc
+from drivers.replay.can_log import CanLog
+from drivers.replay.driver import ReplayCounters
 
 if TYPE_CHECKING:
     import can
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.models import MachineFile
-    from drivers.can_batches import Sorted
+    from drivers.can.batches import Sorted
     from drivers.frames import FrameLayout
 
 pytestmark = pytest.mark.data

@@ -13,8 +13,8 @@ from daqsvc.acquisition.ring import SampleRing
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.diagnosis.detector import Window
 from drivers.base import BusPort, StreamSpec
-from drivers.can_adapter import batch_of
-from drivers.can_bus import CanDriver
+from drivers.can.adapter import batch_of
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 FRAMES = 200

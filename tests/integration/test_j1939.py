@@ -17,9 +17,9 @@ from daqsvc.acquisition.samples import Quality
 from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import EXTENDED, CanBatch, IdMatch
-from drivers.can_bus import CanDriver
-from drivers.dbc import layout_from_dbc
+from drivers.can.batches import EXTENDED, CanBatch, IdMatch
+from drivers.can.dbc import layout_from_dbc
+from drivers.can.driver import CanDriver
 
 if TYPE_CHECKING:
     from pathlib import Path

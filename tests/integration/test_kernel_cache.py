@@ -97,9 +97,9 @@ def test_where_nothing_can_be_written_kernels_are_compiled_and_not_kept(tmp_path
     """Every kernel there is can be imported, and one is used."""
     use = (
         "from daqsvc import kernel_cache; kernel_cache.prepare()\n"
-        "import daqsvc.rotor.sweep, daqsvc.bearing.kernels, drivers.serial_line_kernels\n"
+        "import daqsvc.rotor.sweep, daqsvc.bearing.kernels, drivers.serial.line_kernels\n"
         "import numpy as np\n"
-        "from drivers.serial_kernels import gather\n"
+        "from drivers.serial.kernels import gather\n"
         "print(gather(np.arange(9, dtype=np.uint8), np.array([1, 4]), 2).tolist())\n"
     )
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from drivers.modbus_layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
 

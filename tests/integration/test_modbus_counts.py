@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
-from drivers.modbus_layouts import Count, Fifo, Page, Ring, Waveform, sample_record
-from drivers.registers import RegisterField
+from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
+from drivers.modbus.registers import RegisterField
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, encode, store_for
 

@@ -12,9 +12,9 @@ import pytest
 from pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus_client import ModbusClient
-from drivers.modbus_outcomes import ModbusCounters, RefusedError
-from drivers.modbus_replies import (
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.outcomes import ModbusCounters, RefusedError
+from drivers.modbus.replies import (
     EXCEPTIONS,
     READ_INPUT,
     WRITE_REGISTERS,
@@ -22,7 +22,7 @@ from drivers.modbus_replies import (
     judge_tcp,
     register_bytes,
 )
-from drivers.modbus_wire import LineOptions
+from drivers.modbus.wire import LineOptions
 from sim_hw.nodes.modbus_node import ModbusTcpServer, ModbusWire
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from pcap import Conversation
 
-    from drivers.modbus_replies import Verdict
+    from drivers.modbus.replies import Verdict
     from sim_hw.nodes.modbus_unit import ModbusUnit
 
 pytestmark = pytest.mark.data

@@ -14,8 +14,8 @@ from machine_files import MACHINES, problems_of
 from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
-from drivers.modbus import ModbusDriver
-from drivers.modbus_line import WriteRefusedError
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.line import WriteRefusedError
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode
 from sim_hw.nodes.pacing import RealTimePacer

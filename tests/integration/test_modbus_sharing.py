@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from drivers.modbus_layouts import Trend, shared_runs
-from drivers.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
+from drivers.modbus.layouts import Trend, shared_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 

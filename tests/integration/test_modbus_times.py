@@ -13,8 +13,8 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from drivers.modbus_layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 

@@ -21,10 +21,10 @@ from daqsvc.confined.limits import Limits
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, set_limits, shared, stop_reading
 from drivers.base import BusPort, StreamSpec
-from drivers.replay import ReplayDriver
-from drivers.replay_can import CanLog
-from drivers.replay_files import ColumnLayout, SampleTable
-from drivers.replay_files import RecordingError as ReplayError
+from drivers.replay.can_log import CanLog
+from drivers.replay.driver import ReplayDriver
+from drivers.replay.files import ColumnLayout, SampleTable
+from drivers.replay.files import RecordingError as ReplayError
 
 MOST_MB = 400
 """Of the process that reads, with NumPy, SciPy or Arrow in it."""
@@ -198,7 +198,7 @@ def test_a_can_log_of_nothing_but_other_lines_is_given_up(tmp_path):
 async def test_a_table_that_takes_long_does_not_hold_up_the_end(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     np.savez(path, x=np.zeros(100))
-    monkeypatch.setattr("drivers.replay_table.COLUMNS", "confined_work:spin_with")
+    monkeypatch.setattr("drivers.replay.table.COLUMNS", "confined_work:spin_with")
     spec = StreamSpec("s", COLUMNS, 1000.0)
     port = BusPort("t", {"file": path}, [spec], SystemClock(), lambda _block: None)
     driver = ReplayDriver(port)

@@ -19,9 +19,9 @@ from daqsvc.assembly_drivers import drivers
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
-from drivers.replay import ReplayDriver
-from drivers.replay_files import ColumnLayout
-from drivers.replay_growing import candump_log
+from drivers.replay.driver import ReplayDriver
+from drivers.replay.files import ColumnLayout
+from drivers.replay.growing import candump_log
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

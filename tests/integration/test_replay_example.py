@@ -13,7 +13,7 @@ from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.assembly_drivers import drivers, frame_layout
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
-from drivers.can_bus import CanDriver
+from drivers.can.driver import CanDriver
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock

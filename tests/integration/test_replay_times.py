@@ -14,7 +14,7 @@ from running_drivers import until
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
-from drivers.replay import ReplayDriver
+from drivers.replay.driver import ReplayDriver
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,11 +18,11 @@ from machine_files import MACHINES
 from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.settings import parse_machine_file
-from drivers import serial_reader
 from drivers.base import BusPort, StreamSpec
-from drivers.serial_lines import LineLayout
-from drivers.serial_port import SerialDriver, framing_of
-from drivers.serial_reader import Batch
+from drivers.serial import reader as serial_reader
+from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.lines import LineLayout
+from drivers.serial.reader import Batch
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal

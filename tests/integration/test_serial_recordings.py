@@ -9,9 +9,9 @@ import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from drivers.base import BusPort, StreamSpec
-from drivers.serial_lines import LineFraming, LineLayout
-from drivers.serial_port import SerialDriver, framing_of
-from drivers.serial_reader import Batch
+from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.lines import LineFraming, LineLayout
+from drivers.serial.reader import Batch
 
 if TYPE_CHECKING:
     from pathlib import Path

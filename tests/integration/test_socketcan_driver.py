@@ -12,8 +12,8 @@ from running_drivers import CountingDevice, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can_batches import ERROR, Sorted
-from drivers.can_bus import CanDriver
+from drivers.can.batches import ERROR, Sorted
+from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ async def test_bus_off_and_restart_in_one_batch_are_one_loss() -> None:
     driver = driver_on(StandInBus(), [])
     driver.link.up()
     source_errors = np.array([ERROR | 0x40, ERROR | 0x100], np.uint32)
-    from drivers.can_errors import ErrorCounts
+    from drivers.can.errors import ErrorCounts
 
     driver.take(Sorted(errors=ErrorCounts.of(source_errors, np.zeros((2, 8), np.uint8))))
     assert (driver.link.state, driver.link.losses) == ("up", 1)

@@ -22,9 +22,9 @@ from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import Patience
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus import ModbusDriver
-from drivers.modbus_layouts import Trend
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.layouts import Trend
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 

@@ -14,10 +14,10 @@ from modbus_lines import Rig, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus_layouts import Trend
-from drivers.registers import RegisterField, RegisterRecord, Run
-from drivers.serial_lines import LineLayout
-from drivers.serial_port import SerialDriver
+from drivers.modbus.layouts import Trend
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.serial.driver import SerialDriver
+from drivers.serial.lines import LineLayout
 from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
 from sim_hw.nodes.modbus_node import ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit

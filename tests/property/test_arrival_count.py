@@ -13,7 +13,7 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
-from drivers.dbc import layout_from_dbc
+from drivers.can.dbc import layout_from_dbc
 
 PERIOD_NS = 10_000_000
 SENSOR = MACHINES / "j1939-pgn61485.toml"

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can_adapter import batch_of
-from drivers.can_batches import ERROR, Sorted
-from drivers.can_record_files import LogFile
-from drivers.can_record_formats import ENDINGS, encoder_for
-from drivers.replay_can import CanLog
+from drivers.can.adapter import batch_of
+from drivers.can.batches import ERROR, Sorted
+from drivers.can.record_files import LogFile
+from drivers.can.record_formats import ENDINGS, encoder_for
+from drivers.replay.can_log import CanLog
 
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 ids = st.one_of(

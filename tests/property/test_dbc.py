@@ -13,8 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.base import StreamSpec
-from drivers.can_batches import CanBatch, FrameSorter
-from drivers.dbc import layout_from_dbc, selecting_values
+from drivers.can.batches import CanBatch, FrameSorter
+from drivers.can.dbc import layout_from_dbc, selecting_values
 from drivers.frames import LayoutError
 
 DEVICES = Path(__file__).parents[2] / "config" / "devices"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.dbc import layout_from_dbc
+from drivers.can.dbc import layout_from_dbc
 from drivers.frames import Field, FrameLayout, LayoutError
 
 LIMITS = {"signed": (-(2**15), 2**15 - 1), "unsigned": (0, 2**16 - 1)}

@@ -19,17 +19,17 @@ from hypothesis import strategies as st
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can_adapter import batch_of
-from drivers.can_batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter
-from drivers.can_bus import CanDriver
+from drivers.can.adapter import batch_of
+from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter
+from drivers.can.driver import CanDriver
 from drivers.frames import Field, FrameLayout
-from drivers.modbus_replies import MAX_TCP_BYTES, Expected, judge_rtu, judge_tcp, register_bytes
-from drivers.registers import RegisterField, RegisterRecord, plan_runs
-from drivers.replay import ReplayDriver
-from drivers.replay_files import ColumnLayout
-from drivers.replay_growing import candump_log
-from drivers.serial_lines import LineLayout
-from drivers.serial_port import framing_of
+from drivers.modbus.registers import RegisterField, RegisterRecord, plan_runs
+from drivers.modbus.replies import MAX_TCP_BYTES, Expected, judge_rtu, judge_tcp, register_bytes
+from drivers.replay.driver import ReplayDriver
+from drivers.replay.files import ColumnLayout
+from drivers.replay.growing import candump_log
+from drivers.serial.driver import framing_of
+from drivers.serial.lines import LineLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import supervisor
-from drivers.modbus_layouts import Count, Fifo, Page, Ring, Waveform, sample_record
-from drivers.registers import RegisterField
+from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
+from drivers.modbus.registers import RegisterField
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, WaveformStore, store_for
 

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus_client import ModbusClient
-from drivers.modbus_layouts import Count, Ring, Trend, sample_record
-from drivers.modbus_line import ModbusLine
-from drivers.modbus_outcomes import ModbusCounters, NoReplyError, RefusedError
-from drivers.modbus_silence import Patience, UnitSetAsideError
-from drivers.modbus_wire import LineOptions
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.client import ModbusClient
+from drivers.modbus.layouts import Count, Ring, Trend, sample_record
+from drivers.modbus.line import ModbusLine
+from drivers.modbus.outcomes import ModbusCounters, NoReplyError, RefusedError
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.silence import Patience, UnitSetAsideError
+from drivers.modbus.wire import LineOptions
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.frames import LayoutError
-from drivers.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
 
 FORMATS = {
     "int16": "h",

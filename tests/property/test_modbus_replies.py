@@ -7,7 +7,7 @@ import struct
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.modbus_replies import (
+from drivers.modbus.replies import (
     MAX_RTU_BYTES,
     MAX_TCP_BYTES,
     Expected,

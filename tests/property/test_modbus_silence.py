@@ -16,11 +16,11 @@ from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import supervisor
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus_layouts import Count, Fifo, Trend, sample_record
-from drivers.modbus_outcomes import ModbusCounters
-from drivers.modbus_replies import READ_FIFO, WRITE_REGISTERS
-from drivers.modbus_silence import Enquiry, Patience, UnitSetAsideError, UnitSilence
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import Count, Fifo, Trend, sample_record
+from drivers.modbus.outcomes import ModbusCounters
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS
+from drivers.modbus.silence import Enquiry, Patience, UnitSetAsideError, UnitSilence
 from sim_hw.nodes.modbus_node import Answer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 

@@ -11,9 +11,9 @@ from can.io import TRCReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can_batches import Sorted
-from drivers.replay_can import CanLog
-from drivers.replay_lines import TextLog
+from drivers.can.batches import Sorted
+from drivers.replay.can_log import CanLog
+from drivers.replay.lines import TextLog
 
 FRAMES = 40
 EPOCH_S = 1_640_995_200.0

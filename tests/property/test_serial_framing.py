@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.frames import FrameLayout
-from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial_lines import LineFraming, LineLayout
+from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
+from drivers.serial.lines import LineFraming, LineLayout
 
 if TYPE_CHECKING:
-    from drivers.serial_framing import Found, Framing
+    from drivers.serial.framing import Found, Framing
 
 FRAMES = 12
 SYNC = b"\xa5\x5a"

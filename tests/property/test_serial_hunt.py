@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.serial_kernels import Step, hunt
+from drivers.serial.kernels import Step, hunt
 
 WORD = b"\xa5\x5a"
 LENGTHS = {1: 5, 2: 9}

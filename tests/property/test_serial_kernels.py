@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.frames import FrameLayout
-from drivers.serial_kernels import crc16, crcs_match, gather, in_units, unstuff
+from drivers.serial.kernels import crc16, crcs_match, gather, in_units, unstuff
 
 # Runs without a zero around 254 bytes are where the codes of COBS are special.
 RUNS = st.lists(

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.serial_framing import Pieces
-from drivers.serial_line_kernels import check_lines
-from drivers.serial_lines import DeviceTime, LineLayout
+from drivers.serial.framing import Pieces
+from drivers.serial.line_kernels import check_lines
+from drivers.serial.lines import DeviceTime, LineLayout
 
 NUMBERS = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False).map(repr),

@@ -12,8 +12,8 @@ from daqsvc.alarms.states import Level
 from daqsvc.publish.settings import MqttSettings
 from daqsvc.self_check import MIB, NS_PER_DAY, BusHealth, SelfCheck, Vitals, conditions
 from drivers.base import BusCounters
-from drivers.can_errors import CanCounters
-from drivers.serial_port import SerialCounters
+from drivers.can.errors import CanCounters
+from drivers.serial.driver import SerialCounters
 
 HOUR_NS = 3600 * NS_PER_S
 NOW_NS = 1_795_264_095 * NS_PER_S

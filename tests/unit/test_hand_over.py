@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 import serial
 
-from drivers.can_batches import Sorted
-from drivers.can_reader import BATCHES_UNDER_WAY, CanReader
+from drivers.can.batches import Sorted
+from drivers.can.reader import BATCHES_UNDER_WAY, CanReader
 from drivers.hand_over import HandOver
-from drivers.serial_reader import SerialReader
+from drivers.serial.reader import SerialReader
 
 BATCHES = 16
 

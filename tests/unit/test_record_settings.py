@@ -11,9 +11,9 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_drivers import bus_driver
 from daqsvc.commands.record import ENDINGS
 from daqsvc.settings import describe, parse_machine_file
-from drivers.can_bus import CanDriver
-from drivers.can_record_files import ENDINGS as WRITTEN
-from drivers.can_record_files import OneLog
+from drivers.can.driver import CanDriver
+from drivers.can.record_files import ENDINGS as WRITTEN
+from drivers.can.record_files import OneLog
 
 WITH_RECORD = ("fd = true", 'fd = true\nrecord = { folder = "can", format = "candump", keep_mb = 500 }')
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from drivers.frames import FrameLayout, LayoutError
-from drivers.serial_binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial_lines import LATEST_S, DeviceTime, LineFraming, LineLayout
+from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
+from drivers.serial.lines import LATEST_S, DeviceTime, LineFraming, LineLayout
 
 
 def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:

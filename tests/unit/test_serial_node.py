@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
-from drivers import serial_reader
-from drivers.serial_lines import LineFraming, LineLayout
+from drivers.serial import reader as serial_reader
+from drivers.serial.lines import LineFraming, LineLayout
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode

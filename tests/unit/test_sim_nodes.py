@@ -11,8 +11,8 @@ import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.frames import FrameLayout
-from drivers.modbus_layouts import Trend
-from drivers.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import Trend
+from drivers.modbus.registers import RegisterField, RegisterRecord, Run
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.modbus_node import ModbusNode

@@ -15,11 +15,11 @@ from can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import StreamSpec
-from drivers.can_batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter, IdMatch
+from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter, IdMatch
+from drivers.can.kernel_time import KernelTime
+from drivers.can.recvmmsg import DatagramBuffer
+from drivers.can.socketcan import BATCH_FRAMES, SocketCan, open_socketcan
 from drivers.frames import FrameLayout
-from drivers.kernel_time import KernelTime
-from drivers.recvmmsg import DatagramBuffer
-from drivers.socketcan import BATCH_FRAMES, SocketCan, open_socketcan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

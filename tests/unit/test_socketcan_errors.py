@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.can_batches import ERROR
-from drivers.can_errors import CanCounters, ErrorCounts
+from drivers.can.batches import ERROR
+from drivers.can.errors import CanCounters, ErrorCounts
 
 
 def read(*frames: tuple[int, bytes]) -> ErrorCounts:

@@ -1,0 +1,232 @@
+"""The CAN and CAN FD driver: SocketCAN by a reader of ours, anything else through python-can.
+
+python-can's own asyncio reader hangs when the interface goes down and takes one frame per turn of the
+event loop (python-can#1865, #1912), so the bus is read by a thread of ours (`drivers.can.reader`). This
+module is the event loop's side: it opens the bus and opens it again, places what the thread has decoded,
+and counts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.supervisor import Link
+from drivers.can.adapter import open_adapter
+from drivers.can.batches import FrameSorter
+from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
+from drivers.can.reader import SHUTDOWN_S, CanReader, close_quietly, words
+from drivers.can.record import recorder_of
+from drivers.can.socketcan import open_socketcan
+from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import BusPort, StreamSpec
+    from drivers.can.batches import CanSource, Sorted
+    from drivers.can.record import CanRecorder
+    from drivers.frames import FrameLayout
+
+logger = logging.getLogger(__name__)
+
+REMEMBERED_IDS = 64
+
+
+class CanDriver:
+    """Reads one CAN bus.
+
+    Options of the bus: ``interface`` and ``channel`` as python-can names them, ``fd``, and optionally
+    ``bitrate``, ``data_bitrate``, ``options`` (a table handed to python-can as it is) and ``record`` (see
+    `drivers.can.record`). With interface ``socketcan`` python-can is left out; see `drivers.can.socketcan`
+    for what can be set there.
+
+    Args:
+        port: settings, streams, clock and where to deliver.
+        open_source: opens the bus; called on a thread.
+    """
+
+    def __init__(
+        self, port: BusPort, open_source: Callable[[BusPort, FrameSorter], CanSource] | None = None
+    ) -> None:
+        self.name = port.name
+        self.link = Link(f"CAN bus {port.name!r} ({port.options['interface']} {port.options.get('channel')})")
+        self.counters = CanCounters()
+        self._port = port
+        self._sorter = FrameSorter(port.streams)
+        self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
+        self._open_source = open_source or _open_source
+        self._said: set[str] = set()
+        self._recorder: CanRecorder | None = None
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `drivers.base.Driver.streams`."""
+        return {name: (a.counters, a.time_base) for name, a in self._assemblers.items()}
+
+    async def run(self) -> None:
+        """See `drivers.base.Driver.run`."""
+        self._recorder = recorder_of(self._port, self.link.name, self.counters)
+        if self._recorder is not None:
+            self._recorder.start()
+        try:
+            await keep_up(self.link, self._port, self._attempt)
+        finally:
+            self.link.stop()
+            for assembler in self._assemblers.values():
+                assembler.flush()
+            if self._recorder is not None:
+                await in_thread(self._recorder.close)
+
+    async def _attempt(self) -> Attempt:
+        source = await self._open()
+        self.link.up()
+        self.counters.controller_state = "error-active"
+        before = self._frames
+        reason = await self._receive(source)
+        return Attempt(present=True, useful=self._frames > before, reason=reason)
+
+    @property
+    def _frames(self) -> int:
+        return sum(a.counters.frames_received for a in self._assemblers.values())
+
+    async def _open(self) -> CanSource:
+        try:
+            return await in_thread(
+                self._open_source, self._port, self._sorter, undo=close_quietly, patience_s=SHUTDOWN_S
+            )
+        except Exception as error:
+            self.counters.open_failures += 1
+            raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
+
+    async def _receive(self, source: CanSource) -> str:
+        """Read until the link fails; returns why."""
+        reader = CanReader(
+            self.link.name,
+            source,
+            self._sorter,
+            self.take,
+            asyncio.get_running_loop(),
+            None if self._recorder is None else self._recorder.take,
+        )
+        reader.start()
+        try:
+            return await ended(reader.ended, reader)
+        finally:
+            # Cancelled while the bus is being closed: that takes its half second all the same.
+            try:
+                await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            finally:
+                reader.finish()
+
+    def take(self, found: Sorted) -> None:
+        """Take in what the reader thread has sorted and decoded; runs on the event loop."""
+        for name, count in found.notes.items():
+            setattr(self.counters, name, getattr(self.counters, name) + count)
+        if "frames_overrun" in found.notes:
+            self._say_once(
+                "overrun",
+                "%s: the kernel dropped frames because its receive buffer was full; they are counted from "
+                "now on. Raise receive_buffer_bytes of the bus, or relieve the machine",
+                self.link.name,
+            )
+        if found.errors is not None:
+            self._take_errors(found.errors)
+        elif found.data_frames and self.counters.controller_state == "bus-off":
+            # Whoever receives is on the bus again, even if the frame that said so was missed.
+            self._take_errors(ErrorCounts(state="error-active"))
+        for name, count in found.unknown.items():
+            self._take_unknown(name, count)
+        for stream, (count, length) in found.wrong_length.items():
+            self._take_wrong_length(stream, count, length)
+        for frames in found.frames:
+            decoded = frames.decoded
+            assembler = self._assemblers[frames.stream]
+            with sparing_others(self.link, frames.stream, self.counters):
+                assembler.accept(decoded.counter, decoded.samples, decoded.intact, frames.arrival_ns)
+        if found.drained_ns is not None:
+            for name, assembler in self._assemblers.items():
+                with sparing_others(self.link, name, self.counters):
+                    assembler.tick(found.drained_ns)
+
+    def _take_errors(self, errors: ErrorCounts) -> None:
+        """Count what error frames said; the link goes down with the controller and comes back with it."""
+        before = self.counters.controller_state
+        self.counters.take(errors)
+        state = self.counters.controller_state
+        if errors.counts.get("rx_overflows"):
+            self._say_once(
+                "rx overflow",
+                "%s: the controller's receive buffer overflowed: frames are lost, and counted from now on",
+                self.link.name,
+            )
+        if errors.bus_off:
+            self.link.down(self._bus_off_reason)
+        if state != "bus-off" and (errors.bus_off or before == "bus-off"):
+            self.link.up()
+        elif state not in {before, "bus-off"}:
+            self._say_once(state, "%s is %s: %s", self.link.name, state, EXPLAINED[state])
+
+    @property
+    def _bus_off_reason(self) -> str:
+        if self._port.options["interface"] != "socketcan":
+            return BUS_OFF_REASON
+        channel = self._port.options["channel"]
+        return (
+            f"{BUS_OFF_REASON}; unless {channel} has restart-ms set, it comes back by "
+            f"`ip link set {channel} type can restart`"
+        )
+
+    def _take_unknown(self, name: str, count: int) -> None:
+        ids = self.counters.unknown_ids
+        if name in ids or len(ids) < REMEMBERED_IDS:
+            ids[name] = ids.get(name, 0) + count
+        self._say_once(
+            "unknown id",
+            "%s carries frames that no stream of the machine file has, id %s the first of them; "
+            "they are counted by id",
+            self.link.name,
+            name,
+        )
+
+    def _take_wrong_length(self, stream: str, count: int, length: int) -> None:
+        assembler = self._assemblers[stream]
+        assembler.counters.frames_wrong_length += count
+        spec = next(s for s in self._port.streams if s.name == stream)
+        self._say_once(
+            f"length of {stream}",
+            "%s: a frame %#x of stream %r has %d bytes, its layout %d; such frames are counted and left out",
+            self.link.name,
+            spec.layout.frame_id,
+            stream,
+            length,
+            spec.layout.length,
+        )
+
+    def _say_once(self, key: str, message: str, *arguments: object) -> None:
+        if key not in self._said:
+            self._said.add(key)
+            logger.warning(message, *arguments)
+
+
+def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
+    return StreamAssembler(
+        spec.name,
+        spec.rate_hz,
+        counter_bits=spec.layout.counter_bits,
+        samples_per_frame=spec.layout.samples_per_frame,
+        counts_per_frame=spec.layout.counts_per_frame,
+        deliver=port.deliver,
+        reorder_window_ns=spec.reorder_window_ns,
+        tell=port.tell,
+    )
+
+
+def _open_source(port: BusPort, sorter: FrameSorter) -> CanSource:
+    if port.options["interface"] == "socketcan":
+        return open_socketcan(port.options, sorter.matches, port.clock)
+    return open_adapter(port.options, port.clock)

@@ -1,0 +1,191 @@
+"""The files of a CAN recording: what they are called, how large they grow, and what is taken away."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import re
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+from drivers.can.record_formats import ENDINGS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from drivers.can.batches import CanBatch
+    from drivers.can.record_formats import LogEncoder, LogFormat
+
+_STAMP = r"-\d{8}T\d{6}\.\d{6}Z"
+
+
+class Logs(Protocol):
+    """Where a recording goes."""
+
+    log_format: LogFormat
+    file_bytes: float
+    """A file that is this large is ended, and another one begun."""
+
+    place: Path
+    """What a person is told."""
+
+    def next_path(self, wall_ns: int) -> Path:
+        """The path of the next file, whose first frame came at ``wall_ns``; makes room for it.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        ...
+
+
+class LogFolder:
+    """Files named by bus and UTC start, e.g. ``can0-20261121T133215.250000Z.blf``; the oldest make room.
+
+    Only files with such names are taken away. The folder must be there: made at need, it would fill the
+    wrong disk whenever the right one is not mounted.
+
+    Args:
+        folder: holds them.
+        bus: name of the bus.
+        log_format: of new files.
+        file_bytes: a file that is this large is ended.
+        keep_bytes: what all of them may take, the one that is being written included.
+    """
+
+    def __init__(
+        self, folder: Path, bus: str, log_format: LogFormat, *, file_bytes: float, keep_bytes: float
+    ) -> None:
+        self.place = folder
+        self.log_format = log_format
+        self.file_bytes = file_bytes
+        self._bus = bus
+        self._keep_bytes = keep_bytes
+        endings = "|".join(re.escape(ending) for ending in ENDINGS.values())
+        self._ours = re.compile(re.escape(bus) + _STAMP + f"(?:{endings})")
+
+    def next_path(self, wall_ns: int) -> Path:
+        """See `Logs.next_path`."""
+        if not self.place.is_dir():
+            raise OSError(errno.ENOENT, "there is no such folder")
+        self._make_room()
+        seconds, ns = divmod(wall_ns, NS_PER_S)
+        began = datetime.fromtimestamp(seconds, UTC).replace(microsecond=ns // 1000)
+        return self.place / f"{self._bus}-{began:%Y%m%dT%H%M%S.%f}Z{ENDINGS[self.log_format]}"
+
+    def _make_room(self) -> None:
+        # Their names sort as their times do.
+        files = sorted(path for path in self.place.iterdir() if self._ours.fullmatch(path.name))
+        sizes = [path.stat().st_size for path in files]
+        left = sum(sizes)
+        for path, size in zip(files, sizes, strict=True):
+            if left + self.file_bytes <= self._keep_bytes:
+                break
+            path.unlink()
+            left -= size
+
+
+class OneLog:
+    """One file of any size; should the disk refuse it for a while, it goes on as ``NAME-2``, and so on.
+
+    Args:
+        path: the file; its ending says the format.
+
+    Raises:
+        ValueError: the ending is that of no format.
+    """
+
+    file_bytes = float("inf")
+
+    def __init__(self, path: Path) -> None:
+        formats = {ending: log_format for log_format, ending in ENDINGS.items()}
+        if path.suffix.lower() not in formats:
+            raise ValueError(f"{path.name} must end in {', '.join(formats)}")
+        self.place = path
+        self.log_format = formats[path.suffix.lower()]
+
+    def next_path(self, wall_ns: int) -> Path:  # noqa: ARG002 - its name is given
+        """See `Logs.next_path`."""
+        return next(path for path in self.names() if not path.exists())
+
+    def names(self) -> Iterator[Path]:
+        """What the file is called, and the files that go on with it."""
+        yield self.place
+        for k in itertools.count(2):
+            yield self.place.with_stem(f"{self.place.stem}-{k}")
+
+
+class LogFile:
+    """One log on disk. What is flushed is in it whole or, where the disk refuses, not at all.
+
+    Args:
+        path: the file, which must not exist yet.
+        encoder: the beginning of the log.
+        offset_ns: wall time minus monotonic time. It holds for the whole file: a step of the wall clock is
+            no step between frames.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+
+    def __init__(self, path: Path, encoder: LogEncoder, offset_ns: int) -> None:
+        self.path = path
+        self.size = 0
+        self.flush_ns = encoder.flush_ns
+        self._encoder = encoder
+        self._offset_ns = offset_ns
+        self._last_us = 0
+        self._file = path.open("xb", buffering=0)
+
+    @property
+    def deleted(self) -> bool:
+        """Whether somebody has deleted the file."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
+    def add(self, frames: CanBatch) -> None:
+        """Add frames to what is flushed next."""
+        t_us = (frames.arrival_ns + self._offset_ns) // 1000
+        # Formats that count from their first frame cannot say that one came before it.
+        t_us = np.maximum(np.maximum.accumulate(t_us), self._last_us)
+        self._last_us = int(t_us[-1])
+        self._encoder.add(frames, t_us.tolist())
+
+    def flush(self) -> None:
+        """Hand what was added to the operating system.
+
+        Raises:
+            OSError: the disk refuses; the file ends where it ended before.
+        """
+        piece = self._encoder.take()
+        if not piece:
+            return
+        try:
+            self._put(piece, self.size)
+            self._put(self._encoder.head(), 0)
+        except OSError:
+            os.ftruncate(self._file.fileno(), self.size)
+            raise
+        self.size += len(piece)
+
+    def close(self) -> None:
+        """End the file; one that holds nothing is taken away.
+
+        Raises:
+            OSError: the disk refuses even this; what was flushed stays.
+        """
+        with self._file:
+            if not self.size:
+                self.path.unlink(missing_ok=True)
+            else:
+                self._put(self._encoder.tail(), self.size)
+
+    def _put(self, piece: bytes, at: int) -> None:
+        left = memoryview(piece)
+        while left:
+            written = os.pwrite(self._file.fileno(), left, at)
+            at += written
+            left = left[written:]

@@ -1,0 +1,248 @@
+"""SocketCAN read in batches: kernel time stamps, kernel filters, every dropped frame counted.
+
+python-can takes one frame per call, gives the receive buffer no size and cannot count what the kernel
+drops (python-can#474, #1881), so on Linux the raw socket is read here. Options of the bus, beside those
+of every CAN bus:
+
+- ``receive_buffer_bytes``: how much the kernel holds while nobody reads. It allows itself twice that, and
+  a frame takes some 768 bytes of it.
+- ``filter``: whether the kernel passes on only frames that some stream has (and error frames). It saves
+  the work for all others, which are then not seen and hence not counted as unknown. Left out, it does so
+  unless the bus is recorded.
+
+Bit rates are the interface's, set with ``ip link``, and not a matter of this module.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import select
+import socket
+import struct
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drivers.can.batches import BIT_RATE_SWITCH, ERROR_PASSIVE_SENDER, FD, LONGEST, CanBatch
+from drivers.can.errors import ALL_CLASSES
+from drivers.can.kernel_time import KernelTime
+from drivers.can.recvmmsg import SO_RXQ_OVFL, SO_TIMESTAMPING, SO_TIMESTAMPNS, DatagramBuffer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daqsvc.acquisition.clock import Clock
+    from drivers.can.batches import IdMatch
+
+logger = logging.getLogger(__name__)
+
+BATCH_FRAMES = 4096
+GATHER_S = 0.005
+RECEIVE_BUFFER_BYTES = 4 << 20
+"""Doubled by the kernel: some 10 900 frames, more than a second of a full bus of 1 Mbit/s."""
+
+CLASSIC_BYTES = 16
+FD_BYTES = 72
+"""``sizeof(struct can_frame)`` and ``sizeof(struct canfd_frame)``; both begin with id, length, flags."""
+
+_HEADER_BYTES = 8
+_FD_FLAGS = np.uint8(BIT_RATE_SWITCH | ERROR_PASSIVE_SENDER)
+_SO_RCVBUFFORCE = 33
+_SO_MEMINFO = 55
+_RX_HARDWARE_RAW = 1 << 2 | 1 << 6
+"""``SOF_TIMESTAMPING_RX_HARDWARE | SOF_TIMESTAMPING_RAW_HARDWARE`` (linux/net_tstamp.h)."""
+
+_CAN_RAW_ERR_FILTER = 2
+_MOST_FILTERS = 512
+"""``CAN_RAW_FILTER_MAX`` (linux/can/raw.h)."""
+
+
+class SocketCan:
+    """One socket that yields CAN frames: a raw CAN socket, or a stand-in that carries the same bytes.
+
+    Args:
+        sock: a bound socket, one ``can_frame`` or ``canfd_frame`` per datagram; it is closed with this.
+        clock: what arrivals are told in.
+        receive_buffer_bytes: how much the kernel holds while nobody reads.
+
+    Raises:
+        OSError: this is no Linux, or the socket takes no time stamps.
+    """
+
+    gather_s = GATHER_S
+    error_classes = ALL_CLASSES
+    recovers = True
+
+    def __init__(
+        self, sock: socket.socket, clock: Clock, *, receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES
+    ) -> None:
+        self._socket = sock
+        self._clock = clock
+        self._time = KernelTime(clock)
+        self._buffer = DatagramBuffer(BATCH_FRAMES, FD_BYTES)
+        self._dropped = 0
+        self._failed_with = 0
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, _RX_HARDWARE_RAW)
+        _make_room(sock, receive_buffer_bytes)
+        # Not select(2): it knows no file descriptors past 1023.
+        self._poll = select.poll()
+        self._poll.register(sock, select.POLLIN)
+
+    def read(self, timeout_s: float) -> CanBatch:
+        """See `drivers.can.batches.CanSource.read`.
+
+        Raises:
+            OSError: the interface is down (ENETDOWN) or gone (ENODEV), or the other end of a stand-in is.
+        """
+        asked_ns = self._clock.monotonic_ns()
+        count = self._receive()
+        if not count and not self._failed_with and self._poll.poll(1e3 * timeout_s):
+            asked_ns = self._clock.monotonic_ns()
+            count = self._receive()
+        if not count and self._failed_with:
+            raise OSError(self._failed_with, os.strerror(self._failed_with))
+        stamps = self._buffer.stamps()
+        drained = count < BATCH_FRAMES
+        arrival_ns = self._time.monotonic(stamps.software_ns, stamps.hardware_ns, drained=drained)
+        overrun = self._overrun(stamps.dropped if count else dropped_frames(self._socket))
+        sizes = self._buffer.sizes
+        rows = self._buffer.datagrams[:count]
+        whole = (sizes == CLASSIC_BYTES) | (sizes == FD_BYTES)
+        malformed = 0
+        if not whole.all():
+            if (sizes == 0).any():
+                raise OSError(errno.ENOTCONN, "the other end has closed the socket")
+            malformed = int((~whole).sum())
+            rows, sizes, arrival_ns = rows[whole], sizes[whole], arrival_ns[whole]
+        is_fd = sizes == FD_BYTES
+        return CanBatch(
+            ids=np.ascontiguousarray(rows[:, :4]).view(np.uint32)[:, 0],
+            lengths=np.minimum(rows[:, 4].astype(np.int64), sizes.astype(np.int64) - _HEADER_BYTES),
+            data=rows[:, _HEADER_BYTES : _HEADER_BYTES + LONGEST],
+            arrival_ns=arrival_ns,
+            overrun=overrun,
+            malformed=malformed,
+            drained_ns=asked_ns if drained else None,
+            # Not every kernel sets the flag that says FD; the size says it in any.
+            fd_flags=np.where(is_fd, rows[:, 5] & _FD_FLAGS | FD, 0) if is_fd.any() else None,
+        )
+
+    def close(self) -> None:
+        """See `drivers.can.batches.CanSource.close`."""
+        self._socket.close()
+
+    def _overrun(self, dropped: int | None) -> int:
+        """Frames dropped since this was last asked, of the kernel's count modulo 2^32."""
+        if dropped is None:
+            return 0
+        newly = (dropped - self._dropped) % 2**32
+        if newly >= 2**31:  # a frame that was queued before the count was last read
+            return 0
+        self._dropped = dropped
+        return newly
+
+    def _receive(self) -> int:
+        """Take frames; an error of the socket is kept until what was queued before it has been taken."""
+        try:
+            return self._buffer.receive(self._socket.fileno())
+        except OSError as error:
+            self._failed_with = error.errno or errno.EIO
+            return self._buffer.receive(self._socket.fileno())
+
+
+def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock: Clock) -> SocketCan:
+    """Open a CAN interface of the Linux kernel.
+
+    Args:
+        options: the bus's settings: ``channel``, ``fd``, ``receive_buffer_bytes``, ``filter``, ``record``.
+        matches: ids that some stream has.
+        clock: what arrivals are told in.
+
+    Raises:
+        OSError: the kernel has no CAN, or the interface is absent or down.
+    """
+    if options.get("options"):
+        raise OSError(
+            errno.EINVAL,
+            f"options {sorted(options['options'])} mean nothing to SocketCAN; remove them, "
+            "set the interface up with `ip link` instead",
+        )
+    sock = _raw_socket()
+    try:
+        # A recording is of the whole bus: what is sent on it does not depend on what the streams are.
+        if options.get("fd") or options.get("record"):
+            sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ALL_CLASSES)
+        if _filtered(options) and len(matches) <= _MOST_FILTERS:
+            filters = b"".join(struct.pack("=II", match.id, match.mask) for match in matches)
+            sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        source = SocketCan(
+            sock,
+            clock,
+            receive_buffer_bytes=options.get("receive_buffer_bytes") or RECEIVE_BUFFER_BYTES,
+        )
+        sock.bind((options["channel"],))
+        _raise_first_error(sock, options["channel"])
+    except BaseException:
+        sock.close()
+        raise
+    return source
+
+
+def _filtered(options: Mapping[str, Any]) -> bool:
+    """Whether only frames of some stream are wanted: a recording is of the whole bus unless it is said."""
+    asked = options.get("filter")
+    return not options.get("record") if asked is None else bool(asked)
+
+
+def dropped_frames(sock: socket.socket) -> int:
+    """Frames that the kernel has dropped on a socket so far, modulo 2^32.
+
+    A frame that is received says how many were dropped before it; this says it when none follows.
+    """
+    figures = struct.unpack("=9I", sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
+    return int(figures[8])
+
+
+def _raw_socket() -> socket.socket:
+    family = getattr(socket, "AF_CAN", None)
+    if family is None:
+        raise OSError(errno.EAFNOSUPPORT, "this Python was built without SocketCAN")
+    try:
+        return socket.socket(family, socket.SOCK_RAW, socket.CAN_RAW)
+    except OSError as error:
+        if error.errno in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT}:
+            raise OSError(
+                error.errno, "this kernel has no SocketCAN; `modprobe can-raw`, or use another interface"
+            ) from error
+        raise
+
+
+def _raise_first_error(sock: socket.socket, channel: str) -> None:
+    """A socket binds to an interface that is down, too, and has this as its first error."""
+    code = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if code == errno.ENETDOWN:
+        raise OSError(code, f"interface {channel} is down; set it up with `ip link set {channel} up`")
+    if code:
+        raise OSError(code, os.strerror(code))
+
+
+def _make_room(sock: socket.socket, wanted: int) -> None:
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)
+    except PermissionError:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
+    got = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    if got < wanted:
+        logger.info(
+            "the kernel gives a receive buffer of %d bytes instead of %d; allow more by "
+            "`sysctl net.core.rmem_max=%d`, or grant CAP_NET_ADMIN",
+            got,
+            wanted,
+            wanted,
+        )

@@ -1,0 +1,1 @@
+"""Modbus lines, TCP and RTU."""

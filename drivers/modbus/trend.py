@@ -1,0 +1,323 @@
+"""Present values polled on a schedule: streams whose registers lie together share requests.
+
+The schedule is ours, and so is the clock: a sample was taken between the moment its request went out and the
+moment its reply was there. Nothing need be estimated, and a poll that had to wait for the line is still a
+sample, of its own true time.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.assembler import StreamCounters, note_gap, note_received
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
+from drivers.modbus.layouts import FUNCTIONS
+from drivers.modbus.outcomes import NoReplyError, RefusedError
+from drivers.modbus.reading import PollingReader, streams_in_words
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daqsvc.acquisition.samples import Samples
+    from drivers.base import BusPort, StreamSpec
+    from drivers.modbus.layouts import Trend
+    from drivers.modbus.line import ModbusLine, Reading
+    from drivers.modbus.registers import Run
+
+logger = logging.getLogger(__name__)
+
+BATCH_NS = 20_000_000
+BATCH_POLLS = 64
+WORTH_A_BATCH_NS = 5_000_000
+"""A pause of the poll schedule in which what has been read is handed on."""
+
+EARLY_NS = 500_000
+"""How early a poll may be: no event loop sleeps for less than a millisecond."""
+
+LATE_NS = 2_000_000
+"""How late one may be at least: no event loop wakes up to the millisecond; what is overdue is soon asked."""
+
+REFUSALS_OF_REGISTERS = frozenset({2, 3})
+"""Exceptions by which a unit says that it has not these registers, or not so many at once."""
+
+APART_NS = 60 * NS_PER_S
+APART_MOST_NS = 3600 * NS_PER_S
+"""How long streams are read apart before they are tried together again; twice as long each time."""
+
+
+class _Failure(NamedTuple):
+    """A request that failed: why, for what, and whose samples it costs."""
+
+    error: NoReplyError | RefusedError
+    run: Run
+    takers: frozenset[_TrendStream]
+
+    @property
+    def of_sharing(self) -> bool:
+        """Whether the unit may have each stream's registers, and not all that lies between them."""
+        refused = isinstance(self.error, RefusedError) and self.error.code in REFUSALS_OF_REGISTERS
+        return refused and len(self.takers) > 1
+
+
+class _Row(NamedTuple):
+    """The registers of a sample, its place in the schedule, and between when and when it was taken."""
+
+    slot: int
+    registers: bytes
+    from_ns: int
+    to_ns: int
+
+
+class _TrendStream:
+    """One stream of those that are polled together: its samples until a batch of them is handed on.
+
+    A sample is placed midway between request and reply, which bound its error. Those of one block are as far
+    from even steps as its polls were from the schedule: that is in the block's error, too.
+    """
+
+    def __init__(self, spec: StreamSpec[Trend], port: BusPort) -> None:
+        self.name = spec.name
+        self.own_runs = spec.layout.record.runs
+        self.counters = StreamCounters()
+        self._record = spec.layout.record
+        self._deliver = port.deliver
+        self._period_ns = NS_PER_S / spec.rate_hz
+        self._places: tuple[int, ...] = ()
+        self._rows: list[_Row] = []
+        self._start_ns = 0
+        self._next: int | None = None
+        self._lateness_ns: deque[float] = deque(maxlen=RECENT_DELAYS)
+        self._error_ns = np.inf
+
+    @property
+    def time_base(self) -> TimeBaseState:
+        """How well the schedule is kept, and how far off the time of the last sample may be."""
+        late_ns = float(np.percentile(self._lateness_ns, 95)) if self._lateness_ns else 0.0
+        return TimeBaseState(self._period_ns, 0.0, late_ns, self._next is not None, 0, self._error_ns)
+
+    def places_in(self, runs: Sequence[Run]) -> tuple[int, ...]:
+        """Places of those runs that its quantities lie in."""
+        wanted = [field.run for field in self._record.fields]
+        return tuple(
+            place
+            for place, run in enumerate(runs)
+            if any(run.address <= one.address and one.end <= run.end for one in wanted)
+        )
+
+    def take_from(self, runs: Sequence[Run], places: Sequence[int]) -> None:
+        """Say which runs are read from now on, and which of them are for this stream."""
+        self.flush()
+        self._places = tuple(places)
+        self._record = replace(self._record, runs=tuple(runs[place] for place in places))
+
+    def take(self, slot: int, start_ns: int, readings: Sequence[Reading | None]) -> None:
+        """Take the sample of a slot, from what each run holds; without one of its own it is lost.
+
+        Args:
+            slot: its place in the schedule.
+            start_ns: when the schedule began, host monotonic.
+            readings: of each run; None if there is none.
+        """
+        own = [reading for place in self._places if (reading := readings[place]) is not None]
+        if len(own) < len(self._places):
+            return
+        self._start_ns = start_ns
+        registers = b"".join(reading.registers for reading in own)
+        row = _Row(slot, registers, own[0].asked_ns, own[-1].answered_ns)
+        self._rows.append(row)
+        if len(self._rows) >= BATCH_POLLS or row.to_ns - self._rows[0].to_ns > BATCH_NS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand on what has been read."""
+        if not self._rows:
+            return
+        slots, registers, asked_ns, answered_ns = zip(*self._rows, strict=True)
+        self._rows = []
+        raw = np.frombuffer(b"".join(registers), np.uint8).reshape(len(slots), -1)
+        samples = np.ascontiguousarray(self._record.decode(raw))
+        slot = np.array(slots, np.int64)
+        due_ns = self._start_ns + np.rint(slot * self._period_ns).astype(np.int64)
+        from_ns, to_ns = np.array(asked_ns) - due_ns, np.array(answered_ns) - due_ns
+        self._lateness_ns.extend(from_ns.tolist())
+        gaps = (np.flatnonzero(np.diff(slot) != 1) + 1).tolist()
+        for begin, end in pairwise([0, *gaps, len(slots)]):
+            part = slice(begin, end)
+            earliest_ns, latest_ns = int(from_ns[part].min()), int(to_ns[part].max())
+            t_first_ns = int(due_ns[begin]) + (earliest_ns + latest_ns) // 2
+            self._hand_on(slots[begin], samples[part], t_first_ns, (latest_ns - earliest_ns) / 2)
+
+    def _hand_on(self, first: int, samples: Samples, t_first_ns: int, error_ns: float) -> None:
+        lost = 0 if self._next is None else first - self._next
+        self._next, self._error_ns = first + len(samples), error_ns
+        self.counters.frames_received += len(samples)
+        samples = note_received(self.counters, self.name, samples)
+        if lost:
+            note_gap(self.counters, self.name, lost, first)
+        quality = Quality.AFTER_LOSS if lost else Quality.GOOD
+        self._deliver(
+            SampleBlock(self.name, first, samples, t_first_ns, self._period_ns, lost, quality, error_ns)
+        )
+
+
+class TrendReader(PollingReader):
+    """Polls registers on a schedule, which begins with the first sample; its count is its place in that.
+
+    A poll that fails is a lost sample of every stream that has registers in it, and of no other; and so is
+    one whose request could not go out before the next was due, because others held the line.
+
+    Args:
+        specs: streams of one unit, table and rate.
+        port: of the bus.
+        runs: what is read for all of them together; None to read each stream's own.
+    """
+
+    def __init__(
+        self, specs: Sequence[StreamSpec[Trend]], port: BusPort, runs: Sequence[Run] | None = None
+    ) -> None:
+        super().__init__([spec.name for spec in specs], port.clock)
+        self._unit = specs[0].layout.unit
+        self._function = FUNCTIONS[specs[0].layout.table]
+        self._period_ns = NS_PER_S / specs[0].rate_hz
+        self._late_ns = max(self._period_ns, LATE_NS)
+        self._start_ns = 0
+        self._done = -1
+        self._begun = False
+        self._streams = [_TrendStream(spec, port) for spec in specs]
+        self._shared = runs
+        self._apart_ns = APART_NS
+        self._together_at_ns: int | None = None
+        """When the streams, now read apart, are tried together again."""
+        if runs is None:
+            self._read_apart()
+        else:
+            self._read_together(runs)
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `Reader.streams`."""
+        return {stream.name: (stream.counters, stream.time_base) for stream in self._streams}
+
+    def flush(self) -> None:
+        """See `Reader.flush`."""
+        for stream in self._streams:
+            stream.flush()
+
+    async def _look(self, line: ModbusLine) -> None:
+        slot = await self._wait_for_slot(line)
+        now_ns = self._clock.monotonic_ns()
+        if self._shared and self._together_at_ns is not None and now_ns >= self._together_at_ns:
+            self._read_together(self._shared)
+        readings, failure = await self._ask(line)
+        if failure is not None and failure.of_sharing:
+            self._part(failure)
+            readings, failure = await self._ask(line)
+        self._take(slot, readings)
+        if failure is not None:
+            self._fail(failure)
+
+    async def _ask(self, line: ModbusLine) -> tuple[list[Reading | None], _Failure | None]:
+        """Read all runs; the last failure that cost some stream its sample, if any."""
+        readings: list[Reading | None] = []
+        lost: frozenset[_TrendStream] = frozenset()
+        failure: _Failure | None = None
+        for run, what, takers in self._plan:
+            reading = None
+            if not takers <= lost:  # else nobody's sample can be whole any more
+                try:
+                    reading = await line.poll(self._unit, self._function, run, what)
+                except (NoReplyError, RefusedError) as error:
+                    failure = _Failure(error, run, takers)
+                    lost |= takers
+            readings.append(reading)
+        return readings, failure
+
+    def _take(self, slot: int, readings: Sequence[Reading | None]) -> None:
+        """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
+        asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
+        if asked_ns is None:
+            return
+        if self._begun:
+            self._done = max(slot, self._oldest_slot(asked_ns))
+        else:
+            self._begun, self._start_ns, self._done = True, asked_ns, 0
+        for stream in self._streams:
+            stream.take(self._done, self._start_ns, readings)
+
+    def _part(self, failure: _Failure) -> None:
+        """Read the streams apart: the unit has not all that they share. Sooner or later try again."""
+        self._read_apart()
+        self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
+        self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
+        if (said := f"{failure.error} ({_words(failure.run)})") not in self._said:
+            self._said.add(said)
+            logger.warning(
+                "%s: %s; each stream is polled by itself, and they are tried together only now and then. A "
+                "smaller max_gap, or forbidden, says so from the start",
+                self._who,
+                said,
+            )
+
+    def _fail(self, failure: _Failure) -> None:
+        """Tell a refusal with whom it concerns; whoever is silent is told by the line."""
+        if not isinstance(failure.error, RefusedError):
+            raise failure.error
+        told = RefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
+        self._tell(told, streams_in_words(sorted(stream.name for stream in failure.takers)))
+
+    async def _pause_after_failure(self) -> None:
+        """The schedule itself is the pause."""
+
+    def _read_together(self, runs: Sequence[Run]) -> None:
+        self._together_at_ns = None
+        self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
+
+    def _read_apart(self) -> None:
+        runs: list[Run] = []
+        places = {}
+        for stream in self._streams:
+            places[stream] = range(len(runs), len(runs) + len(stream.own_runs))
+            runs += stream.own_runs
+        self._read_from(runs, places)
+
+    def _read_from(self, runs: Sequence[Run], places: Mapping[_TrendStream, Sequence[int]]) -> None:
+        for stream in self._streams:
+            stream.take_from(runs, places[stream])
+        self._plan = [
+            (run, _words(run), frozenset(stream for stream in self._streams if place in places[stream]))
+            for place, run in enumerate(runs)
+        ]
+
+    async def _wait_for_slot(self, line: ModbusLine) -> int:
+        """Wait for the next place in the schedule that has not passed for good."""
+        now_ns = self._clock.monotonic_ns()
+        if self._done < 0:
+            self._start_ns = now_ns
+        self._done = max(self._done + 1, self._oldest_slot(now_ns))
+        due_ns = self._due_ns(self._done)
+        line.expect(self, due_ns)
+        wait_ns = due_ns - now_ns
+        if wait_ns > WORTH_A_BATCH_NS:
+            self.flush()
+        if wait_ns > EARLY_NS:
+            await self._clock.sleep_ns(wait_ns)
+        return self._done
+
+    def _oldest_slot(self, now_ns: int) -> int:
+        """The first place in the schedule that has not passed for good: the next but one is not due yet."""
+        return -int((self._start_ns + self._late_ns - now_ns) // self._period_ns)
+
+    def _due_ns(self, slot: int) -> int:
+        return self._start_ns + round(slot * self._period_ns)
+
+
+def _words(run: Run) -> str:
+    return f"registers {run.address} to {run.end - 1}"

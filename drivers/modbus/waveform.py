@@ -1,0 +1,241 @@
+"""Blocks of samples that a device takes at once and keeps until the next: fetched page by page."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.assembler import StreamCounters, note_received
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.samples import Quality, SampleBlock
+from daqsvc.acquisition.timebase import TimeBaseState
+from drivers.modbus.counted import SURE, SampleClock
+from drivers.modbus.layouts import FUNCTIONS
+from drivers.modbus.reading import PollingReader
+from drivers.modbus.registers import Run
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable, Mapping
+
+    from drivers.base import BusPort, StreamSpec
+    from drivers.modbus.layouts import Waveform
+    from drivers.modbus.line import ModbusLine
+    from drivers.modbus.outcomes import ModbusCounters
+
+logger = logging.getLogger(__name__)
+
+IDS = 65_535
+"""How many ids there are: they run from 1 to this, and again from 1; 0 says that there is no block."""
+
+NO_BLOCK = 0
+
+
+class _Ended(NamedTuple):
+    """When a block ended, and how far that may be off."""
+
+    t_ns: int
+    error_ns: float
+
+    @classmethod
+    def between(cls, after_ns: int | None, by_ns: int) -> _Ended:
+        """It had not ended at ``after_ns`` (None: nobody looked), and had at ``by_ns``."""
+        if after_ns is None:
+            return cls(by_ns, math.inf)
+        return cls((after_ns + by_ns) // 2, (by_ns - after_ns) / 2)
+
+
+class WaveformReader(PollingReader):
+    """Fetches every block that the device takes.
+
+    Blocks are snapshots: between them nobody samples, and nothing is missing. How long that was is told by
+    the host clock; as lost are counted only those of blocks that the device took and that could not be read
+    whole.
+
+    A trigger is written when it is due, never more often: it may cost a sensor a part of its battery. So it
+    is not written again when its reply is lost, for the device may have heard it.
+
+    Nothing in a block tells when it was taken. But the last look at the id that found another one was before
+    its end, and the first that found its own was after it: it ended midway, give or take half of that time.
+
+    A new id is believed once another look finds it, too; several looks, if it is not the one that was due.
+
+    Args:
+        spec: the stream.
+        port: of its bus.
+        counters: of the bus.
+        window: held while a page is selected and read, by all streams of the unit.
+    """
+
+    def __init__(
+        self, spec: StreamSpec[Waveform], port: BusPort, counters: ModbusCounters, window: asyncio.Lock
+    ) -> None:
+        super().__init__([spec.name], port.clock)
+        self._name = spec.name
+        self._layout = spec.layout
+        self._counters = counters
+        self._window = window
+        self._stream_counters = StreamCounters()
+        self._period_ns = NS_PER_S / spec.rate_hz
+        self._sample_clock = SampleClock(spec.rate_hz)
+        self._deliver: Callable[[SampleBlock], None] = port.deliver
+        self._last_id: int | None = None
+        self._last_seen_ns = 0
+        self._end: tuple[int, int] | None = None
+        self._lost_since = 0
+        self._restarts = 0
+        self._triggered_ns: int | None = None
+        self._shown: int | None = None
+        self._asked_ns: int | None = None
+        self._ended = _Ended(0, math.inf)
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `Reader.streams`."""
+        error_ns = self._ended.error_ns
+        settled = math.isfinite(error_ns)
+        time_base = TimeBaseState(self._period_ns, 0.0, 0.0, settled, self._restarts, error_ns)
+        return {self._name: (self._stream_counters, time_base)}
+
+    def flush(self) -> None:
+        """Nothing is ever held back."""
+
+    async def _look(self, line: ModbusLine) -> None:
+        await self._trigger(line)
+        block_id = await self._id(line)
+        if block_id == NO_BLOCK:
+            self._note_no_block()
+        if block_id in {NO_BLOCK, self._last_id}:
+            await self._clock.sleep_ns(self._layout.poll_ns)
+            return
+        ended = self._ended
+        rows = await self._read_block(line, block_id)
+        self._stream_counters.frames_received += 1
+        self._lose_until(block_id)
+        if rows is None:
+            self._counters.blocks_torn += 1
+            self._lose(1)
+            return
+        self._hand_on(rows, ended)
+
+    async def _read_block(self, line: ModbusLine, block_id: int) -> bytes | None:
+        """Read all pages of a block; None if another block has taken its place meanwhile."""
+        layout = self._layout
+        rows = b""
+        for page, runs in enumerate(layout.pages):
+            async with self._window:  # else another stream of the unit might turn the page
+                if layout.page is not None:
+                    await line.write(layout.unit, layout.page.select, [page])
+                for run in runs:
+                    rows += await line.read(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            if await self._id(line) != block_id:
+                return None
+        return rows
+
+    @property
+    def _what(self) -> str:
+        return f"stream {self._name!r}"
+
+    async def _pause_after_failure(self) -> None:
+        await self._clock.sleep_ns(self._layout.poll_ns)
+
+    async def _trigger(self, line: ModbusLine) -> None:
+        """Make the device take a block, if one is due."""
+        trigger = self._layout.trigger
+        if trigger is None:
+            return
+        now_ns = self._clock.monotonic_ns()
+        if self._triggered_ns is None or now_ns - self._triggered_ns >= trigger.every_ns:
+            self._triggered_ns = now_ns
+            await line.write(self._layout.unit, trigger.address, [trigger.value])
+
+    async def _id(self, line: ModbusLine) -> int:
+        """The id of the block that the device shows, and with a new one when that block ended."""
+        layout = self._layout
+        run = Run(layout.block_id, 1)
+        while True:
+            first = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+            again = first
+            block_id = int.from_bytes(first.registers, "big")
+            if block_id != self._shown:
+                is_next = self._shown is not None and block_id == self._shown % IDS + 1
+                for _ in range(1 if is_next else SURE - 1):
+                    again = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
+                    if again.registers != first.registers:
+                        break
+            if again.registers == first.registers:
+                if block_id != self._shown:
+                    self._ended = _Ended.between(self._asked_ns, first.answered_ns)
+                self._shown, self._asked_ns = block_id, again.asked_ns
+                break
+            self._counters.counts_doubted += 1
+            await self._clock.sleep_ns(layout.poll_ns)
+        if block_id == self._last_id:
+            self._last_seen_ns = self._asked_ns
+        return block_id
+
+    def _note_no_block(self) -> None:
+        """Before the first block of a device there is none; so it has restarted if there was one."""
+        if self._last_id not in {None, NO_BLOCK}:
+            self._tell_restart()
+        self._last_id, self._last_seen_ns = NO_BLOCK, self._asked_ns or 0
+
+    def _lose_until(self, block_id: int) -> None:
+        """Count the blocks between the last one and this one, which nobody can read any more."""
+        last, self._last_id = self._last_id, block_id
+        since_ns, self._last_seen_ns = self._last_seen_ns, self._asked_ns or 0
+        if last is None:
+            return
+        missed = (block_id - last - 1) % IDS
+        elapsed_ns = self._clock.monotonic_ns() - since_ns
+        most = (self._sample_clock.most(elapsed_ns) + self._sample_clock.at_once) / self._layout.samples
+        if missed > most:
+            self._tell_restart()
+            missed = block_id - 1 if block_id - 1 <= most else 0
+        self._counters.blocks_missed += missed
+        self._lose(missed)
+
+    def _tell_restart(self) -> None:
+        logger.warning(
+            "stream %r: the device has begun to count its blocks again; blocks that it took just before are "
+            "not counted as lost",
+            self._name,
+        )
+        self._restarts += 1
+
+    def _lose(self, blocks: int) -> None:
+        self._lost_since += blocks * self._layout.samples
+        self._stream_counters.samples_lost += blocks * self._layout.samples
+
+    def _hand_on(self, rows: bytes, ended: _Ended) -> None:
+        raw = np.frombuffer(rows, np.uint8).reshape(self._layout.samples, -1)
+        samples = note_received(
+            self._stream_counters, self._name, np.ascontiguousarray(self._layout.record.decode(raw))
+        )
+        span_ns = round(len(samples) * self._period_ns)
+        t_first_ns = ended.t_ns - span_ns
+        quality = Quality.GOOD if math.isfinite(ended.error_ns) else Quality.TIME_UNSETTLED
+        end_index, end_ns = self._end or (0, t_first_ns)
+        lost, self._lost_since = self._lost_since, 0
+        pause = max(round((t_first_ns - end_ns) / self._period_ns) - lost, 0)
+        first = end_index + lost + pause
+        if lost:
+            quality |= Quality.AFTER_LOSS | Quality.LOSS_ESTIMATED
+            self._stream_counters.gaps += 1
+        self._end = (first + len(samples), ended.t_ns)
+        self._deliver(
+            SampleBlock(
+                self._name,
+                first,
+                samples,
+                t_first_ns,
+                self._period_ns,
+                lost,
+                quality,
+                ended.error_ns,
+                pause,
+            )
+        )

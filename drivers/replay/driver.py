@@ -1,0 +1,335 @@
+"""The replay driver: a recording in place of a device.
+
+It plays CAN logs and tables of samples through the same decoders and assemblers as a live bus, so that
+a machine file can be tried on what was recorded. Time stamps are those of the recording, moved so that
+its first one is now: the jitter of the day is played too, the jitter of this machine is not added.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.acquisition.supervisor import Link
+from daqsvc.confined.limits import GIGABYTE, Limits
+from daqsvc.confined.process import ConfinedProcess
+from drivers.base import BusCounters, BusPort
+from drivers.can.adapter import batch_of
+from drivers.can.batches import FrameSorter
+from drivers.frames import FrameLayout
+from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
+from drivers.replay.can_log import STEP_BACK_NS, CanLog
+from drivers.replay.channel import ChannelChoice
+from drivers.replay.files import (
+    TABLE_COUNTER_BITS,
+    ColumnLayout,
+    RecordingError,
+    SampleTable,
+    kind_of,
+    words,
+)
+from drivers.replay.growing import GrowingCandump, Place
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import can
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import StreamSpec
+    from drivers.can.batches import Sorted
+    from drivers.replay.files import Recording
+
+logger = logging.getLogger(__name__)
+
+POLL_NS = NS_PER_S // 20
+SPAN_NS = NS_PER_S // 20
+UNPACED_SPAN_NS = NS_PER_S
+REMAP_NS = 2 * NS_PER_S
+"""A growing log whose times are off by more than this is from another clock than before."""
+
+LEAP_NS = 3600 * NS_PER_S
+"""A recording whose time leaps ahead by more is played on at once: nobody waits for a damaged time stamp."""
+
+REMEMBERED_IDS = 64
+END_OF_FILE = "end of file"
+
+
+@dataclass(slots=True)
+class ReplayCounters(BusCounters):
+    """What happened on a replayed bus; every figure only grows.
+
+    Attributes:
+        frames_malformed: lines of a log that are no frames.
+        frames_other_channel: frames of other channels than the one that is played.
+        time_leaps: how often the recorded time has leapt back, or ahead by more than an hour.
+        passes: how often the recording has been played to its end.
+        passes_damaged: how often it has been played as far as it could be read, which was not its end.
+    """
+
+    frames_malformed: int = 0
+    frames_other_channel: int = 0
+    time_leaps: int = 0
+    passes: int = 0
+    passes_damaged: int = 0
+
+
+class Ending(NamedTuple):
+    """Why nothing more comes of a recording.
+
+    Attributes:
+        reason: in words.
+        readable: whether all that can be read of it has been played; else its reader failed.
+    """
+
+    reason: str
+    readable: bool
+
+
+class ReplayDriver:
+    """Plays one recording.
+
+    Options of the bus: ``file``; ``channel``, which one of a CAN log that holds several (the first one in it
+    if left out); ``at_end``, what to do at its end: ``"stop"`` (the link is down from then on, with the
+    reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is writing the
+    file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver takes it,
+    where the samples' times run ahead of the clock; ``max_memory_gb``, what reading a table may take (half of
+    the machine's memory, at most 4 GB, if left out).
+
+    A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
+    `ColumnLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
+    be read of one that is damaged is played, and that is its end.
+
+    Args:
+        port: settings, streams, clock and where to deliver.
+    """
+
+    def __init__(self, port: BusPort) -> None:
+        self.name = port.name
+        self._path = Path(port.options["file"])
+        self._at_end = port.options.get("at_end", "stop")
+        self._paced = port.options.get("pace", "recorded") == "recorded"
+        self.link = Link(f"replayed bus {port.name!r} ({self._path})")
+        self.counters = ReplayCounters()
+        self._port = port
+        self._assemblers = {spec.name: _assembler(spec, port) for spec in port.streams}
+        frames = [spec for spec in port.streams if isinstance(spec.layout, FrameLayout)]
+        self._sorter = FrameSorter(frames)
+        self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
+        self._place = Place()
+        self._reader = ConfinedProcess()
+        memory_gb = port.options.get("max_memory_gb")
+        self._limits = Limits() if memory_gb is None else Limits(round(memory_gb * GIGABYTE))
+        self._first_index: dict[str, int] = {}
+        self._to_its_end = False
+        self._shift_ns: int | None = None
+        self._newest_ns: int | None = None
+        self._said: set[str] = set()
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `drivers.base.Driver.streams`."""
+        return {name: (a.counters, a.time_base) for name, a in self._assemblers.items()}
+
+    async def run(self) -> None:
+        """See `drivers.base.Driver.run`; also ends at the end of a recording that is played once."""
+        try:
+            await keep_up(self.link, self._port, self._attempt)
+        finally:
+            self.link.stop()
+            for assembler in self._assemblers.values():
+                assembler.flush()
+
+    async def _attempt(self) -> Attempt | None:
+        while True:
+            recording = await self._open()
+            self.link.up()
+            before = self._frames
+            ending = await self._play(recording)
+            played = self._frames > before
+            if self._at_end == "stop":
+                self.link.end(ending.reason)
+                return None
+            if self._at_end == "wait" or not ending.readable or not played:
+                return Attempt(present=True, useful=played, reason=ending.reason)
+
+    @property
+    def _frames(self) -> int:
+        return sum(a.counters.frames_received for a in self._assemblers.values())
+
+    async def _open(self) -> Recording:
+        self._reader.close()  # it may have been told to stop when it had just ended
+        try:
+            return await in_thread(self._open_file, undo=self._close, abort=self._reader.abort)
+        except RecordingError as error:
+            self.counters.open_failures += 1
+            raise CannotOpenError(f"{error}") from error
+        except Exception as error:
+            self.counters.open_failures += 1
+            raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
+
+    def _open_file(self) -> Recording:
+        if not self._path.exists():
+            raise RecordingError(f"there is no file {self._path}; correct the bus's file, or record it first")
+        if self._at_end == "wait":
+            return GrowingCandump(self._path, self._sort, self._place)
+        if kind_of(self._path) == "table":
+            return SampleTable(self._path, self._port.streams, self._first_index, self._limits, self._reader)
+        return CanLog(self._path, self._sort)
+
+    def _close(self, recording: Recording) -> None:
+        try:
+            recording.close()
+        except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
+            logger.info("closing %s: %s", self.link.name, words(error))
+
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+        chosen = self._channel.of(messages)
+        batch = batch_of([messages[k] for k in chosen], t_ns[chosen].tolist())
+        found = self._sorter.sort(batch, 0)
+        found.note("frames_other_channel", len(messages) - len(chosen))
+        return found
+
+    async def _play(self, recording: Recording) -> Ending:
+        """Play until there is no more; returns why."""
+        if self._at_end != "wait":
+            self._begin_anew(recording)
+        try:
+            while True:
+                piece = await in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
+                if piece is None:
+                    self.counters.passes += 1
+                    self._to_its_end = True
+                    return Ending(self._channel.missed or END_OF_FILE, readable=True)
+                if piece.notes.get("frames_malformed"):
+                    self._say_once(
+                        f"what is no frame in {self._path} is counted (frames_malformed) and left out, first "
+                        f"{recording.first_malformed}"
+                    )
+                await self._take(piece)
+        except RecordingError as error:
+            if self._at_end != "wait":
+                self.counters.passes_damaged += 1
+                self._say_once(f"{error}")
+            return Ending(f"{error}", readable=True)
+        except Exception as error:
+            logger.exception("the reader of %s failed", self.link.name)
+            self.counters.reader_failures += 1
+            return Ending(f"its reader failed: {words(error)}", readable=False)
+        finally:
+            await in_thread(self._close, recording)
+
+    def _say_once(self, what: str) -> None:
+        if what not in self._said:
+            self._said.add(what)
+            logger.warning("replayed bus %r: %s", self.name, what)
+
+    def _begin_anew(self, recording: Recording) -> None:
+        """The recording is played from its beginning: nothing is missing between this and what was before."""
+        if not (isinstance(recording, SampleTable) and recording.seamless and self._to_its_end):
+            for assembler in self._assemblers.values():
+                assembler.begin_afresh()
+        self._to_its_end = False
+        self._shift_ns = None
+
+    async def _take(self, piece: Sorted) -> None:
+        clock = self._port.clock
+        for name, count in piece.notes.items():
+            setattr(self.counters, name, getattr(self.counters, name) + count)
+        for name, count in piece.unknown.items():
+            if name in self.counters.unknown_ids or len(self.counters.unknown_ids) < REMEMBERED_IDS:
+                self.counters.unknown_ids[name] = self.counters.unknown_ids.get(name, 0) + count
+        for stream, (count, _) in piece.wrong_length.items():
+            self._assemblers[stream].counters.frames_wrong_length += count
+        if piece.frames:
+            await self._place_frames(piece)
+        elif self._at_end == "wait":
+            await clock.sleep_ns(POLL_NS)
+        if self._paced:
+            for assembler in self._assemblers.values():
+                assembler.tick(clock.monotonic_ns())
+
+    async def _place_frames(self, piece: Sorted) -> None:
+        """Deliver a piece, when its last frame is due."""
+        clock = self._port.clock
+        now_ns = clock.monotonic_ns()
+        first_ns = min(int(frames.arrival_ns[0]) for frames in piece.frames)
+        last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames)
+        if (
+            self._shift_ns is None
+            or (self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS)
+            or self._leaps(first_ns + self._shift_ns)
+        ):
+            self._shift_ns = self._next_ns(now_ns) - first_ns
+        due_ns = last_ns + self._shift_ns
+        floor_ns, self._newest_ns = self._newest_ns or 0, max(self._newest_ns or 0, due_ns)
+        if self._paced and due_ns > now_ns:
+            await clock.sleep_ns(due_ns - now_ns)
+        else:
+            await asyncio.sleep(0)
+        for frames in piece.frames:
+            decoded = frames.decoded
+            # Logs of several interfaces may step back a little; an arrival never does.
+            arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns + self._shift_ns, floor_ns))
+            self._assemblers[frames.stream].accept(
+                decoded.counter, decoded.samples, decoded.intact, arrival_ns
+            )
+
+    def _leaps(self, due_ns: int) -> bool:
+        """Whether the recorded time has leapt, and what comes now is to be played at once."""
+        if self._at_end == "wait" or self._newest_ns is None:
+            return False
+        leap_ns = due_ns - self._newest_ns
+        if -STEP_BACK_NS <= leap_ns <= LEAP_NS:
+            return False
+        self.counters.time_leaps += 1
+        self._say_once(
+            "its time stamps leap back, or ahead by more than an hour; such leaps are counted (time_leaps) "
+            "and it is played on without a pause"
+        )
+        return True
+
+    def _next_ns(self, now_ns: int) -> int:
+        """When the first frame of what is played now comes: never before what was played has ended."""
+        if self._newest_ns is None:
+            return now_ns
+        if self._at_end == "wait":
+            return max(now_ns, self._newest_ns)
+        period_ns = min(_frame_ns(spec) for spec in self._port.streams)
+        next_ns = self._newest_ns + period_ns
+        # It takes a moment to begin again, which is no part of the recording.
+        return next_ns if now_ns - next_ns < REMAP_NS else now_ns
+
+
+def _frame_ns(spec: StreamSpec[FrameLayout | ColumnLayout]) -> int:
+    """Nominal time from frame to frame."""
+    samples = spec.layout.samples_per_frame if isinstance(spec.layout, FrameLayout) else 1
+    return round(samples * NS_PER_S / spec.rate_hz)
+
+
+def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:
+    layout = spec.layout
+    bits: int | None
+    if isinstance(layout, ColumnLayout):
+        bits, per_frame, counts = TABLE_COUNTER_BITS, 1, 1
+    else:
+        bits, per_frame, counts = layout.counter_bits, layout.samples_per_frame, layout.counts_per_frame
+    return StreamAssembler(
+        spec.name,
+        spec.rate_hz,
+        counter_bits=bits,
+        samples_per_frame=per_frame,
+        counts_per_frame=counts,
+        deliver=port.deliver,
+        reorder_window_ns=spec.reorder_window_ns,
+        tell=port.tell,
+    )

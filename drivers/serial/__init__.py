@@ -1,0 +1,1 @@
+"""Serial ports with binary frames or lines of text."""

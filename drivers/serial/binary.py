@@ -1,0 +1,268 @@
+"""Binary frames on a serial port: COBS with delimiters, and sync words.
+
+The content of a frame, its *body*, is
+
+    [stream id, 1 byte]  payload  [CRC-16, 2 bytes]
+
+with the id only where several streams share a port, and the payload as a `FrameLayout` packs it.
+"""
+
+from __future__ import annotations
+
+import binascii
+from abc import ABC, abstractmethod
+from itertools import repeat
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+from cobs import cobs
+
+from drivers.frames import LayoutError
+from drivers.serial.framing import DelimitedFraming, Found, Frames
+from drivers.serial.kernels import CRC_BYTES, Step, crcs_match, gather, hunt, in_units, unstuff
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from drivers.frames import FrameLayout
+    from drivers.serial.framing import Pieces
+    from drivers.serial.kernels import Hunted
+
+CrcName = Literal["none", "ibm-3740", "xmodem"]
+CrcOrder = Literal["big", "little"]
+
+CRC_INITIAL: Mapping[CrcName, int] = {"ibm-3740": 0xFFFF, "xmodem": 0x0000}
+"""Both are the polynomial 0x1021, most significant bit first (CCITT); they begin differently."""
+
+NO_CRC = -1
+DELIMITER = b"\0"
+
+
+class Bodies(NamedTuple):
+    """Where the bodies of frames are.
+
+    Attributes:
+        buffer: uint8, with all of them in it.
+        starts: int64 ``[n]``, where each begins in the buffer.
+        lengths: int64 ``[n]``, bytes of each; 0 or less for what is no frame.
+        intact: bool ``[n]``, whether its CRC matches.
+        ends: int64 ``[n]``, see `Frames`.
+    """
+
+    buffer: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    intact: NDArray[np.bool_]
+    ends: NDArray[np.int64]
+
+
+class BodyCodec:
+    """The bodies of the binary frames on one port: id, payload and CRC.
+
+    Args:
+        layouts: by stream; where ``ids`` is set, their ``frame_id`` is the byte that names the stream.
+        ids: whether each body begins with that byte.
+        crc: which CRC-16 ends each body, over all that is before it.
+        crc_order: its byte order.
+
+    Raises:
+        LayoutError: there is more than one stream and no id to tell them apart, two have the same id, or an
+            id is no byte.
+    """
+
+    def __init__(
+        self,
+        layouts: Mapping[str, FrameLayout],
+        *,
+        ids: bool = False,
+        crc: CrcName = "ibm-3740",
+        crc_order: CrcOrder = "big",
+    ) -> None:
+        if not ids and len(layouts) != 1:
+            raise LayoutError(
+                f"{len(layouts)} streams share a serial port without stream ids; set stream_ids, or keep one"
+            )
+        self._ids = ids
+        self._initial = CRC_INITIAL.get(crc, NO_CRC)
+        self._swap = crc_order == "little"
+        self._head = 1 if ids else 0
+        self._tail = CRC_BYTES if self.checked else 0
+        self._layouts = dict(layouts)
+        self._by_id: dict[int, str] = {}
+        for name, layout in layouts.items():
+            if ids and not 0 <= layout.frame_id <= 0xFF:
+                raise LayoutError(f"stream {name!r}: id {layout.frame_id} is no byte; take 0 to 255")
+            other = self._by_id.setdefault(layout.frame_id if ids else 0, name)
+            if other != name:
+                raise LayoutError(f"streams {other!r} and {name!r} share id {layout.frame_id}")
+        self.longest = max(self.length(name) for name in layouts)
+        self._by_first_byte = np.full(256, -1 if ids else self.longest, np.int64)
+        for key, name in self._by_id.items():
+            self._by_first_byte[key] = self.length(name)
+
+    @property
+    def checked(self) -> bool:
+        """Whether bodies end with a CRC."""
+        return self._initial != NO_CRC
+
+    def length(self, stream: str) -> int:
+        """Bytes of a body of that stream."""
+        return self._head + self._layouts[stream].length + self._tail
+
+    def intact(
+        self, buffer: NDArray[np.uint8], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Whether the CRC of each body matches, bool ``[n]``; True if there is none. See `Bodies`."""
+        if not self.checked:
+            return np.ones(len(starts), np.bool_)
+        return crcs_match(buffer, starts, lengths, self._initial, self._swap)
+
+    def hunt(self, buffer: NDArray[np.uint8], word: NDArray[np.uint8], step: Step) -> Hunted:
+        """The bodies behind sync words; see `drivers.serial.kernels.hunt`."""
+        limits = min(map(self.length, self._layouts)), self.longest
+        return hunt(buffer, word, self._by_first_byte, limits, self._initial, self._swap, step)
+
+    def encode(
+        self,
+        stream: str,
+        first_index: NDArray[np.int64],
+        samples: NDArray[np.float64] | NDArray[np.float32],
+        *,
+        clip: bool = False,
+    ) -> list[bytes]:
+        """The bodies of frames; see `drivers.serial.framing.Framing.encode`."""
+        layout = self._layouts[stream]
+        head = bytes([layout.frame_id]) if self._ids else b""
+        bodies = [head + payload.tobytes() for payload in layout.encode(first_index, samples, clip=clip)]
+        if not self.checked:
+            return bodies
+        order: CrcOrder = "little" if self._swap else "big"
+        crcs = map(binascii.crc_hqx, bodies, repeat(self._initial))
+        return [body + crc.to_bytes(CRC_BYTES, order) for body, crc in zip(bodies, crcs, strict=True)]
+
+    def sort(self, bodies: Bodies, found: Found) -> NDArray[np.bool_]:
+        """Decode bodies into ``found``, by stream.
+
+        Args:
+            bodies: as they came.
+            found: where to put frames, unknown ids and wrong lengths.
+
+        Returns:
+            bool ``[n]``, False for bodies that are no frame at all: neither length nor CRC speak for them.
+        """
+        buffer, starts, lengths, intact, ends = bodies
+        sound = intact & (lengths > 0) if self.checked else np.zeros(len(ends), np.bool_)
+        ids = np.where(lengths > 0, buffer[starts], -1) if self._ids else np.zeros(len(ends), np.int64)
+        strays = np.ones(len(ends), np.bool_)
+        for key, name in self._by_id.items():
+            layout = self._layouts[name]
+            mine = (ids == key) & (lengths == self.length(name))
+            if not mine.any():
+                continue
+            strays &= ~mine
+            decoded = layout.decode(gather(buffer, starts[mine] + self._head, layout.length), in_units)
+            found.frames[name] = Frames(decoded._replace(intact=decoded.intact & intact[mine]), ends[mine])
+        for k in np.flatnonzero(strays & sound).tolist():
+            owner = self._by_id.get(int(ids[k]))
+            if owner is None:
+                found.note_unknown(f"{ids[k]:#04x}")
+            else:
+                found.note_wrong_length(owner, int(lengths[k]))
+        return ~strays | sound
+
+
+class _BinaryFraming(ABC):
+    """What wraps bodies for the wire.
+
+    Args:
+        codec: what the bodies are.
+    """
+
+    def __init__(self, codec: BodyCodec) -> None:
+        self._codec = codec
+
+    @abstractmethod
+    def _wrap(self, body: bytes) -> bytes:
+        """All that goes over the wire for a body."""
+
+    def encode(
+        self,
+        stream: str,
+        first_index: NDArray[np.int64],
+        samples: NDArray[np.float64] | NDArray[np.float32],
+        *,
+        clip: bool = False,
+    ) -> list[bytes]:
+        """See `Framing.encode`."""
+        bodies = self._codec.encode(stream, first_index, samples, clip=clip)
+        return [self._wrap(body) for body in bodies]
+
+
+class CobsFraming(_BinaryFraming, DelimitedFraming):
+    """Bodies encoded by Consistent Overhead Byte Stuffing, each followed by a zero byte.
+
+    Garbage costs only the frames it touches: the next zero byte is a fresh start, wherever it is.
+    (S. Cheshire and M. Baker, Consistent Overhead Byte Stuffing, IEEE/ACM Trans. Networking 7, 1999.)
+
+    Args:
+        codec: what the bodies are.
+    """
+
+    def __init__(self, codec: BodyCodec) -> None:
+        _BinaryFraming.__init__(self, codec)
+        DelimitedFraming.__init__(self, DELIMITER, codec.longest + -(-codec.longest // 254) + 1)
+
+    def _wrap(self, body: bytes) -> bytes:
+        stuffed: bytes = cobs.encode(body)
+        return stuffed + DELIMITER
+
+    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
+        buffer, starts, stops, ends = pieces
+        lengths = unstuff(buffer, starts, stops)
+        intact = self._codec.intact(buffer, starts + 1, lengths)
+        return self._codec.sort(Bodies(buffer, starts + 1, lengths, intact, ends), found)
+
+
+class SyncFraming(_BinaryFraming):
+    """Bodies of fixed length, each behind a sync word, with nothing between them.
+
+    The sync word may turn up inside a frame or in garbage, so a frame counts only if its CRC matches, or,
+    where there is none, once the next sync word stands right behind it. After garbage every sync word is
+    tried in turn: one that was none delays what follows by a frame at most, and costs nothing. What stands
+    in the place of a frame, behind a sync word, and is none, is a corrupt frame.
+
+    Args:
+        codec: what the bodies are.
+        sync: the sync word.
+    """
+
+    def __init__(self, codec: BodyCodec, sync: bytes) -> None:
+        if not sync:
+            raise LayoutError("the sync word is empty; give the bytes that each frame begins with")
+        super().__init__(codec)
+        self._sync = np.frombuffer(sync, np.uint8).copy()
+        self.restart()
+
+    def restart(self) -> None:
+        """See `Framing.restart`."""
+        self._rest = np.empty(0, np.uint8)
+        self._step = Step()
+
+    def _wrap(self, body: bytes) -> bytes:
+        return self._sync.tobytes() + body
+
+    def cut(self, data: bytes) -> Found:
+        """See `Framing.cut`."""
+        kept = len(self._rest)
+        buffer = np.concatenate([self._rest, np.frombuffer(data, np.uint8)])
+        hunted = self._codec.hunt(buffer, self._sync, self._step)
+        found = Found(garbage_bytes=hunted.garbage_bytes, malformed=hunted.malformed, resyncs=hunted.resyncs)
+        taken, tried, *state = hunted.step
+        start = min(taken, tried)
+        self._rest, self._step = buffer[start:].copy(), Step(taken - start, tried - start, *state)
+        if len(hunted.ends):
+            lengths = hunted.ends - hunted.starts
+            self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, hunted.ends - kept), found)
+        return found

@@ -1,0 +1,284 @@
+"""The driver of serial ports: framed binary samples, or lines of text, from a device that sends by itself.
+
+pyserial opens the port and sets it up; the bytes are read from its file descriptor by a thread of ours, cut
+into frames and decoded by another, and handed to the event loop in batches. When the event loop cannot keep
+up the threads wait: bytes then pile up in the kernel, and what overflows there shows as a gap in the
+devices' counters. A port that goes away, because it was unplugged, is opened again by its path.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import termios
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import serial
+
+from daqsvc.acquisition.assembler import StreamAssembler
+from daqsvc.acquisition.supervisor import Link
+from drivers.base import BusCounters, BusPort
+from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
+from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
+from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming, LineLayout
+from drivers.serial.reader import SHUTDOWN_S, Batch, SerialReader, close_port
+from drivers.tty import Character, CharacterFormat, why_not_open
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from daqsvc.acquisition.assembler import StreamCounters
+    from daqsvc.acquisition.timebase import TimeBaseState
+    from drivers.base import StreamSpec
+    from drivers.frames import FrameLayout
+    from drivers.serial.framing import Framing
+
+logger = logging.getLogger(__name__)
+
+REMEMBERED_IDS = 64
+
+_PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
+
+
+@dataclass(slots=True)
+class SerialCounters(BusCounters):
+    """See `BusCounters`; besides what only a serial port has.
+
+    Attributes:
+        bytes_received: bytes read.
+        bytes_garbage: of those, in no frame.
+        frames_malformed: pieces of the byte stream that should have been a frame.
+        resyncs: how often a frame was found again after something malformed.
+        stalls: how often the reader had to wait because the event loop was behind.
+        overruns: bytes that the UART or the kernel's buffer lost, as far as the UART's driver tells.
+        framing_errors: characters without a stop bit, likewise.
+        parity_errors: characters of wrong parity, likewise.
+        breaks: break conditions, likewise.
+    """
+
+    bytes_received: int = 0
+    bytes_garbage: int = 0
+    frames_malformed: int = 0
+    resyncs: int = 0
+    stalls: int = 0
+    overruns: int = 0
+    framing_errors: int = 0
+    parity_errors: int = 0
+    breaks: int = 0
+
+
+class SerialDriver:
+    """Reads one serial port.
+
+    Options of the bus, all but ``port`` and ``framing`` with a default: ``port`` (path of the device),
+    ``baud``, ``data_bits``, ``parity``, ``stop_bits``, ``flow_control``, ``low_latency``; ``framing``, and
+    what that framing needs: ``crc``, ``crc_order`` and ``stream_ids`` for ``"cobs"`` and ``"sync"``, the
+    ``sync_word`` in hexadecimal, ``checksum`` and ``delimiter`` for ``"lines"``. The layouts of its streams
+    are `FrameLayout`, or `LineLayout` for lines.
+
+    Args:
+        port: settings, streams, clock and where to deliver.
+
+    Raises:
+        LayoutError: the streams do not fit the framing.
+    """
+
+    def __init__(self, port: BusPort) -> None:
+        self.name = port.name
+        self.link = Link(f"serial port {port.name!r} ({port.options['port']})")
+        self.counters = SerialCounters()
+        self._port = port
+        self._framing = framing_of(port.options, port.streams)
+        self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
+        self._said: set[str] = set()
+        asked = Character(port.options.get("data_bits", 8), port.options.get("parity", "none"))
+        self._characters = CharacterFormat(self.link.name, asked)
+
+    @property
+    def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
+        """See `drivers.base.Driver.streams`."""
+        return {name: (a.counters, a.time_base) for name, a in self._assemblers.items()}
+
+    async def run(self) -> None:
+        """See `drivers.base.Driver.run`."""
+        try:
+            await in_thread(_warm, self._port.options, self._port.streams, patience_s=SHUTDOWN_S)
+            await keep_up(self.link, self._port, self._attempt)
+        finally:
+            self.link.stop()
+            for assembler in self._assemblers.values():
+                assembler.flush()
+
+    async def _attempt(self) -> Attempt:
+        device = await self._open()
+        self.link.up()
+        before = self._frames
+        reason = await self._receive(device)
+        return Attempt(present=True, useful=self._frames > before, reason=reason)
+
+    @property
+    def _frames(self) -> int:
+        return sum(a.counters.frames_received for a in self._assemblers.values())
+
+    async def _open(self) -> serial.Serial:
+        try:
+            return await in_thread(
+                _open_port, self._port.options, self._characters, undo=close_port, patience_s=SHUTDOWN_S
+            )
+        except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
+            self.counters.open_failures += 1
+            why = why_not_open(error, self._port.options["port"], "port")
+            raise CannotOpenError(f"it cannot be opened: {why}") from error
+
+    async def _receive(self, device: serial.Serial) -> str:
+        """Read until the link fails; returns why."""
+        self._framing.restart()
+        loop = asyncio.get_running_loop()
+        reader = SerialReader(self.link.name, device, self._framing, self, self._port.clock, loop)
+        reader.start()
+        try:
+            return await ended(reader.ended, reader, reader.cutter)
+        finally:
+            # Cancelled while the port is being closed: that takes its time all the same.
+            try:
+                await in_thread(reader.close, patience_s=2 * SHUTDOWN_S)
+            finally:
+                reader.finish()
+
+    def take(self, batch: Batch) -> None:
+        """Take in what the reader thread has found; runs on the event loop."""
+        found = batch.found
+        counters = self.counters
+        counters.bytes_received += batch.bytes_read
+        counters.bytes_garbage += found.garbage_bytes
+        counters.frames_malformed += found.malformed
+        counters.resyncs += found.resyncs
+        if found.malformed:
+            self._say_once(
+                "malformed",
+                "%s carries bytes that are no frame; they are counted and left out. If it is all of them, "
+                "compare baud, parity, framing and checksum with the device's",
+                self.link.name,
+            )
+        for name, count in found.unknown.items():
+            self._take_unknown(name, count)
+        for stream, (count, length) in found.wrong_length.items():
+            self._assemblers[stream].counters.frames_wrong_length += count
+            self._say_once(
+                f"length of {stream}",
+                "%s: a frame of stream %r has %d bytes, id and CRC included, and its layout another length; "
+                "such frames are counted and left out",
+                self.link.name,
+                stream,
+                length,
+            )
+        for stream, frames in found.frames.items():
+            decoded = frames.decoded
+            with sparing_others(self.link, stream, counters):
+                self._assemblers[stream].accept(
+                    decoded.counter, decoded.samples, decoded.intact, batch.arrivals_ns[stream]
+                )
+
+    def tick(self, drained_ns: int) -> None:
+        """Nothing more is under way that was sent before ``drained_ns``; runs on the event loop."""
+        for name, assembler in self._assemblers.items():
+            with sparing_others(self.link, name, self.counters):
+                assembler.tick(drained_ns)
+
+    def note(self, counter: str, count: int = 1) -> None:
+        """Add to one of the bus's counters; runs on the event loop."""
+        setattr(self.counters, counter, getattr(self.counters, counter) + count)
+
+    def _take_unknown(self, name: str, count: int) -> None:
+        self.counters.frames_unknown += count
+        ids = self.counters.unknown_ids
+        if name in ids or len(ids) < REMEMBERED_IDS:
+            ids[name] = ids.get(name, 0) + count
+        self._say_once(
+            "unknown id",
+            "%s carries frames that no stream of the machine file has, id %s the first of them; "
+            "they are counted by id",
+            self.link.name,
+            name,
+        )
+
+    def _say_once(self, key: str, message: str, *arguments: object) -> None:
+        if key not in self._said:
+            self._said.add(key)
+            logger.warning(message, *arguments)
+
+
+def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> Framing:
+    """The framing that a bus's options name, for its streams.
+
+    Raises:
+        LayoutError: the streams do not fit it.
+    """
+    if options["framing"] == "lines":
+        lines: dict[str, LineLayout] = {s.name: s.layout for s in streams}
+        rates_hz = {s.name: s.rate_hz for s in streams}
+        delimiter = options.get("delimiter", "\n").encode("ascii")
+        windows_ns = {s.name: s.reorder_window_ns for s in streams}
+        return LineFraming(lines, rates_hz, options.get("checksum", "none"), delimiter, windows_ns)
+    layouts: dict[str, FrameLayout] = {s.name: s.layout for s in streams}
+    codec = BodyCodec(
+        layouts,
+        ids=options.get("stream_ids", False),
+        crc=options.get("crc", "ibm-3740"),
+        crc_order=options.get("crc_order", "big"),
+    )
+    if options["framing"] == "sync":
+        return SyncFraming(codec, bytes.fromhex(options["sync_word"]))
+    return CobsFraming(codec)
+
+
+def _warm(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> None:
+    """Have the loops that the streams need compiled, before their data come in."""
+    framing = framing_of(options, streams)
+    for spec in streams:
+        shape = (3, spec.layout.samples_per_frame, len(spec.layout.channels))
+        frames = framing.encode(spec.name, np.zeros(3, np.int64), np.zeros(shape), clip=True)
+        framing.cut(b"".join(frames))
+
+
+def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
+    layout: FrameLayout | LineLayout = spec.layout
+    timed = isinstance(layout, LineLayout) and layout.time is not None
+    return StreamAssembler(
+        spec.name,
+        spec.rate_hz,
+        counter_bits=TIME_COUNTER_BITS if timed else layout.counter_bits,
+        samples_per_frame=layout.samples_per_frame,
+        counts_per_frame=layout.counts_per_frame,
+        deliver=port.deliver,
+        reorder_window_ns=spec.reorder_window_ns,
+        stamped=timed,
+        tell=port.tell,
+    )
+
+
+def _open_port(options: Mapping[str, Any], characters: CharacterFormat) -> serial.Serial:
+    flow = options.get("flow_control", "none")
+    character = characters.on(options["port"])
+    device = serial.Serial(
+        options["port"],
+        baudrate=options.get("baud", 115_200),
+        bytesize=character.data_bits,
+        parity=_PARITY[character.parity],
+        stopbits=options.get("stop_bits", 1),
+        rtscts=flow == "rts-cts",
+        xonxoff=flow == "xon-xoff",
+        timeout=0,
+        write_timeout=0,
+        # VMIN = 1: a read that finds nothing then fails with EAGAIN, and nothing at all means hung up.
+        inter_byte_timeout=0,
+        exclusive=True,
+    )
+    if options.get("low_latency", False):
+        try:
+            device.set_low_latency_mode(True)
+        except (OSError, ValueError) as error:
+            logger.info("%s has no low-latency mode: %s", options["port"], error)
+    return device

@@ -1,0 +1,307 @@
+"""Compiled loops over lines of text: checksums, numbers, and counts from time stamps.
+
+A number is what Python's `float` and `int` make of it, to the last bit. Where that takes more than the
+arithmetic of doubles (more than 15 digits or so, an exponent beyond 22), the line is left to them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from drivers.serial.kernels import crc16
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Bytes = NDArray[np.uint8]
+    Places = NDArray[np.int64]
+    Values = NDArray[np.float64]
+
+OTHER, BAD, READ, HARD = range(4)
+"""A line of another stream; no line; numbers that have been read; numbers to be read by Python."""
+
+ZERO, MINUS = b"0-"
+STAR, DOLLAR, EXCLAMATION = b"*$!"
+EXACT = 2**53
+"""Integers up to this are doubles."""
+_POWERS = np.array([10.0**k for k in range(23)])
+"""All powers of ten that are doubles: one multiplication or division by them rounds correctly.
+
+(W. Clinger, How to Read Floating Point Numbers Accurately, PLDI 1990.)
+"""
+_LARGEST = 10**17
+_COUNTS = 2.0**32
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hex_value(byte: int) -> int:
+    """Value of a hexadecimal digit; far below zero if it is none."""
+    if ZERO <= byte < ZERO + 10:
+        return byte - ZERO
+    letter = (byte | 0x20) - 0x61
+    return letter + 10 if 0 <= letter < 6 else -0x10000000
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def check_lines(
+    buffer: Bytes, starts: Places, stops: Places, digits: int
+) -> tuple[Places, NDArray[np.bool_]]:
+    """Take the checksums off lines, and check them.
+
+    Args:
+        buffer: uint8, with the lines in it.
+        starts: int64 ``[n]``, where each begins.
+        stops: int64 ``[n]``, one past its last byte.
+        digits: of the checksum in hexadecimal, behind a star: 2 for all bytes combined by XOR, 4 for their
+            CRC-16/IBM-3740. An opening ``$`` or ``!`` does not count.
+
+    Returns:
+        int64 ``[n]``, where the text of each ends, at its start if there is no star; bool ``[n]``, whether
+        its checksum matches.
+    """
+    ends = starts.copy()
+    intact = np.zeros(len(starts), np.bool_)
+    for k in range(len(starts)):
+        star = stops[k] - 1
+        while star >= starts[k] and buffer[star] != STAR:
+            star -= 1
+        if star < starts[k]:
+            continue
+        ends[k] = star
+        start = starts[k]
+        if buffer[start] == DOLLAR or buffer[start] == EXCLAMATION:
+            start += 1
+        right = 0
+        if digits == 4:
+            right = crc16(buffer, start, star, 0xFFFF)
+        else:
+            for at in range(start, star):
+                right ^= buffer[at]
+        sent = 0
+        for at in range(star + 1, stops[k]):
+            sent = sent * 16 + _hex_value(buffer[at])
+        intact[k] = stops[k] - star - 1 == digits and sent == right
+    return ends, intact
+
+
+START, SIGNED, POINT, EXPONENT, EXPONENT_SIGNED, WRONG = range(6)
+WHOLE, AFTER_WHOLE, FRACTION, POWER, AFTER = range(6, 11)
+"""How far a number has been read; only with the last five it may end."""
+_DIGIT, _SIGN, _POINT, _E, _SPACE, _ALIEN = range(6)
+
+
+def _classes() -> NDArray[np.uint8]:
+    """What each byte is to a number, uint8 ``[256]``."""
+    classes = np.full(256, _ALIEN, np.uint8)
+    for kind, bytes_ in (
+        (_DIGIT, b"0123456789"),
+        (_SIGN, b"+-"),
+        (_POINT, b"."),
+        (_E, b"eE"),
+        (_SPACE, b" "),
+    ):
+        classes[list(bytes_)] = kind
+    return classes
+
+
+def _grammar() -> NDArray[np.uint8]:
+    """What follows at each byte of a number, uint8 ``[state, kind of byte]``."""
+    follows = np.full((AFTER + 1, _ALIEN + 1), WRONG, np.uint8)
+    for state, kind, then in (
+        (START, _SPACE, START), (START, _SIGN, SIGNED), (START, _DIGIT, WHOLE), (START, _POINT, POINT),
+        (SIGNED, _DIGIT, WHOLE), (SIGNED, _POINT, POINT),
+        (WHOLE, _DIGIT, WHOLE), (WHOLE, _POINT, FRACTION), (WHOLE, _E, EXPONENT),
+        (WHOLE, _SPACE, AFTER_WHOLE),
+        (POINT, _DIGIT, FRACTION),
+        (FRACTION, _DIGIT, FRACTION), (FRACTION, _E, EXPONENT), (FRACTION, _SPACE, AFTER),
+        (EXPONENT, _SIGN, EXPONENT_SIGNED), (EXPONENT, _DIGIT, POWER), (EXPONENT_SIGNED, _DIGIT, POWER),
+        (POWER, _DIGIT, POWER), (POWER, _SPACE, AFTER),
+        (AFTER_WHOLE, _SPACE, AFTER_WHOLE), (AFTER, _SPACE, AFTER),
+    ):  # fmt: skip
+        follows[state, kind] = then
+    return follows
+
+
+_CLASSES = _classes()
+_GRAMMAR = _grammar()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _number(state: int, mantissa: int, exponent: int) -> tuple[float, int]:
+    """The number ``mantissa * 10^exponent``; and `BAD`, `READ` or `HARD`."""
+    if state <= WRONG:
+        return 0.0, BAD
+    if abs(mantissa) > EXACT or abs(exponent) >= len(_POWERS):
+        return 0.0, HARD
+    if exponent < 0:
+        return mantissa / _POWERS[-exponent], READ
+    return mantissa * _POWERS[exponent], READ
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _text_begins(buffer: Bytes, start: int, stop: int, prefix: Bytes, separator: int) -> int:
+    """Where the fields behind the prefix begin; -1 if it is another one, or the first if there is none."""
+    if not len(prefix):
+        return start
+    end = start + len(prefix)
+    if end > stop or (end < stop and buffer[end] != separator):
+        return -1
+    for k in range(len(prefix)):
+        if buffer[start + k] != prefix[k]:
+            return -1
+    return end + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _line(
+    buffer: Bytes, start: int, stop: int, separator: int, columns: int, picks: Places, values: Values
+) -> tuple[int, bool]:
+    """Read the picked fields of one line.
+
+    Returns:
+        `BAD`, `READ` or `HARD`; and whether its first picked field is an integer.
+    """
+    line, counts, column = READ, False, 0
+    state, negative, mantissa, exponent, power, down = START, False, 0, 0, 0, False
+    for at in range(start, stop + 1):
+        if at < stop and buffer[at] != separator:
+            byte = buffer[at]
+            kind = _CLASSES[byte]
+            state = _GRAMMAR[state, kind]
+            if kind != _DIGIT:
+                negative |= byte == MINUS and state == SIGNED
+                down |= byte == MINUS and state == EXPONENT_SIGNED
+            elif state == POWER:
+                power = min(power * 10 + byte - ZERO, _LARGEST)
+            elif mantissa < _LARGEST:
+                mantissa = mantissa * 10 + byte - ZERO
+                exponent -= state == FRACTION
+            continue
+        for k in range(len(picks)):
+            if picks[k] == column:
+                value, found = _number(state, mantissa, exponent - power if down else exponent + power)
+                if found == BAD:
+                    return BAD, False
+                values[k] = -value if negative else value
+                line = max(line, found)
+                counts |= k == 0 and WHOLE <= state <= AFTER_WHOLE
+        column += 1
+        state, negative, mantissa, exponent, power, down = START, False, 0, 0, 0, False
+    return (line if column == columns else BAD), counts
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def read_lines(
+    buffer: Bytes,
+    starts: Places,
+    stops: Places,
+    prefix: Bytes,
+    separator: int,
+    columns: int,
+    picks: Places,
+    counted: bool,  # noqa: FBT001 - numba
+) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
+    """Read the numbers of the lines of one stream.
+
+    Args:
+        buffer: uint8, with the lines in it.
+        starts: int64 ``[n]``, where each begins.
+        stops: int64 ``[n]``, one past its last byte.
+        prefix: uint8, the first field of each line of the stream; empty if it has none.
+        separator: the byte between fields.
+        columns: how many fields there are, without the prefix.
+        picks: int64 ``[p]``, which of them are read.
+        counted: whether the first of those must be an integer.
+
+    Returns:
+        int8 ``[n]``, `OTHER`, `BAD`, `READ` or `HARD`; float64 ``[n, p]``, the numbers where it is `READ`.
+    """
+    states = np.empty(len(starts), np.int8)
+    values = np.zeros((len(starts), len(picks)), np.float64)
+    for k in range(len(starts)):
+        start = _text_begins(buffer, starts[k], stops[k], prefix, separator)
+        if start < 0:
+            states[k] = OTHER
+            continue
+        state, integer = _line(buffer, start, stops[k], separator, columns, picks, values[k])
+        states[k] = BAD if counted and not integer else state
+    return states, values
+
+
+COUNT, STAMP, DUE, GRAIN, SHARED = range(5)
+"""What is known of a device's time stamps: count, stamp and instant of its newest sample in s, how coarse the
+stamps are in s, and whether several samples share one."""
+KNOWN = SHARED + 1
+_SLACK = 0.6
+"""How many periods late, beside the half one, a sample must be for a shared stamp to tell of missing ones."""
+_NOT_BEFORE_STAMP = 0.5
+"""In place of `tracking`, for samples that are due before the stamp that they share with others."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _next_stamp(state: Values, time_s: float, period_s: float, tracking: float) -> None:
+    """Take in the stamp of the sample after the newest one; no earlier than that one's."""
+    passed_s = time_s - state[STAMP]
+    if passed_s == 0.0:
+        state[SHARED] = 1.0
+    else:
+        state[GRAIN] = min(state[GRAIN], passed_s)
+    # It was taken when it is due, or some samples are missing before it.
+    slack = _SLACK if state[SHARED] else 0.0
+    steps = max(np.rint((time_s - state[DUE]) / period_s - slack), 1.0)
+    state[COUNT] = (state[COUNT] + steps % _COUNTS) % _COUNTS
+    state[DUE] += steps * period_s
+    state[STAMP] = time_s
+    ahead_s = time_s - state[DUE]
+    if not state[SHARED]:
+        state[DUE] += tracking * ahead_s
+    elif ahead_s > 0.0:
+        state[DUE] += _NOT_BEFORE_STAMP * ahead_s
+    else:
+        # The samples that share a stamp were taken within its grain.
+        state[DUE] += tracking * min(ahead_s + state[GRAIN], 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_stamps(
+    times_s: Values, period_s: float, tracking: float, back_s: float, leap_s: float, states: Values
+) -> Places:
+    """Sample counts from time stamps, modulo 2^32; see `drivers.serial.lines.DeviceTime`.
+
+    Args:
+        times_s: float64 ``[n]``.
+        period_s: nominal time between samples.
+        tracking: share of a stamp's deviation by which the sampling instants are corrected.
+        back_s: how far behind the newest one the stamp of a line may be that was overtaken.
+        leap_s: how far ahead of it a stamp may be, for others to be believed to go on from there.
+        states: float64 ``[2, KNOWN]``, what is known; and what was known before the newest stamp if that is
+            far from the one before, and may be damaged. Their stamp is NaN if there is none. Changed.
+
+    Returns:
+        int64 ``[n]``.
+    """
+    counts = np.empty(len(times_s), np.int64)
+    now, before = states[0], states[1]
+    for k in range(len(times_s)):
+        time_s = times_s[k]
+        if not now[STAMP] - back_s <= time_s <= now[STAMP] + leap_s:
+            if before[STAMP] - back_s <= time_s <= before[STAMP] + leap_s:
+                now[:] = before
+                before[STAMP] = np.nan
+            elif np.isnan(before[STAMP]):
+                before[:] = now
+        else:
+            before[STAMP] = np.nan
+        if time_s >= now[STAMP]:
+            _next_stamp(now, time_s, period_s, tracking)
+            counts[k] = np.int64(now[COUNT])
+        elif time_s >= now[STAMP] - back_s:
+            earlier = max(np.rint((now[DUE] - time_s) / period_s), 1.0)
+            counts[k] = np.int64((now[COUNT] - earlier) % _COUNTS)
+        else:
+            now[:] = np.array([0.0, time_s, time_s, np.inf, 0.0])
+            counts[k] = 0
+    return counts

@@ -1,0 +1,310 @@
+"""The two threads of an open serial port.
+
+One takes bytes from the port's file descriptor and gathers them into batches. The other finds and decodes the
+frames of each batch, mostly without the interpreter's lock, and hands them to the event loop; meanwhile the
+first one reads on. When the event loop cannot keep up they wait.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import fcntl
+import logging
+import os
+import queue
+import select
+import threading
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from drivers.hand_over import HandOver
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+    import serial
+    from numpy.typing import NDArray
+
+    from daqsvc.acquisition.clock import Clock
+    from drivers.serial.framing import Found, Framing
+
+logger = logging.getLogger(__name__)
+
+POLL_MS = 50
+GATHER_NS = 5_000_000
+"""How long bytes are gathered into one batch: one turn of the event loop then serves them all."""
+
+READ_BYTES = 65_536
+BATCH_BYTES = 524_288
+BATCHES_UNDER_WAY = 16
+SHUTDOWN_S = 0.5
+LINE_ERRORS_EVERY_NS = 1_000_000_000
+TIOCGICOUNT = 0x545D
+"""Linux: counts of interrupts and errors of a UART (asm-generic/ioctls.h, struct serial_icounter_struct)."""
+
+GONE = {errno.EIO, errno.ENXIO, errno.ENODEV, errno.EBADF}
+
+
+class Batch(NamedTuple):
+    """What one batch of bytes held.
+
+    Attributes:
+        bytes_read: how many bytes it was.
+        found: the frames.
+        arrivals_ns: by stream, int64 ``[n]``, host monotonic arrival of each frame's last byte.
+    """
+
+    bytes_read: int
+    found: Found
+    arrivals_ns: dict[str, NDArray[np.int64]]
+
+
+class Taker(Protocol):
+    """Who is given what the reader finds; called on the event loop, once in a turn of it."""
+
+    def take(self, batch: Batch) -> None:
+        """Take in a batch."""
+        ...
+
+    def tick(self, drained_ns: int) -> None:
+        """Nothing more is under way that was sent before ``drained_ns``, host monotonic."""
+        ...
+
+    def note(self, counter: str, count: int = 1) -> None:
+        """Add to one of the bus's counters."""
+        ...
+
+
+class LineErrors(NamedTuple):
+    """What a UART has counted; see `SerialCounters`."""
+
+    framing_errors: int
+    overruns: int
+    parity_errors: int
+    breaks: int
+
+
+class _HungUpError(Exception):
+    """The port is gone."""
+
+
+class SerialReader(threading.Thread):
+    """Reads one open port until told to stop or the port fails; `ended` then holds the reason.
+
+    It brings the thread that cuts what it has read. Whatever the event loop is told goes through that one, so
+    it is told in order.
+
+    Args:
+        name: what a person calls the port.
+        device: the open port, in non-blocking mode.
+        framing: cuts what is read into frames; used by the cutting thread alone.
+        taker: who is given the frames.
+        clock: stamps arrivals.
+        loop: where the taker lives.
+
+    Attributes:
+        ended: what becomes the reason why the reading has ended.
+        cutter: the thread that finds and decodes the frames.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: serial.Serial,
+        framing: Framing,
+        taker: Taker,
+        clock: Clock,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
+        super().__init__(name=f"reader of {name}", daemon=True)
+        self.ended: asyncio.Future[str] = loop.create_future()
+        self._device = device
+        self._fd = device.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+        self._framing = framing
+        self._taker = taker
+        self._clock = clock
+        self._hand = HandOver(loop)
+        self._stopping = threading.Event()
+        self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self.cutter = threading.Thread(target=self._cut_on, name=f"cutter of {name}", daemon=True)
+        self._line_errors = _line_errors(self._fd)
+        self._line_errors_due_ns = 0
+
+    def start(self) -> None:
+        """Start both threads."""
+        self.cutter.start()
+        super().start()
+
+    def run(self) -> None:
+        """Read until `close` is called or the port fails."""
+        try:
+            while not self._stopping.is_set():
+                self._drain()
+            reason = "it was closed"
+        except _HungUpError as error:
+            reason = f"{error}"
+        except BaseException as error:
+            logger.exception("the %s failed", self.name)
+            reason = self._failed(error)
+        self._jobs.put(partial(self._post, self._end, reason))
+        self._jobs.put(None)
+
+    def close(self) -> None:
+        """Stop reading and close the port; may take a while, as closing a port may."""
+        self._stopping.set()
+        self.join(SHUTDOWN_S)
+        if self.is_alive():
+            logger.warning("the %s hangs in the port and is left behind", self.name)
+            self._jobs.put(None)
+        self.cutter.join(SHUTDOWN_S)
+        close_port(self._device)
+
+    def finish(self) -> None:
+        """Take in at once what has been handed over; on the event loop, once it is closed."""
+        self._hand.finish()
+
+    def _cut_on(self) -> None:
+        """Do what the reading thread asks for, in turn."""
+        try:
+            while (job := self._jobs.get()) is not None:
+                job()
+        except BaseException as error:
+            logger.exception("the %s failed", self.cutter.name)
+            self._stopping.set()
+            self._post(self._end, self._failed(error))
+
+    def _failed(self, error: BaseException) -> str:
+        """Count a failure of one of the threads, and say it in words."""
+        self._post(self._taker.note, "reader_failures")
+        return f"its reader failed: {error or type(error).__name__}"
+
+    def _drain(self) -> None:
+        """Gather what comes within 5 ms, or a batch of it, and have it cut.
+
+        Raises:
+            _HungUpError: the port is gone; what was read before has been handed over.
+        """
+        asked_ns = self._clock.monotonic_ns()
+        if not self._poll.poll(POLL_MS):
+            # Asked before the port was: whatever came until then has been seen by now.
+            self._look_at_line(asked_ns)
+            self._jobs.put(partial(self._post, self._taker.tick, asked_ns))
+            return
+        chunks: list[bytes] = []
+        arrival_ns: list[int] = []
+        gathered = 0
+        failure: _HungUpError | None = None
+        # Real time, whatever the service's clock is: this is about how many turns a second cost.
+        until_ns = time.monotonic_ns() + GATHER_NS
+        while gathered < BATCH_BYTES:
+            try:
+                chunk = self._read()
+            except _HungUpError as error:
+                failure = error
+                break
+            if chunk:
+                arrival_ns.append(self._clock.monotonic_ns())
+                chunks.append(chunk)
+                gathered += len(chunk)
+            left_ms = (until_ns - time.monotonic_ns()) // 1_000_000
+            if left_ms <= 0 or not self._poll.poll(left_ms):
+                break
+        if chunks and self._may_hand_over():
+            self._jobs.put(partial(self._cut, chunks, arrival_ns))
+        if failure is not None:
+            raise failure
+        self._look_at_line(asked_ns)
+
+    def _read(self) -> bytes:
+        """What is there; nothing if another took it.
+
+        Raises:
+            _HungUpError: the port is gone.
+        """
+        try:
+            chunk = os.read(self._fd, READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return b""
+        except OSError as error:
+            why = "it is gone (unplugged, or its device was reset)" if error.errno in GONE else f"{error}"
+            raise _HungUpError(why) from error
+        if not chunk:
+            raise _HungUpError("it has hung up (unplugged, or its device was reset)")
+        return chunk
+
+    def _cut(self, chunks: list[bytes], arrival_ns: list[int]) -> None:
+        """Find and decode the frames in what was read, and hand them to the event loop."""
+        found = self._framing.cut(b"".join(chunks))
+        ends = np.cumsum([len(chunk) for chunk in chunks])
+        at = np.array(arrival_ns, np.int64)
+        # A frame is there when its last byte is.
+        arrivals = {
+            name: at[np.searchsorted(ends, frames.ends, "left").clip(0, len(at) - 1)]
+            for name, frames in found.frames.items()
+        }
+        self._post(self._take, Batch(int(ends[-1]), found, arrivals))
+
+    def _look_at_line(self, now_ns: int) -> None:
+        """Count what the UART has found wrong since the last look."""
+        if self._line_errors is None or now_ns < self._line_errors_due_ns:
+            return
+        self._line_errors_due_ns = now_ns + LINE_ERRORS_EVERY_NS
+        before, now = self._line_errors, _line_errors(self._fd)
+        if now is None:
+            return
+        self._line_errors = now
+        for name, earlier, later in zip(LineErrors._fields, before, now, strict=True):
+            if later != earlier:
+                self._post(self._taker.note, name, (later - earlier) % 2**32)
+
+    def _may_hand_over(self) -> bool:
+        """Wait until the event loop has room for another batch; False if the wait was ended by `close`."""
+        if self._under_way.acquire(blocking=False):
+            return True
+        self._post(self._taker.note, "stalls")
+        while not self._under_way.acquire(timeout=POLL_MS / 1000):
+            if self._stopping.is_set():
+                return False
+        return True
+
+    def _take(self, batch: Batch) -> None:
+        self._under_way.release()
+        self._taker.take(batch)
+
+    def _end(self, reason: str) -> None:
+        if not self.ended.done():
+            self.ended.set_result(reason)
+
+    def _post(self, call: Any, *arguments: object) -> None:
+        try:
+            self._hand.post(call, *arguments)
+        except RuntimeError:  # the event loop is closed: there is nobody left to tell
+            self._stopping.set()
+
+
+def close_port(device: serial.Serial) -> None:
+    """Close a port that may be gone; may block, so not for the event loop."""
+    try:
+        device.close()
+    except OSError as error:  # a port that is gone may fail to close in its own way
+        logger.info("closing serial port %s, which is gone: %s", device.port, error)
+
+
+def _line_errors(fd: int) -> LineErrors | None:
+    """The UART's counts; None if the port has none, as pseudo-terminals and many USB adapters."""
+    counts = array.array("i", [0] * 20)
+    try:
+        fcntl.ioctl(fd, TIOCGICOUNT, counts)
+    except OSError:
+        return None
+    # In the order of struct serial_icounter_struct: cts, dsr, rng, dcd, rx, tx, frame, overrun, ...
+    frame, overrun, parity, brk, buf_overrun = counts[6:11]
+    return LineErrors(frame, overrun + buf_overrun, parity, brk)
