@@ -299,12 +299,14 @@ async def test_with_mqtt_3_1_1_a_message_of_any_size_is_one_that_is_too_long(mos
     sender.loop_start()
     with nothing_but_counters_move(caplog):
         async with listening(outbox, mosquitto.port, "3.1.1", Desk()) as box:
-            await eventually(lambda: box.counters.connected, "connected")
+            # Retained, so that it arrives also if the box subscribes only then.
+            sender.publish(f"{COMMANDS}/acknowledge", b"{}", 1, retain=True)
+            await eventually(lambda: box.figures()["commands"]["malformed"] == 1, "it listens to commands")
             for qos in (0, 1, 1):
                 sender.publish(f"{COMMANDS}/acknowledge", b"x" * 3_000_000, qos)
-            await eventually(lambda: box.figures()["commands"]["malformed"] == 3, "they are refused")
+            await eventually(lambda: box.figures()["commands"]["malformed"] == 4, "they are refused")
             sender.publish(f"{COMMANDS}/acknowledge", b"{}", 1)
-            await eventually(lambda: box.figures()["commands"]["malformed"] == 4, "and the next one is read")
+            await eventually(lambda: box.figures()["commands"]["malformed"] == 5, "and the next one is read")
             assert box.counters.connections == 1
     sender.disconnect()
     await asyncio.to_thread(sender.loop_stop)
