@@ -62,6 +62,7 @@ class MachineAnalyst:
         rate_hz: sampling rate; None: what the recording says.
         unit: unit of the proximity probes in the recording; None: those of the sensors.
         calibration: file with the healthy machine, in place of what the machine file names.
+        read: the machine file as soon as it was read; it stays in its process.
     """
 
     machine: str
@@ -69,6 +70,27 @@ class MachineAnalyst:
     rate_hz: float | None = None
     unit: LengthUnit | None = None
     calibration: Path | None = None
+    read: list[MachineFile] = field(default_factory=list, repr=False, compare=False)
+
+    def __getstate__(self) -> tuple[Any, ...]:
+        """All but what was read: the models of its tables are made where it is read."""
+        return self.machine, self.channels, self.rate_hz, self.unit, self.calibration
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        """As it was, in another process."""
+        names = ("machine", "channels", "rate_hz", "unit", "calibration", "read")
+        for name, value in zip(names, (*state, []), strict=True):
+            object.__setattr__(self, name, value)
+
+    def machine_file(self) -> MachineFile:
+        """The machine file, read once a process.
+
+        Raises:
+            MachineFileError: it cannot be used.
+        """
+        if not self.read:
+            self.read.append(load_machine_file(Path(self.machine)))
+        return self.read[0]
 
     def check(self) -> None:
         """See whether the map fits the machine.
@@ -77,7 +99,7 @@ class MachineAnalyst:
             ValueError: it names what is no sensor or channel, or the calibration cannot be used.
             MachineFileError: the machine file cannot be used.
         """
-        machine = load_machine_file(Path(self.machine))
+        machine = self.machine_file()
         self.check_map(machine)
         synchronous = machine.pipeline.table(RotorSynchronous)
         if synchronous is not None:
@@ -110,7 +132,7 @@ class MachineAnalyst:
         self, recording: str, figures: str | None, progress: Callable[[int, int], None] | None = None
     ) -> Outcome:
         """See `daqsvc.analysis.many.Analyst.judge`."""
-        machine = load_machine_file(Path(self.machine))
+        machine = self.machine_file()
         try:
             loaded = self.load(machine, recording)
         except (RecordingError, RefusedError) as error:

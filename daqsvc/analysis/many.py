@@ -81,10 +81,10 @@ def judge_all(
         processes,
         multiprocessing.get_context("spawn"),
         initializer=_prepare,
-        initargs=(get_limits(),),
+        initargs=(analyst, get_limits()),
     )
     try:
-        jobs = [pool.submit(analyst.judge, *job) for job in zip(recordings, figures, strict=True)]
+        jobs = [pool.submit(_judge, *job) for job in zip(recordings, figures, strict=True)]
         for recording, job in zip(recordings, jobs, strict=True):
             try:
                 yield job.result()
@@ -97,8 +97,17 @@ def judge_all(
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare(limits: Limits) -> None:
+_analysts: list[Analyst] = []
+"""In a process of the pool: the one that judges there, so that what it has read is read once."""
+
+
+def _judge(recording: str, figures: str | None) -> Outcome:
+    return _analysts[0].judge(recording, figures)
+
+
+def _prepare(analyst: Analyst, limits: Limits) -> None:
     """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
+    _analysts.append(analyst)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_limits(limits)
     kernel_cache.prepare(say=False)

@@ -172,7 +172,8 @@ class AnalyzeCommand:
 
     def _machine(self, machine: str, arguments: argparse.Namespace) -> Analyst | None:
         """An analyst by a machine file; None after its errors have been printed."""
-        if self._load(Path(machine)) is None:
+        loaded = self._load(Path(machine))
+        if loaded is None:
             return None
         from daqsvc.analysis.machine import MachineAnalyst  # noqa: PLC0415
 
@@ -183,6 +184,7 @@ class AnalyzeCommand:
                 rate_hz=arguments.fs,
                 unit=arguments.unit,
                 calibration=arguments.calibration,
+                read=[loaded],
             )
             analyst.check()
         except (OSError, ValueError) as error:

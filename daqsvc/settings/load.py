@@ -81,8 +81,7 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     problems, warnings = reading.problems()
     if problems:
         raise MachineFileError(problems)
-    origin = Origin(path, tuple(warnings), MappingProxyType(messages))
-    return MachineFile.model_validate(document, context=origin)
+    return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(messages)))
 
 
 class _Reading:
@@ -107,9 +106,9 @@ class _Reading:
 
     def validate(self) -> MachineFile:
         """Check every value for itself; returns the file, or what is valid of it."""
-        errors = _errors(self._document)
-        if not errors:
-            return MachineFile.model_validate(self._document)
+        draft, errors = _validated(self._document)
+        if draft is not None:
+            return draft
         unknown = [error for error in errors if error["type"] == "extra_forbidden"]
         more = len(unknown) - _MOST_PROBLEMS
         if more > 0:
@@ -118,10 +117,12 @@ class _Reading:
             )
         self._say(unknown, self._document)
         meant = self._without_unknown_keys([error["loc"] for error in unknown]) if unknown else self._document
-        self._say([error for error in _errors(meant) if error["type"] != "extra_forbidden"], meant)
-        draft = valid_part(MachineFile, meant)
-        assert isinstance(draft, MachineFile)  # noqa: S101 - for the type checker
-        return draft
+        if unknown:
+            _, errors = _validated(meant)
+        self._say([error for error in errors if error["type"] != "extra_forbidden"], meant)
+        part = valid_part(MachineFile, meant)
+        assert isinstance(part, MachineFile)  # noqa: S101 - for the type checker
+        return part
 
     def _without_unknown_keys(self, unknown: Iterable[KeyPath]) -> dict[str, Any]:
         """The document as it was probably meant: misspelt keys put right, other unknown keys left out."""
@@ -173,12 +174,12 @@ class _Reading:
         return tuple(self._written_as.get(path[: depth + 1], step) for depth, step in enumerate(path))
 
 
-def _errors(document: dict[str, Any]) -> list[ErrorDetails]:
+def _validated(document: dict[str, Any]) -> tuple[MachineFile | None, list[ErrorDetails]]:
+    """The file if every value is valid for itself, else what is wrong."""
     try:
-        MachineFile.model_validate(document)
+        return MachineFile.model_validate(document), []
     except ValidationError as error:
-        return [item for item in error.errors(include_url=False) if not only_follows(item, document)]
-    return []
+        return None, [item for item in error.errors(include_url=False) if not only_follows(item, document)]
 
 
 def _copy(value: Any) -> Any:

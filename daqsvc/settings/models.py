@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, PrivateAttr
 from pydantic_core import PydanticCustomError
@@ -207,10 +207,11 @@ class MachineFile(Section):
 
     _origin: Origin = PrivateAttr(default_factory=Origin)
 
-    def model_post_init(self, context: Any, /) -> None:
-        """Keep the `Origin` that is given as validation context."""
-        if isinstance(context, Origin):
-            self._origin = context
+    def found_at(self, origin: Origin) -> MachineFile:
+        """The same, with where it came from."""
+        found = self.model_copy()
+        found._origin = origin  # noqa: SLF001 - its own
+        return found
 
     @property
     def path(self) -> Path:

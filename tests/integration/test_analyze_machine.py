@@ -16,6 +16,7 @@ from daqsvc.cli import main
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
+from daqsvc.settings import load as settings_load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,6 +61,23 @@ def test_every_key_is_documented(analyze: Callable[..., Any], machine: Path, tmp
     for keys in (found, found["alarms"][0], *parts):
         assert [key for key in keys if f"`{key}`" not in told] == []
     assert [name for name in VERDICTS if f"`{name}`" not in told] == []
+
+
+def test_the_machine_file_is_read_once(
+    analyze: Callable[..., Any], machine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many recordings: reading it compiles what it names, and checks it against this computer."""
+    read: list[Path] = []
+    parsed = settings_load.MachineFile.model_validate
+
+    def counting(document: Any) -> Any:
+        read.append(machine)
+        return parsed(document)
+
+    monkeypatch.setattr(settings_load.MachineFile, "model_validate", counting)
+    recordings = [Orbit(30, seed=seed).save(tmp_path / f"{seed}.npz") for seed in range(3)]
+    _, found, _ = analyze(machine, *recordings)
+    assert (len(found), len(read)) == (3, 1)
 
 
 def test_a_calibration_stands_in_for_the_first_revolutions(
