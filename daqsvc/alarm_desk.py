@@ -59,6 +59,7 @@ MOST_COMMANDS = 64
 GRACE_S = 0.1
 """What those who publish may take beyond their deadline before they are left behind."""
 FORGOTTEN = "the journal was damaged and no longer knows how it stood; it begins anew"
+UNJOURNALLED = "the service ended while the journal could not be written; it begins anew"
 STOPPING = "the service is stopping; ask again when it runs"
 
 
@@ -130,6 +131,7 @@ class AlarmDesk:
             if mqtt is None or sparkplug is None
             else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.obey)
         )
+        self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
         self._log = AlarmLog(clock)
         self._conditions = conditions(mqtt, buses or {})
@@ -169,12 +171,17 @@ class AlarmDesk:
         if self.outbox.counters.shut:
             latest = await self.outbox.glimpse()
             self._knows_journal, self._is_in_step = latest is not None, False
-            self._take_over(await asyncio.to_thread(recall, latest or (), self.topics))
+            told = await asyncio.to_thread(recall, latest or (), self.topics)
+            self._take_over(told)
+            if self._knows_journal and self.outbox.broker_is_ahead:
+                self._confirm(self._tell_again(told))
             return
         told = await asyncio.to_thread(recall, await self.outbox.latest(), self.topics)
         self._take_over(told)
         self._damage_seen = self._damage()
-        if self._damage_seen:
+        if self.outbox.broker_is_ahead:
+            self._confirm(self._tell_again(told))
+        elif self._damage_seen:
             self._confirm(self._forget(told))
 
     def _take_over(self, told: Sequence[AlarmEvent]) -> None:
@@ -196,6 +203,22 @@ class AlarmDesk:
             self._post(event)
             for event in self.manager.begin_anew(told, FORGOTTEN)
             if ever is None or self._topic(event) in ever
+        ]
+
+    def _tell_again(self, told: Sequence[AlarmEvent]) -> list[asyncio.Future[int]]:
+        """Say of every alarm how it stands: the broker may show what the journal never got.
+
+        Args:
+            told: what the journal knows, which the alarms have taken over.
+        """
+        logger.warning(
+            "the service was ended while the disk took no writes: the broker may show what the journal does "
+            "not know, so it is told of every alarm how it stands"
+        )
+        again = [event for event in told if self._newest[event.identity.machine, event.alarm] is event]
+        return [
+            *(self._submit(event) for event in again),
+            *(self._post(event) for event in self.manager.begin_anew(told, UNJOURNALLED)),
         ]
 
     def _topic(self, event: AlarmEvent) -> str:
@@ -266,8 +289,8 @@ class AlarmDesk:
 
     def tick(self) -> None:
         """What time alone brings, such as the end of shelving, and how the service itself stands."""
-        if self._untold and not self.outbox.counters.waiting:
-            # Once the disk takes events again, it must know how each alarm stands by now.
+        if self._untold and self.outbox.counters.waiting <= self._waiting_max // 2:
+            # Once events are taken again, broker and disk must know how each alarm stands by now.
             for event in list(self._untold.values()):
                 self._submit(event)
         if self._falls_out_of_step():
@@ -416,7 +439,7 @@ class AlarmDesk:
             waiting=outbox.waiting,
             write_errors=outbox.write_errors,
             lost=outbox.refused + outbox.lost,
-            shut=bool(outbox.shut),
+            unbacked=bool(outbox.shut or outbox.unbacked),
             damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
             set_aside=self.outbox.has_set_aside,
             telemetry_dropped=outbox.telemetry.dropped,

@@ -96,7 +96,7 @@ class Vitals:
         unwritten: commands so far that were refused because the audit log could not be written.
         buses: how each bus stands, by name.
         refused: by topic, why the broker will not take messages; None without a broker.
-        shut: whether the journal cannot be opened so far.
+        unbacked: whether the disk takes no alarm events, so that they go out from memory.
         set_aside: whether the damage has left files that are named ``*.corrupt-*``.
     """
 
@@ -115,7 +115,7 @@ class Vitals:
     unwritten: int
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
     refused: Mapping[str, str] | None = None
-    shut: bool = False
+    unbacked: bool = False
     set_aside: bool = False
 
 
@@ -233,14 +233,15 @@ class SelfCheck:
     def _journal(self, vitals: Vitals) -> Condition:
         failed = vitals.write_errors > self._write_errors
         self._write_errors = vitals.write_errors
-        self._unwritable = vitals.shut or (vitals.waiting > 0 and (failed or self._unwritable))
+        self._unwritable = vitals.unbacked or (vitals.waiting > 0 and (failed or self._unwritable))
         if self._lost.goes_on(vitals.lost, vitals.now_ns):
             sentence = f"{vitals.lost} alarm events are lost: the journal in {self._store} cannot be written"
             return Condition("store/journal", Level.DANGER, sentence)
         if self._unwritable:
             sentence = (
-                f"the journal in {self._store} cannot be written, and alarm events wait in memory: make room "
-                "on the disk"
+                f"the journal in {self._store} cannot be written: delivery of alarms is not backed by the "
+                "disk, they go out from memory, and what the broker does not get before the process ends is "
+                "lost: make room on the disk"
             )
             return Condition("store/journal", Level.ALERT, sentence)
         return Condition("store/journal", Level.NORMAL, f"the journal in {self._store} takes what comes")

@@ -54,8 +54,14 @@ class OutboxCounters:
         vanished: messages on disk, at least, which the file no longer knew when it was opened: it was
             damaged, deleted, or is an older copy.
         refused: messages refused because too many waited in memory for a disk that cannot be written.
-        lost: messages that never reached the disk because the outbox was closed while it could not write.
+        lost: messages that reached neither the disk nor the broker because the outbox was closed while it
+            could not write.
         shut: 1 until the journal can be opened, else 0.
+        unbacked: 1 while the disk takes no messages and those that come go to the broker from memory, else 0.
+        sent_unbacked: messages that the broker has acknowledged before the disk had them; they are journalled
+            as soon as that takes writes again.
+        unjournalled: of these, messages that the journal will never have: there were too many, or the service
+            was stopped before the disk took writes again.
         telemetry: what became of telemetry.
     """
 
@@ -70,4 +76,7 @@ class OutboxCounters:
     refused: int = 0
     lost: int = 0
     shut: int = 0
+    unbacked: int = 0
+    sent_unbacked: int = 0
+    unjournalled: int = 0
     telemetry: TelemetryCounters = field(default_factory=TelemetryCounters)

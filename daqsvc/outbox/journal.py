@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import sqlite3
+from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from daqsvc.outbox.ballast import Ballast
@@ -37,14 +39,16 @@ from daqsvc.outbox.tables import (
     are_of_this_version,
     bring_up_to_date,
 )
+from daqsvc.outbox.unwritten import Unwritten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
     from daqsvc.outbox.limits import OutboxLimits
     from daqsvc.outbox.messages import Draft
+    from daqsvc.outbox.unwritten import Acknowledged
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +60,9 @@ TRIM_AT_MOST = 8 * TRIM_EVERY
 
 SLACK_PAGES = 2048
 """Free pages of the file that are kept for what comes, 8 MiB; more are given back to the disk."""
+
+RECENT = 1000
+"""Messages, not sent yet, that are kept in memory as well: a disk that fails may not give them back."""
 
 _INSERT = """
 INSERT INTO messages (sequence, topic, payload, retain, wall_ns, checksum) VALUES (?, ?, ?, ?, ?, ?)
@@ -75,6 +82,9 @@ SHORT_BYTES = 1024 * 1024
 
 class Journal:
     """Messages by sequence number, sent or not; how the numbers go on is told in `outbox.sequence`.
+
+    A message is numbered, then written; until then it waits in memory, under the number and with the content
+    that it keeps. Nobody reads it there, unless it is shown because the disk takes no writes: see `show`.
 
     Args:
         path: the SQLite file; its directory is created.
@@ -104,12 +114,47 @@ class Journal:
         self._lock: BinaryIO | None = None
         self._is_ready = False
         self._next = 0
+        self._unwritten = Unwritten(limits.alarms_waiting_max // 4)
+        self._unsent = 0
+        self._recent: dict[int, OutboxMessage] = {}
+        self._shows = False
+        self._was_ahead = False
         self._sent_since_trim = 0
 
     @property
     def last_sequence(self) -> int:
         """The highest number used so far."""
         return self._next - 1
+
+    @property
+    def newest(self) -> int:
+        """The highest number that can be read, or was."""
+        first = self._unwritten.first
+        return self._next - 1 if first is None or self._shows else first - 1
+
+    @property
+    def shows(self) -> bool:
+        """Whether messages can be read that are not on the disk."""
+        return self._shows
+
+    @property
+    def has_unwritten(self) -> bool:
+        """Whether `write` has something to do."""
+        return bool(self._unwritten)
+
+    @property
+    def waiting(self) -> tuple[OutboxMessage, ...]:
+        """The messages that are not on the disk and that the broker does not have."""
+        marks = self._unwritten.marks
+        return tuple(m for m in self._unwritten.messages if m.sequence not in marks)
+
+    @property
+    def was_ahead(self) -> bool:
+        """Whether an earlier run may have told the broker what the journal does not have.
+
+        So it is until `damage_is_told`.
+        """
+        return self._was_ahead
 
     @property
     def is_held(self) -> bool:
@@ -161,7 +206,9 @@ class Journal:
     def _open(self) -> None:
         assert self._lock is not None  # noqa: S101 - `hold` has it
         self._close_view()
-        self._mark.read(place_of(self._lock))
+        if not self._next:  # else numbers of this run are in use
+            self._mark.read(place_of(self._lock))
+            self._was_ahead = self._mark.is_ahead
         aside = self._renewal.finish()
         if aside is not None:
             log.warning("outbox %s: the saving of what was left of %s is finished", self.path, aside)
@@ -262,7 +309,7 @@ class Journal:
             self._connect()
             self._tidy()
             return
-        begun = self._next or LARGEST
+        begun = self._first_unwritten() or LARGEST
         # A new file's numbers begin above all that the old one may have forgotten.
         self._next = max(self._next, self._mark.first_free(None, self._wall_ns()))
         in_log = [row for number, row in self._log_copy.rows().items() if number < begun]
@@ -281,6 +328,8 @@ class Journal:
 
     def damage_is_told(self) -> None:
         """The alarms have told what has befallen the journal: a crash need not have it told again."""
+        self._was_ahead = False
+        self._mark.drift(ahead=self._shows)
         try:
             self._renewal.is_told()
             if self._known_topics.topics is None:
@@ -299,6 +348,7 @@ class Journal:
         except BaseException:
             connection.close()
             raise
+        self._close_view()
         self._connection = connection
         gone = self._mark.vanished(stored)
         if is_new and self._mark.is_damaged:
@@ -324,7 +374,12 @@ class Journal:
                 gone,
             )
         self._next = max(self._next, self._mark.first_free(stored, self._wall_ns()))
-        self._mark.begin(self._next)
+        self._mark.begin(self._next, self._unwritten.first)
+
+    def _first_unwritten(self) -> int:
+        """The first number that is not in the journal by a commit that has succeeded; 0 if nobody knows."""
+        first = self._unwritten.first
+        return self._next if first is None else first
 
     def _take_back(self, connection: sqlite3.Connection, stored: int) -> list[int]:
         """Have the messages again that SQLite does not find behind a wrong checksum in the log.
@@ -357,9 +412,9 @@ class Journal:
         """Open the file again in the middle of a run.
 
         The log may hold a commit that has failed. Its messages are still in memory and will be committed
-        under other numbers, so it must not come back.
+        again, so it must not come back.
         """
-        begun = self._next
+        begun = self._first_unwritten()
         self._connect()
         if not begun:
             return
@@ -404,55 +459,105 @@ class Journal:
             raise corruption(f"it ends with message {used[0]}, which was never given")
         return max(used[0], last or 0)
 
-    def commit(self, drafts: Sequence[Draft], sent: Iterable[int]) -> tuple[list[int | Exception], int]:
-        """Write drafts and mark others as sent, in one durable transaction.
+    def number(self, drafts: Iterable[Draft]) -> list[OutboxMessage | Exception]:
+        """Give messages their numbers, which they keep; from here on they wait to be written.
 
         Returns:
-            For each draft its sequence number, or what its payload function raised (such a draft takes
-            no number); and how many messages were newly marked.
+            For each draft its message, or what its payload function raised (such a draft takes no number).
 
         Raises:
-            sqlite3.Error: nothing was written; try again with the same drafts.
-            OSError: likewise, from the side file.
+            OSError: there are no numbers to be had; try again with the same drafts.
+            OutboxError: nobody has looked yet which numbers are free.
         """
-        connection = self._open_connection()
-        outcomes: list[int | Exception] = []
-        rows = []
-        latest = {}
-        wall_ns = self._wall_ns()
+        if not self._next:
+            self._begin_unread()
+        outcomes: list[OutboxMessage | Exception] = []
         sequence = self._next
         for draft in drafts:
             try:
-                m = draft.message(sequence)
+                outcomes.append(draft.message(sequence))
             except Exception as error:  # noqa: BLE001  the caller's own function; it goes back to the caller
                 outcomes.append(error)
                 continue
-            rows.append(
-                (m.sequence, m.topic, m.payload, m.retain, wall_ns, checksum(m.sequence, m.topic, m.payload))
-            )
-            if m.retain:
-                latest[m.topic] = m.sequence
-            outcomes.append(sequence)
             sequence += 1
-        if rows:
-            self._mark.advance(sequence - 1)
+        if sequence > self._next:
+            self._mark.give(sequence - 1)
+            if self._shows:
+                self._mark.drift(ahead=True)
+        self._next = sequence
+        for outcome in outcomes:
+            if isinstance(outcome, OutboxMessage):
+                self._unwritten.add(outcome)
+        return outcomes
+
+    def _begin_unread(self) -> None:
+        """Begin with numbers though the journal cannot be opened."""
+        if self._lock is None:
+            raise OutboxError(f"outbox {self.path} is not open; call open() first")
+        self._next = self._mark.first_unread(self._wall_ns())
+        self._mark.begin(self._next)
+
+    def acknowledge(self, numbers: Iterable[int]) -> Acknowledged:
+        """Take in that the broker has messages; the next `write` tells the disk."""
+        return self._unwritten.acknowledge(numbers)
+
+    def show(self) -> None:
+        """Have messages read though the disk does not take them, until `hide`."""
+        self._shows = True
+        if self._unwritten.first is not None:
+            self._mark.drift(ahead=True)
+
+    def hide(self) -> None:
+        """The disk takes messages again and has all of them."""
+        self._shows = False
+        self._mark.drift(ahead=self._was_ahead)
+
+    def write(self, at_most: int) -> tuple[list[int], int]:
+        """Write the first messages that wait, and mark others as sent, in one durable transaction.
+
+        Args:
+            at_most: how many messages, and how many marks.
+
+        Returns:
+            The numbers of the messages that are on disk by now, and how many messages were newly marked.
+
+        Raises:
+            sqlite3.Error: nothing was written; try again.
+            OSError: likewise, from the side file.
+        """
+        connection = self._open_connection()
+        messages, marks = self._unwritten.next(at_most)
+        wall_ns = self._wall_ns()
+        rows = [
+            (m.sequence, m.topic, m.payload, m.retain, wall_ns, checksum(m.sequence, m.topic, m.payload))
+            for m in messages
+        ]
+        latest = {m.topic: m.sequence for m in messages if m.retain}
+        if messages:
+            self._mark.advance(messages[-1].sequence)
         self._known_topics.add(latest)
         with self._committed(connection):
             connection.executemany(_INSERT, rows)
             connection.executemany("INSERT OR REPLACE INTO latest VALUES (?, ?)", latest.items())
             marked = connection.executemany(
-                "UPDATE messages SET sent = 1 WHERE sequence = ? AND NOT sent", [(s,) for s in sent]
+                "UPDATE messages SET sent = 1 WHERE sequence = ? AND NOT sent", [(mark,) for mark in marks]
             ).rowcount
             self._sent_since_trim += max(marked, 0)
             trims = self._sent_since_trim >= TRIM_EVERY
             if trims:
                 self._trim(connection)
-        if rows:
-            self._confirm(sequence - 1)
-            self._next = sequence
+        if messages:
+            self._confirm(messages[-1].sequence)
+        self._unwritten.written(messages, marks)
+        self._recent.update((m.sequence, m) for m in messages)
+        for mark in marks:
+            self._recent.pop(mark, None)
+        while len(self._recent) > RECENT:
+            del self._recent[next(iter(self._recent))]
+        self._unsent += len(messages) - max(marked, 0)
         if trims:
             self._tend(connection)
-        return outcomes, max(marked, 0)
+        return [m.sequence for m in messages], max(marked, 0)
 
     def _confirm(self, last: int) -> None:
         """Note what was committed, and so see whether the disk still takes writes.
@@ -520,31 +625,81 @@ class Journal:
 
     def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that are not sent, in order, at most ``limit``."""
-        return self._select("WHERE NOT sent AND sequence > ? ORDER BY sequence LIMIT ?", after, limit)
+        marks = self._unwritten.marks
+        try:
+            found = self._unsent_above(after, limit, marks)
+        except (OutboxError, *FileError):
+            recent = [m for m in self._recent.values() if m.sequence not in marks]
+            if not self._shows or self._unsent > self._unwritten.marks_elsewhere() + len(recent):
+                raise
+            # Of all else in the journal, the broker has it.
+            found = [replace(m, stored=True) for m in recent if m.sequence > after][:limit]
+        waiting = (m for m in self._shown() if m.sequence > after and m.sequence not in marks)
+        return [*found, *islice(waiting, limit - len(found))]
+
+    def _unsent_above(self, after: int, limit: int, marks: frozenset[int]) -> list[OutboxMessage]:
+        where = "WHERE NOT sent AND sequence > ? AND sequence < ? ORDER BY sequence LIMIT ?"
+        found: list[OutboxMessage] = []
+        while len(found) < limit:
+            some = self._select(where, after, self._first_unwritten() or LARGEST, limit)
+            found += [m for m in some if m.sequence not in marks]
+            if len(some) < limit:
+                break
+            after = some[-1].sequence
+        return found[:limit]
 
     def following(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that are still kept, sent or not, in order, at most ``limit``."""
-        return self._select("WHERE sequence > ? ORDER BY sequence LIMIT ?", after, limit)
+        where = "WHERE sequence > ? AND sequence < ? ORDER BY sequence LIMIT ?"
+        found = self._select(where, after, self._first_unwritten() or LARGEST, limit)
+        waiting = (m for m in self._shown() if m.sequence > after)
+        return [*found, *islice(waiting, limit - len(found))]
 
     def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, if it is sent, in order."""
-        return self._select(f"WHERE sent AND sequence IN ({_IS_LATEST}) ORDER BY sequence")
+        if not self._unwritten:
+            return self._select(f"WHERE sent AND sequence IN ({_IS_LATEST}) ORDER BY sequence")
+        marks = self._unwritten.marks
+        try:
+            sent = marks.union(
+                row[0]
+                for row in self._reading().execute(
+                    f"SELECT sequence FROM messages WHERE sent AND sequence IN ({_IS_LATEST})"  # noqa: S608  constants only
+                )
+            )
+            latest = self.latest()
+        except (OutboxError, *FileError):
+            if not self._shows:
+                raise
+            sent, latest = marks, self._overlaid([])  # of what nobody can read, nothing is repeated
+        return [message for message in latest if message.sequence in sent]
 
     def latest(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, sent or not, in order."""
-        return self._select(f"WHERE sequence IN ({_IS_LATEST}) ORDER BY sequence")
+        where = f"WHERE sequence IN ({_IS_LATEST}) AND sequence < ? ORDER BY sequence"
+        return self._overlaid(self._select(where, self._first_unwritten() or LARGEST))
+
+    def _overlaid(self, there: Iterable[OutboxMessage]) -> list[OutboxMessage]:
+        by_topic = {m.topic: m for m in (*there, *self._shown()) if m.retain}
+        return sorted(by_topic.values(), key=lambda m: m.sequence)
+
+    def _shown(self) -> Iterable[OutboxMessage]:
+        return self._unwritten.messages if self._shows else ()
 
     def unsent(self) -> int:
-        """How many messages are not sent."""
+        """How many messages on the disk are not marked as sent."""
         count: int = (
             self._open_connection().execute("SELECT count(*) FROM messages WHERE NOT sent").fetchone()[0]
         )
+        self._unsent = count
         return count
 
     def close(self) -> None:
         """Close the file; whatever the disk does, nothing is raised."""
         self._close_view()
         is_whole = self._connection is not None and self._is_ready and not self._has_failed
+        # What the broker may have and the journal has not, the next run must be able to find out.
+        is_whole = is_whole and self._unwritten.first is None and not self._mark.is_ahead
         self._disconnect()
         self._is_ready = False
         if is_whole:
@@ -573,15 +728,20 @@ class Journal:
         return self._connection
 
     def _reading(self) -> sqlite3.Connection:
-        """The journal; before it can be opened, a look at it that needs no room on the disk.
+        """The journal; while it cannot be opened, a look at it that needs no room on the disk.
 
         Raises:
             sqlite3.Error: it cannot be looked at, or may say what the disk never got (see `_prove`).
             OSError: likewise.
         """
         if self._is_ready or self._connection is not None or self._lock is None:
-            return self._open_connection()
-        if not self._may_view:
+            try:
+                return self._open_connection()
+            except FileError as error:
+                if not may_pass(error) or self._lock is None:
+                    raise
+                log.debug("outbox %s is only looked at: %s", self.path, error)
+        elif not self._may_view:
             raise sqlite3.OperationalError(f"outbox {self.path} is not open yet")
         if self._viewed is None:
             self._view = contextlib.ExitStack()

@@ -21,19 +21,21 @@ class OutboxAwayError(OutboxError):
 
 @dataclass(frozen=True, slots=True)
 class OutboxMessage:
-    """A message that is on disk.
+    """A message for the broker.
 
     Attributes:
         sequence: its number, never used twice.
         topic: MQTT topic.
         payload: the bytes to publish.
         retain: whether the broker keeps it as the latest of its topic.
+        stored: whether it is on disk. While the disk takes no writes, messages go out from memory.
     """
 
     sequence: int
     topic: str
     payload: bytes
     retain: bool
+    stored: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class TelemetryMessage:
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A message on its way to the disk, whose payload wants to know its number."""
+    """A message on its way to the disk and the broker, whose payload wants to know its number."""
 
     topic: str
     payload_of_sequence: Callable[[int], bytes]
@@ -72,7 +74,7 @@ class Draft:
         if not isinstance(payload, bytes):
             raise TypeError(f"the payload for {self.topic} is of type {type(payload).__name__}; give bytes")
         self.topic.encode()  # or the database refuses it later, for all others of the commit as well
-        return OutboxMessage(sequence, self.topic, payload, self.retain)
+        return OutboxMessage(sequence, self.topic, payload, self.retain, stored=False)
 
 
 def new_series() -> str:

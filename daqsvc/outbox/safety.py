@@ -91,8 +91,23 @@ def _refuse_directory(directory: Path, status: os.stat_result, store: Path | Non
         return
     raise OutboxError(
         f"{above if store is None else f'the store {store}'} has mode {mode:04o}, so that others may put "
-        f"files of theirs into it: chmod go-w {directory}, and look at what is in it before the next start"
+        f"files of theirs into it: {_narrowed(directory, status, is_store=store is not None)}, and look at "
+        "what is in it before the next start"
     )
+
+
+def _narrowed(directory: Path, status: os.stat_result, *, is_store: bool) -> str:
+    """What to do about a directory that others may write.
+
+    A volume that is made by root, as Kubernetes makes those of kind emptyDir, could not be written at all if
+    it were only taken from the others.
+    """
+    if status.st_uid == os.geteuid():
+        return f"chmod go-w {directory}"
+    if not is_store:
+        return f"chmod go-w {directory}, or chmod +t it, as root"
+    owned = f"chown {_account()} {directory} && chmod 700 {directory}"
+    return f"{owned}, as root (on Kubernetes: in an init container)"
 
 
 def _refuse_file(path: Path, status: os.stat_result) -> None:
@@ -108,13 +123,21 @@ def _refuse_file(path: Path, status: os.stat_result) -> None:
 def _belongs(what: str, owner: int, path: Path) -> str:
     return (
         f"{what} belongs to {_user(owner)} and the service runs as {_user(os.geteuid())}: "
-        f"chown {_user(os.geteuid())} {path}, run the service as {_user(owner)}, "
+        f"chown {_account()} {path}, run the service as {_user(owner)}, "
         "or give it a directory of its own"
     )
 
 
 def _trusted() -> set[int]:
     return {0, os.geteuid()}
+
+
+def _account() -> str:
+    """This process's user, as `chown` takes it."""
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return f"{os.geteuid()}"
 
 
 def _user(number: int) -> str:

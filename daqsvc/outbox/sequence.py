@@ -8,14 +8,16 @@ in a power cut what it had confirmed. So two side files of one line each tell, a
 - the *ceiling*, ahead of every number in use and durable before one is used;
 - the highest number *used* and the *first* one of this run, without a sync: a lower bound after a crash;
 - which *boot* of the system that was, and in which *place*: a copy of the store is in another one;
-- whether the run has *ended* properly.
+- whether the run has *ended* properly, or the broker may be *ahead* of the journal: messages went out while
+  the disk took none.
 
 They are written one after the other, in place, so that a torn or a damaged one never leaves none, and a full
-disk stops neither.
+disk stops neither. A disk that takes no writes at all stops both: then numbers may be given up to
+`UNRECORDED` above the ceiling, for messages in memory.
 
-Numbers go on without a gap after a proper end. They go on above the ceiling after any other end, above the
-wall clock in ms as well after another boot, in a copy, or for a new file, and far ahead when a side file is
-damaged or missing.
+Numbers go on without a gap after a proper end. After any other end they go on above all of these and above
+the wall clock in ms; above the wall clock as well after another boot, in a copy, or for a new file; and far
+ahead when a side file is damaged or missing.
 """
 
 from __future__ import annotations
@@ -40,6 +42,10 @@ STEP = 1024
 LEAP = 10_000_000
 """How far numbers jump where nobody knows any more what was used: hours of the worst flood of alarms."""
 
+UNRECORDED = 10_000_000
+"""Numbers above the ceiling that may be given while no side file can be written; an end that was not a proper
+one skips them, used or not."""
+
 UNKNOWN_BOOT = "-"
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -57,11 +63,13 @@ class _Told:
     boot: str
     place: str
     ended: bool
+    ahead: bool = False
 
     def line(self) -> bytes:
         """As it is written; of one length for one boot and place, so that it can be written in place."""
         figures = " ".join(f"{number:0{_DIGITS}d}" for number in (self.ceiling, self.used, self.first))
-        told = f"{figures} {self.boot} {self.place} {'ended' if self.ended else 'going'}".encode()
+        how = "ended" if self.ended else "ahead" if self.ahead else "going"
+        told = f"{figures} {self.boot} {self.place} {how}".encode()
         return b"%b %08x\n" % (told, zlib.crc32(told))
 
 
@@ -80,6 +88,8 @@ class SequenceMark:
         self._told = _NOTHING
         self._here = _NOTHING
         self._damaged = False
+        self._ended = False
+        self._skipped = 0
         self._first = 0
         self._noted = True
 
@@ -109,12 +119,20 @@ class SequenceMark:
             newest,
             used=max((told.used for told in sound), default=0),
             ended=newest.ended and all(told.ceiling == newest.ceiling for told in sound),
+            ahead=any(told.ahead for told in sound),
         )
+        self._ended = not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
+        self._skipped = UNRECORDED if self._told.ceiling and not self._told.ended else 0
 
     @property
     def ended(self) -> bool:
         """Whether the run that wrote last came to a proper end, or this system has booted since."""
-        return not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
+        return self._ended
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether the broker may have been told what the journal does not have."""
+        return self._told.ahead
 
     @property
     def is_damaged(self) -> bool:
@@ -133,14 +151,25 @@ class SequenceMark:
             stored: the highest number that the journal knows; None for a new file.
             wall_ns: the wall clock, ns since the Unix epoch.
         """
-        known = max(stored or 0, self._told.ceiling, self._told.used)
+        known = max(stored or 0, self._told.ceiling, self._told.used) + self._skipped
         clock = max(known, wall_ns // NS_PER_MS)
         if self._damaged or (stored is not None and not self._told.ceiling):
             return clock + LEAP + 1
         is_same = (self._told.boot, self._told.place) == (self._here.boot, self._here.place)
-        if stored is None or not is_same or self._here.boot == UNKNOWN_BOOT:
+        if stored is None or not is_same or self._skipped or self._here.boot == UNKNOWN_BOOT:
             return clock + 1
         return known + 1
+
+    def first_unread(self, wall_ns: int) -> int:
+        """The number to begin with while the journal cannot be read, above whatever that may hold.
+
+        Args:
+            wall_ns: the wall clock, ns since the Unix epoch.
+        """
+        known = max(self._told.ceiling, self._told.used)
+        if self._damaged or not known:
+            return max(known, wall_ns // NS_PER_MS) + LEAP + 1
+        return max(known + UNRECORDED, wall_ns // NS_PER_MS) + 1
 
     def vanished(self, stored: int | None) -> int:
         """How many messages the journal knew and does not know any more, at least.
@@ -152,9 +181,15 @@ class SequenceMark:
             return 0
         return max(self._told.used - max(stored or 0, self._told.first - 1), 0)
 
-    def begin(self, first: int) -> None:
-        """All numbers below ``first`` are taken for used; durable with the next `advance`."""
-        self._first = first
+    def begin(self, first: int, waiting: int | None = None) -> None:
+        """All numbers below ``first`` are taken for used; durable with the next `advance`.
+
+        Args:
+            first: the number to go on with.
+            waiting: the first number of those that wait in memory; None if none do.
+        """
+        self._first = first if waiting is None else min(first, waiting)
+        self._skipped = 0
         here = self._here
         ceiling = max(self._told.ceiling, first - 1)
         self._told = replace(self._told, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
@@ -171,6 +206,33 @@ class SequenceMark:
         """
         if last >= self._told.ceiling or not any(side.is_open for side in self._sides):
             self._write(replace(self._told, ceiling=max(last + STEP, self._told.ceiling)))
+
+    def give(self, last: int) -> None:
+        """Have numbers up to ``last`` for messages in memory, on a disk that takes no writes, too.
+
+        Raises:
+            OSError: neither side file can be written, and the numbers above the ceiling are used up.
+        """
+        try:
+            self.advance(last)
+        except OSError:
+            if last > self._told.ceiling + UNRECORDED:
+                raise
+
+    def drift(self, *, ahead: bool) -> None:
+        """Tell, durably if the disk takes it, whether the broker may be ahead of the journal."""
+        if ahead == self._told.ahead:
+            return
+        self._told = replace(self._told, ahead=ahead)
+        try:
+            self._write(self._told)
+        except OSError as error:
+            log.warning(
+                "outbox mark %s cannot be written: %s; if the service is killed before it can, the broker "
+                "may go on showing states that the journal does not know",
+                self._sides[0].path,
+                error,
+            )
 
     def note(self, used: int) -> None:
         """Tell that numbers up to ``used`` are in the journal.
@@ -297,7 +359,8 @@ def _understood(line: bytes) -> _Told | None:
         ceiling, used, first = (int(word) for word in words[:3])
     except ValueError:
         return None
-    return _Told(ceiling, used, first, words[3], words[4], ended=words[5] == "ended")
+    boot, place, how = words[3:]
+    return _Told(ceiling, used, first, boot, place, ended=how == "ended", ahead=how == "ahead")
 
 
 def _hexadecimal(text: bytes) -> int | None:

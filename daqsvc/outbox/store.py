@@ -50,8 +50,9 @@ class Outbox:
 
     All of a file's SQLite happens on one thread. Messages that arrive while a commit is on its way to
     the disk go together with the next one, so a message waits for two syncs at most and a burst shares
-    one. If the disk is full or fails, messages wait in memory and are tried again until it works; on a full
-    one, telemetry gives way first, then messages that the broker has.
+    one. If the disk is full or fails, messages wait in memory, can be read from there like all others, and
+    are tried again until it works; on a full one, telemetry gives way first, then messages that the broker
+    has.
 
     Use it from one event loop; ``open`` before anything else, ``close`` at the end.
 
@@ -119,12 +120,23 @@ class Outbox:
             log.error("what the alarms were cannot be read yet: %s", error)  # noqa: TRY400
             return None
 
+    @property
+    def broker_is_ahead(self) -> bool:
+        """Whether an earlier run may have told the broker what the journal never got.
+
+        Until `damage_is_told`, which says that the broker has been told how everything stands by now.
+        """
+        return self._journal.was_ahead
+
     def damage_is_told(self) -> None:
         """What has befallen the journal is told: it need not be told again after a restart."""
         self._put(Batch(reads=[(self._journal.damage_is_told, asyncio.get_running_loop().create_future())]))
 
     async def append(self, topic: str, payload_of_sequence: Callable[[int], bytes], *, retain: bool) -> int:
         """Append a message and wait until it is on disk.
+
+        If the disk takes no writes, the broker may have it before; if that goes on for very long, the journal
+        gives up messages that the broker has and a later one has overtaken: then this returns, too.
 
         Args:
             topic: MQTT topic.
@@ -154,7 +166,7 @@ class Outbox:
         return done
 
     def mark_sent(self, sequence: int) -> None:
-        """The broker has acknowledged this message; on disk within the next 50 ms or commit.
+        """The broker has acknowledged this message; on disk within the next 50 ms or commit, if it works.
 
         A crash in between only sends the message again, with the same number.
         """
@@ -330,11 +342,32 @@ class _Books:
         self._refusing = False
         self._arrived.set()
 
-    def abandoned(self, drafts: Sequence[asyncio.Future[int]], error: OutboxError) -> None:
-        """See `Reports.abandoned`."""
-        for done in drafts:
+    def shown(self, last_sequence: int) -> None:
+        """See `Reports.shown`."""
+        self._counters.unbacked = 1
+        self.last_sequence = last_sequence
+        self._arrived.set()
+
+    def backed(self) -> None:
+        """See `Reports.backed`."""
+        self._counters.unbacked = 0
+
+    def acknowledged(self, from_memory: int, given_up: Sequence[tuple[asyncio.Future[int], int]]) -> None:
+        """See `Reports.acknowledged`."""
+        self._counters.sent_unbacked += from_memory
+        self._counters.unjournalled += len(given_up)
+        for done, number in given_up:
             self._counters.waiting -= 1
-            self._counters.lost += 1
+            succeed(done, number)
+
+    def abandoned(
+        self, lost: Sequence[asyncio.Future[int]], told: Sequence[asyncio.Future[int]], error: OutboxError
+    ) -> None:
+        """See `Reports.abandoned`."""
+        self._counters.lost += len(lost)
+        self._counters.unjournalled += len(told)
+        for done in (*lost, *told):
+            self._counters.waiting -= 1
             fail(done, error)
 
     def opened(self, unsent: int) -> None:

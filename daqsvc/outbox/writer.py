@@ -1,4 +1,8 @@
-"""The thread that writes the journal: group commits, retries, and what to do about a file that fails."""
+"""The thread that writes the journal: group commits, retries, and what to do about a file that fails.
+
+While the disk takes no writes, messages get their numbers all the same and can be read from memory, so that
+they reach the broker; the disk is told later, in the same order.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,12 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from daqsvc.outbox.files import FileError, is_corrupt
-from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError
+from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError, OutboxMessage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -41,6 +46,14 @@ IDLE_S = 0.5
 
 COMMIT_AT_MOST = 500
 """Messages, and marks, in one transaction, so that the write-ahead log does not grow with the backlog."""
+
+NAMED = 5
+"""Topics that the log names of messages that are lost."""
+
+UNBACKED = (
+    "delivery is not backed by the disk until it can: messages wait in memory, go to the broker from there, "
+    "and are lost if the process ends before either has them"
+)
 
 READ_FAILURES_MAX = 3
 """Reads in a row that may fail before the file is given up as if it were corrupt."""
@@ -107,7 +120,19 @@ class Reports(Protocol):
         marked: int,
         last_sequence: int,
     ) -> None:
-        """Drafts are on disk under their numbers, or were refused; ``marked`` others are newly sent."""
+        """Drafts are on disk under their numbers, or were refused; ``marked`` others are newly sent.
+
+        Messages can be read up to ``last_sequence``.
+        """
+
+    def shown(self, last_sequence: int) -> None:
+        """The disk takes no messages: up to this number they can be read, from memory."""
+
+    def backed(self) -> None:
+        """The disk takes messages again, and has all."""
+
+    def acknowledged(self, from_memory: int, given_up: Sequence[tuple[asyncio.Future[int], int]]) -> None:
+        """The broker has so many more that the disk has not; of those, some will never be on the disk."""
 
     def failed(self, failure: Failure) -> None:
         """A turn failed and will be tried again."""
@@ -118,8 +143,10 @@ class Reports(Protocol):
     def replaced(self, unsent: int) -> None:
         """A corrupt file was set aside; so many unsent messages are in the new one."""
 
-    def abandoned(self, drafts: Sequence[asyncio.Future[int]], error: OutboxError) -> None:
-        """Drafts that will not reach the disk any more."""
+    def abandoned(
+        self, lost: Sequence[asyncio.Future[int]], told: Sequence[asyncio.Future[int]], error: OutboxError
+    ) -> None:
+        """Messages that will not reach the disk any more: ``lost``, or ``told`` to the broker."""
 
     def stopped(self, reason: str) -> None:
         """The writer has ended through a mistake in this program."""
@@ -141,6 +168,8 @@ class JournalWriter:
         self._work: queue.SimpleQueue[Batch] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._crowd = Crowd()
+        self._waiting: dict[int, asyncio.Future[int]] = {}
+        """By number, who waits for a message to be on the disk."""
         self._thread: threading.Thread | None = None
 
     def start(self) -> tuple[asyncio.Future[int | None], asyncio.Future[None]]:
@@ -245,6 +274,9 @@ class JournalWriter:
             failure = self._perform(batch, post)
             error = failure.write or failure.read
             if error is None:
+                if self._journal.shows:
+                    self._journal.hide()
+                    post(self._reports.backed)
                 if reported is not None:
                     reported = None
                     log.warning("outbox %s can be used again", self._journal.path)
@@ -254,6 +286,7 @@ class JournalWriter:
                 continue
             post(self._reports.failed, failure)
             if self._closing.is_set():
+                self._show(batch, post)  # what the broker has is not lost
                 self._abandon(batch, error, post)
                 return
             has_failed_to_read = failure.read is not None and self._journal.is_ready
@@ -261,13 +294,16 @@ class JournalWriter:
             if reported is None:
                 reported = error
                 log.error(
-                    "outbox %s cannot be %s: %s; messages wait in memory until it can",
+                    "outbox %s cannot be %s: %s; %s",
                     self._journal.path,
                     ("written" if self._journal.is_ready else "opened") if failure.write else "read",
                     error,
+                    UNBACKED if failure.write else "messages wait until it can",
                 )
             if not self._recover(error, post, give_up=failed_reads >= READ_FAILURES_MAX):
-                self._closing.wait(retry_s)
+                if failure.write:
+                    self._show(batch, post)
+                self._bide(batch, post, retry_s)
                 retry_s = min(2 * retry_s, RETRY_MOST_S)
 
     def _gather(self, batch: Batch, *, wait: bool) -> None:
@@ -292,31 +328,75 @@ class JournalWriter:
             with contextlib.suppress(queue.Empty):
                 return self._work.get(timeout=IDLE_S)
 
+    def _show(self, batch: Batch, post: _Post) -> None:
+        """Have messages go out from memory."""
+        self._journal.show()
+        try:
+            self._take(batch, post)
+        except (OutboxError, *FileError) as error:
+            log.debug("outbox %s has no numbers: %s", self._journal.path, error)
+        post(self._reports.shown, self._journal.newest)
+
+    def _bide(self, batch: Batch, post: _Post, seconds: float) -> None:
+        """Until the disk is tried again, have what comes go out from memory, if it can be read there."""
+        until = time.monotonic() + seconds
+        while not self._closing.is_set() and (left_s := until - time.monotonic()) > 0:
+            try:
+                batch.add(self._work.get(timeout=min(left_s, IDLE_S)))
+            except queue.Empty:
+                continue
+            self._gather(batch, wait=False)
+            if self._journal.shows:
+                self._show(batch, post)
+                self._read(batch, post)
+
     def _perform(self, batch: Batch, post: _Post) -> Failure:
         """Commit, then read, even if the former failed. What is done is taken out of the batch."""
         failure = Failure()
         try:
             self._open(post)
-            while batch.drafts or batch.sent:
-                self._commit(batch, post)
+            self._take(batch, post)
+            while self._journal.has_unwritten:
+                self._commit(post)
         except (OutboxError, *FileError) as error:
             failure.write = _cause(error)
+        failure.read = self._read(batch, post)
+        return failure
+
+    def _take(self, batch: Batch, post: _Post) -> None:
+        """Give what has come its numbers, and note what was acknowledged."""
+        if batch.drafts:
+            outcomes = self._journal.number([draft for draft, _ in batch.drafts])
+            drafts, batch.drafts = batch.drafts, []
+            refused: list[tuple[asyncio.Future[int], int | Exception]] = []
+            for (_, done), outcome in zip(drafts, outcomes, strict=True):
+                if isinstance(outcome, OutboxMessage):
+                    self._waiting[outcome.sequence] = done
+                else:
+                    refused.append((done, outcome))
+            self._crowd.come(len(drafts), time.monotonic())
+            if refused:
+                post(self._reports.committed, refused, 0, self._journal.newest)
+        sent, batch.sent = batch.sent, []
+        from_memory, given_up = self._journal.acknowledge(sent)
+        if from_memory:
+            never = [(self._waiting.pop(number), number) for number in given_up]
+            post(self._reports.acknowledged, from_memory, never)
+
+    def _read(self, batch: Batch, post: _Post) -> Exception | None:
         try:
             while batch.reads:
                 query, answer = batch.reads[0]
                 post(succeed, answer, query())
                 batch.reads.pop(0)
         except (OutboxError, *FileError) as error:
-            failure.read = _cause(error)
-        return failure
+            return _cause(error)
+        return None
 
-    def _commit(self, batch: Batch, post: _Post) -> None:
-        now, sent = batch.drafts[:COMMIT_AT_MOST], batch.sent[:COMMIT_AT_MOST]
-        self._crowd.come(len(now), time.monotonic())
-        outcomes, marked = self._journal.commit([draft for draft, _ in now], sent)
-        settled = [(done, outcome) for (_, done), outcome in zip(now, outcomes, strict=True)]
-        batch.drafts, batch.sent = batch.drafts[COMMIT_AT_MOST:], batch.sent[COMMIT_AT_MOST:]
-        post(self._reports.committed, settled, marked, self._journal.last_sequence)
+    def _commit(self, post: _Post) -> None:
+        numbers, marked = self._journal.write(COMMIT_AT_MOST)
+        settled = [(self._waiting.pop(number), number) for number in numbers]
+        post(self._reports.committed, settled, marked, self._journal.newest)
 
     def _recover(self, error: Exception, post: _Post, *, give_up: bool) -> bool:
         """Do something about a failure; whether it is worth trying again at once.
@@ -345,11 +425,39 @@ class JournalWriter:
         failure = OutboxError(
             f"outbox {self._journal.path} was closed while it could not be written: {error}"
         )
-        post(self._reports.abandoned, [done for _, done in batch.drafts], failure)
+        waiting = self._journal.waiting
+        lost = [self._waiting.pop(m.sequence) for m in waiting if m.sequence in self._waiting]
+        lost += [done for _, done in batch.drafts]
+        told = list(self._waiting.values())
+        self._waiting.clear()
+        post(self._reports.abandoned, lost, told, failure)
         for _, answer in batch.reads:
             post(fail, answer, failure)
-        if batch.drafts:
-            log.error("outbox %s lost %d messages: %s", self._journal.path, len(batch.drafts), error)
+        topics = Counter(
+            [*(message.topic for message in waiting), *(draft.topic for draft, _ in batch.drafts)]
+        )
+        if lost:
+            log.error(
+                "outbox %s lost %d messages, which neither the disk nor the broker has: %s; they were on %s",
+                self._journal.path,
+                len(lost),
+                error,
+                _named(topics),
+            )
+        if told:
+            log.error(
+                "outbox %s will never have %d messages that the broker has: %s",
+                self._journal.path,
+                len(told),
+                error,
+            )
+
+
+def _named(topics: Counter[str]) -> str:
+    """Topics, those with the most messages first, and how many each has."""
+    named = [f"{topic} ({count})" for topic, count in topics.most_common(NAMED)]
+    rest = len(topics) - len(named)
+    return ", ".join(named) + (f" and {rest} others" if rest else "")
 
 
 def _cause(error: Exception) -> Exception:

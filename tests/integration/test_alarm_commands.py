@@ -171,19 +171,19 @@ async def test_an_event_that_the_disk_does_not_take_is_not_called_committed(
         find(desk, "alert")
         await desk.settle(5.0)
         desk._stopping = False
-        commit = Journal.commit
+        write = Journal.write
 
         def full(*_: object) -> None:
             raise OSError(28, os.strerror(28))
 
-        monkeypatch.setattr(Journal, "commit", full)
+        monkeypatch.setattr(Journal, "write", full)
         outcome = await desk.obey(ACK, "test")
         assert outcome.accepted
         assert outcome.events == ()
         assert outcome.reason.startswith("done, but the journal cannot be written yet")
         desk.tick()
         assert state(desk, "store/journal").is_active
-        monkeypatch.setattr(Journal, "commit", commit)
+        monkeypatch.setattr(Journal, "write", write)
         await eventually(lambda: desk.outbox.counters.waiting == 0, "the disk takes it")
         assert await kinds(desk) == ["raised", "acknowledged", "raised"], (
             "in the order in which they came about"

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 
 import pytest
+from journal_commits import commit
 
 from daqsvc.outbox import journal as journal_module
 from daqsvc.outbox.journal import Journal
@@ -32,7 +33,7 @@ def opened(path):
 
 
 def append(journal, topic, *, retain=True):
-    return journal.commit([Draft(topic, text, retain=retain)], [])[0][0]
+    return commit(journal, [Draft(topic, text, retain=retain)], [])[0][0]
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def killed(tmp_path):
     path = tmp_path / "made" / NAME
     journal = opened(path)
     standing = append(journal, "alarms/standing")
-    journal.commit([], [standing])
+    commit(journal, [], [standing])
     numbers = [append(journal, f"alarms/{n % 5}", retain=n % 2 == 0) for n in range(30)]
     shutil.copytree(path.parent, tmp_path / "killed")
     journal.close()

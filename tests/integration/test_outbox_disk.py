@@ -60,7 +60,7 @@ async def opened(directory, limits=NO_RESERVE):
     return outbox
 
 
-async def test_alarms_wait_for_a_full_disk_while_those_on_it_are_delivered(disk):
+async def test_alarms_are_delivered_from_a_full_disk_and_from_memory_and_stored_later(disk):
     outbox = await opened(disk)
     before = [await outbox.append(TOPIC, kilobyte, retain=False) for _ in range(10)]
     await outbox.pending_telemetry(0, 1)  # both files are there
@@ -68,12 +68,24 @@ async def test_alarms_wait_for_a_full_disk_while_those_on_it_are_delivered(disk)
     waiting = [outbox.submit(TOPIC, lambda n: kilobyte(n) * 9, retain=False) for _ in range(200)]
     await eventually(lambda: outbox.counters.write_errors >= 2, "the disk is full")
     assert not any(future.done() for future in waiting)
-    assert [m.sequence for m in await outbox.pending(0, 1000)] == before
+    assert outbox.counters.unbacked == 1
+    there = await outbox.pending(0, 1000)
+    assert [m.sequence for m in there if m.stored] == before
+    assert [m.sequence for m in there] == list(range(before[0], before[-1] + 201))
+    assert await outbox.pending(before[-1] + 10, 3) == there[20:23]
     make_room(disk)
     numbers = await asyncio.wait_for(asyncio.gather(*waiting), 30)
     assert numbers == list(range(before[-1] + 1, before[-1] + 201))
-    assert [m.sequence for m in await outbox.pending(0, 1000)] == [*before, *numbers]
-    assert outbox.counters.waiting == outbox.counters.lost == outbox.counters.refused == 0
+    stored = await outbox.pending(0, 1000)
+    assert all(message.stored for message in stored)
+    assert [(m.sequence, m.payload) for m in stored] == [(m.sequence, m.payload) for m in there]
+    assert (
+        outbox.counters.unbacked
+        == outbox.counters.waiting
+        == outbox.counters.lost
+        == outbox.counters.refused
+        == 0
+    )
     await outbox.close()
 
 
@@ -199,7 +211,7 @@ async def test_a_mistake_of_the_writer_is_told_to_all_who_wait(tmp_path, monkeyp
     def mistake(*_):
         raise RuntimeError("a mistake")
 
-    monkeypatch.setattr(outbox._journal, "commit", mistake)
+    monkeypatch.setattr(outbox._journal, "write", mistake)
     monkeypatch.setattr("threading.excepthook", lambda _: None)
     with pytest.raises(OutboxError, match="a mistake"):
         await asyncio.wait_for(outbox.append(TOPIC, kilobyte, retain=False), 5)

@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 from crashing import dies_at
+from journal_commits import commit
 from small_disks import mounted
 
 from daqsvc.outbox import journal as journal_module
@@ -38,11 +39,11 @@ def damaged(tmp_path_factory):
     path = directory / "whole" / JOURNAL_NAME
     journal = opened(path)
     for begin in range(0, COUNT, 10):
-        numbers, _ = journal.commit(
-            [Draft(f"t/{n % 40}", text, retain=True) for n in range(begin, begin + 10)], []
+        numbers, _ = commit(
+            journal, [Draft(f"t/{n % 40}", text, retain=True) for n in range(begin, begin + 10)], []
         )
         if begin < SENT:
-            journal.commit([], numbers)
+            commit(journal, [], numbers)
         if begin == COUNT // 2:
             journal._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     store = directory / "killed"
@@ -80,7 +81,7 @@ def check(path, unsent, latest, highest):
         assert {m.sequence for m in journal.pending(0, 10**6)} == unsent
         assert all(m.payload == text(m.sequence) for m in journal.pending(0, 10**6))
         assert {m.topic: m.sequence for m in journal.latest()} == latest
-        assert journal.commit([Draft("t", text, retain=True)], [])[0][0] > highest
+        assert commit(journal, [Draft("t", text, retain=True)], [])[0][0] > highest
     finally:
         journal.close()
     left = {path.name for path in path.parent.iterdir()}

@@ -157,7 +157,7 @@ async def test_what_could_not_even_be_read_at_the_start_is_taken_over_later(tmp_
         assert desk.manager.alarms["bearing-fault"].level.label == "alert"
 
 
-async def test_a_disk_that_takes_no_more_writes_ends_nothing_and_publishes_nothing(disk, caplog):
+async def test_a_disk_that_takes_no_more_writes_ends_nothing_and_what_is_lost_is_said(disk, caplog):
     """Also at the stop: no traceback, and what is lost is said."""
     async with desk_in(disk.directory / "store") as desk:
         find(desk, "rotor-fault", "danger")
@@ -171,15 +171,20 @@ async def test_a_disk_that_takes_no_more_writes_ends_nothing_and_publishes_nothi
         big = desk.outbox.submit("big", lambda _: bytes(8 * MIB), retain=False)
         await eventually(lambda: desk.outbox.counters.write_errors > 1, "it cannot be written")
         there = await desk.outbox.pending(0, 1000)
-        assert all(message.topic != "big" for message in there)
+        assert [message.stored for message in there if message.topic == "big"] == [False]
         assert there[0].sequence == used
     assert "Traceback" not in caplog.text
     assert isinstance(big.exception(), OutboxError)
     assert desk.outbox.counters.lost >= 1
-    assert any("lost" in record.getMessage() for record in caplog.records if record.levelno == logging.ERROR)
+    assert any(
+        "lost" in record.getMessage() and "big (1)" in record.getMessage()
+        for record in caplog.records
+        if record.levelno == logging.ERROR
+    )
     disk.free()
     async with desk_in(disk.directory / "store") as desk:
         numbers = [message.sequence for message in await desk.outbox.pending(0, 1000)]
+        assert "big" not in {message.topic for message in await desk.outbox.pending(0, 1000)}
         assert await desk.outbox.append("t", lambda _: b"", retain=False) > max(there[-1].sequence, *numbers)
 
 

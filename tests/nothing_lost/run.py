@@ -30,6 +30,9 @@ TESTS = Path(__file__).parents[1]
 FINISH_S = 60.0
 """How long a teller that nobody disturbs any more may take to its end; nothing is timed by it."""
 
+NOTICED_S = 6.0
+"""How long it may take until the journal finds that its disk has room again."""
+
 DISTURBANCES = 7
 KILLS_AT_LEAST = 2
 Mutation = Literal["none", "bypass", "forget-early"]
@@ -99,6 +102,8 @@ class Stage:
     disk_is_full: bool = False
     disk_was_full: bool = False
     disk_excuses: bool = False
+    killed_on_full_disk: bool = False
+    freed_s: float = 0.0
     restart_after_s: float = 0.0
     forgotten: dict[str, bytes] = field(default_factory=dict)
 
@@ -152,6 +157,8 @@ class Stage:
                 return
             await asyncio.sleep(0.01)
         self.kills += 1
+        is_full = self.disk_is_full or time.monotonic() - self.freed_s < NOTICED_S
+        self.killed_on_full_disk |= self.disk_was_full and is_full
 
     async def kill_twice(self) -> None:
         """The second time while it starts."""
@@ -243,7 +250,7 @@ class Stage:
             await self.kill()
             await asyncio.sleep(self.some_s(0.0, 0.8))
         self.disk.free(self.teller.pid)
-        self.disk_is_full = False
+        self.disk_is_full, self.freed_s = False, time.monotonic()
 
     def plan(self) -> list[tuple[int, Callable[[], Coroutine[None, None, None]]]]:
         """What will befall this run, each with the step of the script that is told by then."""
@@ -330,6 +337,7 @@ async def run(course: Course, directory: Path) -> Report:
             list(consumer.arrivals),
             stage.forgotten,
             set(proxy.tap.acknowledged) if stage.disk_was_full else set(),
+            stage.killed_on_full_disk,
         )
         verdict = Verdict.on(evidence)
         verdict.violations[:0] = stage.failures

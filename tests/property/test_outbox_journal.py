@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from journal_commits import commit
 
 from daqsvc.outbox import journal as journal_module
 from daqsvc.outbox import sequence as sequence_module
@@ -81,7 +82,7 @@ class Restarts(RuleBasedStateMachine):
     @rule(drafts=st.lists(st.tuples(st.sampled_from(TOPICS), st.booleans()), max_size=3), data=st.data())
     def commit(self, drafts, data):
         sent = data.draw(st.lists(st.sampled_from(sorted(self.unsent)), unique=True)) if self.unsent else []
-        sequences, marked = self.journal.commit(drafts_of(drafts), sent)
+        sequences, marked = commit(self.journal, drafts_of(drafts), sent)
         assert marked == len(sent)
         for number in sent:
             del self.unsent[number]
@@ -102,8 +103,8 @@ class Restarts(RuleBasedStateMachine):
         def refuse(_sequence):
             raise ValueError("no")
 
-        outcomes, _ = self.journal.commit(
-            [Draft("a", refuse, retain=True), Draft("a", lambda n: "no bytes", retain=True)], []
+        outcomes, _ = commit(
+            self.journal, [Draft("a", refuse, retain=True), Draft("a", lambda n: "no bytes", retain=True)], []
         )
         assert [type(outcome) for outcome in outcomes] == [ValueError, TypeError]
 

@@ -46,6 +46,25 @@ def _anything_goes():
     os.umask(before)
 
 
+@pytest.mark.parametrize("mode", [0o777, 0o2777, 0o1777])
+def test_a_volume_that_root_made_for_all_is_refused_with_what_helps_there(tmp_path, mode, monkeypatch):
+    """An emptyDir of Kubernetes, and a service that is not root: chmod alone would lock it out."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can make a directory of root's")
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    volume.chmod(mode)
+    monkeypatch.setattr(os, "geteuid", lambda: 4711)
+    owned = f"chown 4711 {volume} && chmod 700 {volume}, as root (on Kubernetes: in an init container)"
+    with refused(volume, f"the store {volume} has mode {mode:04o}", owned):
+        pass
+    if mode & stat.S_ISVTX:
+        opened(volume / "store").close()
+    else:
+        with refused(volume / "store", f"{volume}, above the store", f"chmod go-w {volume}, or chmod +t it"):
+            pass
+
+
 @pytest.mark.usefixtures("_anything_goes")
 def test_a_new_store_is_its_owners_alone_whatever_the_umask(tmp_path):
     store = tmp_path / "above" / "store"

@@ -154,6 +154,21 @@ def test_a_host_of_sparkplug_2_2_says_its_state_in_one_word() -> None:
     assert host.online is False
 
 
+def test_a_disk_that_takes_no_writes_keeps_no_session_from_going_on(tmp_path, caplog) -> None:
+    memory = Memory(tmp_path / "nowhere" / "sparkplug.json")
+    memory.load()
+    memory.begin_session(17)
+    memory.advance(18)
+    memory.advance(19)
+    assert (memory.bd_seq, memory.cursor) == (1, 19)
+    assert [record.getMessage().count("cannot be written") for record in caplog.records] == [1], "said once"
+    (tmp_path / "nowhere").mkdir()
+    memory.advance(20)
+    again = Memory(tmp_path / "nowhere" / "sparkplug.json")
+    again.load()
+    assert (again.bd_seq, again.cursor) == (1, 20)
+
+
 def test_the_number_of_a_session_goes_round_and_is_remembered(tmp_path) -> None:
     memory = Memory(tmp_path / "sparkplug.json")
     memory.load()

@@ -28,6 +28,7 @@ class Memory:
         """Number of the next session, 0 to 255."""
         self.cursor: int | None = None
         """The last message of the outbox that a broker has taken; None if there has been no session."""
+        self._failed = False
 
     def load(self) -> None:
         """Read the file; one that is absent or cannot be read begins anew, which is logged."""
@@ -48,24 +49,29 @@ class Memory:
 
         Args:
             cursor: where to begin in the outbox if nobody has been told anything yet.
-
-        Raises:
-            OSError: it cannot be written.
         """
         self.cursor = cursor if self.cursor is None else self.cursor
         self._save((self.bd_seq + 1) % NUMBERS, self.cursor)
 
     def advance(self, cursor: int) -> None:
-        """A broker has taken everything up to here.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """A broker has taken everything up to here."""
         self._save(self.bd_seq, cursor)
 
     def _save(self, bd_seq: int, cursor: int | None) -> None:
-        replace_durably(self._path, json.dumps({"bd_seq": bd_seq, "cursor": cursor}).encode())
+        """Keep both; on a disk that takes no writes in memory only, for alarms must go out even so."""
         self.bd_seq, self.cursor = bd_seq, cursor
+        try:
+            replace_durably(self._path, json.dumps({"bd_seq": bd_seq, "cursor": cursor}).encode())
+        except OSError as error:
+            if not self._failed:
+                log.warning(
+                    "Sparkplug memory %s cannot be written: %s; a restart before it can tells alarms again",
+                    self._path,
+                    error,
+                )
+            self._failed = True
+        else:
+            self._failed = False
 
 
 def _understood(raw: bytes) -> tuple[int, int | None]:
