@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from gapped_signals import FRAMES, SHARES, lost
 from rotor_orbits import HEALTHY, orbits
 from shaft_channels import channels_of, feed
 
+from daqsvc.acquisition.clock import DrivenClock
+from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import learn_healthy
@@ -39,6 +43,8 @@ FEW_GAPS = [
     for frame in FRAMES
 ]
 PER_REV = 64
+NAMES = {"speed": 0.5, "1x.amplitude": 0.15, "mean.x": 0.15, "mean.y": 0.15, "noise": 0.05}
+"""What the rotor's detectors state, and how far the mean may be off with gaps, of 28 um of whirl."""
 KEYPHASOR = KeyphasorProbe("keyphasor", 2, -6.0)
 PROBES = (Probe("probe-x", 0, 0.0), Probe("probe-y", 1, 90.0))
 
@@ -161,6 +167,126 @@ def test_a_rotor_s_decision_neither_comes_nor_goes_with_the_samples(make, noise_
     assert {d.severity for d in lossy} == {before.severity}
     assert {d.decision for d in lossy if d.quality != "good"} <= {d.decision for d in lossy}
     assert any(d.quality == "missing" for d in lossy) or share < 0.3
+
+
+def bearing_watch(**more):
+    bearing = HousedBearing("drive-end", "accel-de", 0, bearing_orders("6205-2RS"))
+    return BearingDetector(
+        machine="motor",
+        stream="housing",
+        rate_hz=BEARING_HZ,
+        speed_rpm=SPEED_RPM,
+        bearings=[bearing],
+        **more,
+    )
+
+
+def looks(watch, samples):
+    """What a bearing's detector says of samples of one accelerometer."""
+    said = []
+    for begin in range(0, len(samples) - watch.block + 1, watch.block):
+        part = samples[begin : begin + watch.block, np.newaxis].astype(np.float32)
+        t_ns = round((begin + watch.block) / BEARING_HZ * 1e9)
+        said += watch.process(Window(begin, part, t_ns, 1e9 / BEARING_HZ))
+    return said
+
+
+def rotor_samples(noise_um, revolutions=200.0):
+    return channels_of(plant.simulate(plant.RotorParameters(), [], revolutions=revolutions), noise_um)
+
+
+@pytest.mark.parametrize(("share", "frame"), [(0.1, 1), (0.3, 20), (0.5, 20), (0.2, 64)])
+@pytest.mark.parametrize("make", [rotor_bank, rotor_synchronous])
+def test_a_rotor_s_detectors_state_what_is_missing_and_raise_one_quality_alarm_for_it(make, share, frame):
+    whole = rotor_samples(2.0, 300.0)
+    begin, end = 85 * PER_REV, 215 * PER_REV
+    samples = whole.copy()
+    samples[:end] = without(np.random.default_rng(8), whole[:end], share, frame, begin)
+    missing = ~np.isfinite(samples[begin:end]).all(axis=1)
+    said = feed(make(), samples, 640.0, block=PER_REV, first_index=0)
+    assert all(d.missing_share == 0.0 for d in said if d.end_index < begin)
+    lossy = [d for d in said if begin + PER_REV < d.end_index <= end]
+    assert np.mean([d.missing_share for d in lossy]) == pytest.approx(missing.mean(), abs=0.06)
+    assert said[-1].missing_share == 0.0
+    alarms = AlarmManager(Identity("lab", "box", "rig"), [], DrivenClock())
+    events = [(e.alarm, e.kind.value) for d in said for e in alarms.take(d)]
+    flickers = len([1 for a, b in pairwise(said) if (a.quality == "good") != (b.quality == "good")])
+    name = f"detector-ok/{said[0].detector}"
+    assert [kind for kind in events if kind[1] != "changed"] in ([(name, "raised"), (name, "returned")], [])
+    assert bool(events) is (flickers > 0)
+
+
+@pytest.mark.parametrize(("share", "frame"), [(0.02, 1), (0.005, 20), (0.3, 20)])
+def test_a_bearing_s_detector_states_what_is_missing(share, frame):
+    samples = lost(np.random.default_rng(9), housing(10.0, 31, 0.0), share, frame)
+    said = looks(bearing_watch(calibrate_s=60.0), samples)
+    stated = np.mean([d.missing_share for d in said])
+    assert stated == pytest.approx(np.isnan(samples[: said[-1].end_index]).mean(), rel=1e-6)
+    assert {d.quality for d in said} == ({"missing"} if share > 0.01 else {"good"})
+
+
+def test_a_bearing_is_not_found_normal_while_its_second_accelerometer_lacks_samples():
+    # Only where it is and which: the pair is looked at against a healthy machine, and there is none.
+    two = SimpleNamespace(rotor="accel-rotor", column=1, model=None)
+    housed = HousedBearing("drive-end", "accel-de", 0, bearing_orders("6205-2RS"), two)
+    watch = BearingDetector(
+        machine="motor", stream="housing", rate_hz=BEARING_HZ, speed_rpm=SPEED_RPM, bearings=[housed],
+        calibrate_s=60.0,
+    )  # fmt: skip
+    both = np.column_stack([housing(10.0, 61, 0.0), housing(10.0, 63, 0.0)]).astype(np.float32)
+    both[len(both) // 2 :, 1] = lost(np.random.default_rng(12), both[len(both) // 2 :, 1], 0.3, 20)
+    said = []
+    for begin in range(0, len(both) - watch.block + 1, watch.block):
+        t_ns = round((begin + watch.block) / BEARING_HZ * 1e9)
+        said += watch.process(Window(begin, both[begin : begin + watch.block], t_ns, 1e9 / BEARING_HZ))
+    assert [d.quality for d in said] == ["good", "good", "missing", "missing"]
+    assert [d.missing_share for d in said] == pytest.approx([0.0, 0.0, 0.3, 0.3], abs=0.05)
+    assert "accel-rotor: " in said[-1].reason
+    assert said[-1].decision == "normal"
+
+
+@pytest.mark.parametrize(("share", "frame"), [(0.005, 1), (0.005, 20)])
+def test_what_a_bearing_s_detector_measures_in_spite_of_gaps_has_no_bias(share, frame):
+    rng = np.random.default_rng(10)
+    healthy_s = housing(20.0, 41, 0.0)
+    learnt = bearing_watch(calibrate_s=15.0)
+    looks(learnt, healthy_s)
+    assert learnt.baseline is not None
+    rises, sizes = [], []
+    for seed in (51, 53, 55):
+        damaged = housing(5.0, seed, 0.3)
+        pair = [
+            looks(bearing_watch(baseline=learnt.baseline), one)
+            for one in (damaged, lost(rng, damaged, share, frame))
+        ]
+        for whole, gapped in zip(*pair, strict=True):
+            assert gapped.quality == "good"
+            rises.append(gapped.statistics["residual.rise"] - whole.statistics["residual.rise"])
+            names = [name for name in whole.statistics if name.endswith("outer.size")]
+            sizes += [gapped.statistics[n] / whole.statistics[n] for n in names if whole.statistics[n] > 0]
+    # Of the 2 dB that count as a change.
+    assert abs(np.mean(rises)) < 0.1
+    assert np.abs(rises).max() < 0.3
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("share", "frame"), [(0.02, 1), (0.1, 1), (0.1, 20), (0.3, 20), (0.5, 20)])
+@pytest.mark.parametrize("make", [rotor_bank, rotor_synchronous])
+def test_what_a_rotor_s_detectors_measure_in_spite_of_gaps_has_no_bias(make, share, frame):
+    whole = rotor_samples(2.0)
+    begin = 85 * PER_REV
+    gapped = without(np.random.default_rng(11), whole, share, frame, begin)
+    figures = []
+    for samples in (whole, gapped):
+        said = feed(make(), samples, 640.0, block=PER_REV, first_index=0)
+        good = [d for d in said if d.end_index > begin + 4 * PER_REV and d.quality == "good"]
+        stated = [(name, d.statistics[name]) for d in good for name in NAMES if name in d.statistics]
+        figures.append({name: np.array([v for n, v in stated if n == name]) for name in NAMES})
+    for name, tolerance in NAMES.items():
+        if len(figures[1][name]) < 3:
+            assert share >= 0.3 or not len(figures[0][name])
+            continue
+        assert figures[1][name].mean() == pytest.approx(figures[0][name].mean(), abs=tolerance), name
 
 
 def housing(seconds, seed, size):

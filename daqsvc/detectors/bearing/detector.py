@@ -205,9 +205,10 @@ class BearingDetector:
         self._pending = []
         first_index = self._end_index - len(samples)
         look = self._judge(samples.astype(np.float64))
+        share = self._missing_share(samples)
         if look.quality != "good":
             self._steadfast.interrupt()
-            return self._statement(look, first_index, t_ns, changed=False)
+            return self._statement(look, first_index, t_ns, changed=False, missing_share=share)
         assert look.finding is not None  # noqa: S101 - good
         self.seen = look
         changed = self._steadfast.look(look.finding, last=last)
@@ -218,7 +219,14 @@ class BearingDetector:
                 self._watches, self._directions = self._new_watches(), self._new_directions()
                 if self._keep is not None:
                     self._keep(self.baseline)
-        return self._statement(look, first_index, t_ns, changed=changed)
+        return self._statement(look, first_index, t_ns, changed=changed, missing_share=share)
+
+    def _missing_share(self, samples: NDArray[np.float32]) -> float:
+        """Share of the samples that lack a value of any sensor that the look rests on."""
+        columns = [column for bearing in self.bearings for column in bearing.columns]
+        if self.keyphasor is not None:
+            columns.append(self.keyphasor.column)
+        return float((~np.isfinite(samples[:, columns])).any(axis=1).mean())
 
     def _judge(self, samples: Floats) -> Look:
         """What the bearings show, one by one and together."""
@@ -243,6 +251,7 @@ class BearingDetector:
                 self._watches[bearing.name].forget()
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
                 continue
+            unfit += _lacking_pair(bearing, samples)
             races[bearing.name] = race
             # "Normal" of samples that had to be put right clears nothing; a fault seen through them is one.
             unfit += [("not_ok", f"{bearing.sensor}: {repair}") for repair in race.repairs]
@@ -377,7 +386,9 @@ class BearingDetector:
             self._large = change.ratio > (_NO_LONGER_LARGE if self._large else LARGE)
         return "danger" if self._large else "alert"
 
-    def _statement(self, look: Look, first_index: int, t_ns: int, *, changed: bool) -> Diagnosis:
+    def _statement(
+        self, look: Look, first_index: int, t_ns: int, *, changed: bool, missing_share: float | None = None
+    ) -> Diagnosis:
         standing = self._steadfast.standing
         where = standing.where or (look.finding.where if look.finding is not None else "")
         good = look.quality == "good"
@@ -404,10 +415,22 @@ class BearingDetector:
             or tuple(bearing.sensor for bearing in self.bearings),
             model=MODEL,
             where=standing.where,
+            missing_share=missing_share,
         )
         if good and not look.reason and self.baseline is None:
             return replace(said, reason=self._learning.reason)
         return said
+
+
+def _lacking_pair(bearing: HousedBearing, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
+    """What is against "normal" where the second accelerometer lacks samples: then no change can be seen."""
+    for name, column in zip(bearing.sensors, bearing.columns, strict=True):
+        missing = int(np.isnan(samples[:, column]).sum())
+        if column != bearing.column and missing > _MISSING * len(samples):
+            yield (
+                "missing",
+                f"{name}: {missing} of {len(samples)} samples are missing; check the bus and the device",
+            )
 
 
 class _StandsStillError(ValueError):

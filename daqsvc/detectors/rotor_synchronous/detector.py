@@ -153,6 +153,8 @@ class RotorSynchronousDetector:
         self._verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
         self._ends: deque[int] = deque(maxlen=_REACH)
         self._speed_rpm = self._stated_rpm = abs(speed_rpm)
+        self._taken = self._missing = 0
+        self._missing_share: float | None = None
 
     @property
     def watch(self) -> RotorWatch:
@@ -177,12 +179,30 @@ class RotorSynchronousDetector:
         if not len(window.samples):
             return []
         self._t_end_ns, self._period_ns = window.t_end_ns, window.period_ns
+        self._count_missing(window)
         if abs(window.first_index - self._turns.end_index) > self._turns.period:
             self._judge.reset()
             self._checks.reset()
         said = [self._turn(turn) for turn in self._turns.process(window.samples, window.first_index)]
         said.append(self._blind())
         return [diagnosis for diagnosis in said if diagnosis is not None]
+
+    def _count_missing(self, window: Window) -> None:
+        """Count the samples since the last statement, and those that lack a value of any sensor."""
+        columns = [sensor.column for sensor in self._turns.sensors]
+        begun = self._taken > 0 or self._missing_share is not None
+        gap = max(window.first_index - self._turns.end_index, 0) if begun else 0
+        self._taken += gap + len(window.samples)
+        self._missing += gap + int((~np.isfinite(window.samples[:, columns])).any(axis=1).sum())
+
+    def _stating(self, said: Diagnosis | None) -> Diagnosis | None:
+        """A statement with the share of samples that are missing since the last one."""
+        if said is None:
+            return None
+        if self._taken:
+            self._missing_share = self._missing / self._taken
+            self._taken = self._missing = 0
+        return replace(said, missing_share=self._missing_share)
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
@@ -230,7 +250,9 @@ class RotorSynchronousDetector:
             self._report = report
             if self._listener is not None:
                 self._listener(report, turn.vector)
-        return self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
+        return self._stating(
+            self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
+        )
 
     def _judge_turn(self, turn: Turn) -> Verdict:
         """What a revolution is worth, the cheapest and clearest reason first."""
@@ -276,7 +298,7 @@ class RotorSynchronousDetector:
         if self._turns.waiting_samples <= patience * 60.0 * self._rate_hz / slowest_rpm:
             return None
         verdict = Verdict("missing", self._angle_unknown())
-        return self._stater.maybe(self._standing(), verdict, *self._end(self._turns.end_index))
+        return self._stating(self._stater.maybe(self._standing(), verdict, *self._end(self._turns.end_index)))
 
     def _angle_unknown(self) -> str:
         if isinstance(self._reference, KeyphasorProbe):
