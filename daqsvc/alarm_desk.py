@@ -19,7 +19,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.alarms.states import AlarmState, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
@@ -397,7 +397,7 @@ class AlarmDesk:
     async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
         try:
             events = self.manager.obey(command)
-        except RefusedError as refusal:
+        except CommandNotAllowedError as refusal:
             return self._refuse(f"{refusal}")
         self.commands.accepted += 1
         committed = [self._post(event) for event in events]

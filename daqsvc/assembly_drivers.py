@@ -27,15 +27,15 @@ from drivers.modbus.layouts import (
     ModbusLayout,
     Page,
     Ring,
-    Trend,
+    TrendLayout,
     Trigger,
     Waveform,
     in_units,
     sample_record,
 )
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
 from drivers.replay.files import ColumnLayout
-from drivers.serial.lines import LineLayout
+from drivers.serial.lines import TextLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -56,7 +56,7 @@ _LOOKS_PER_FILL = 4
 
 def stream_layout(
     machine: MachineFile, stream: str
-) -> FrameLayout | ModbusLayout | ColumnLayout | LineLayout:
+) -> FrameLayout | ModbusLayout | ColumnLayout | TextLayout:
     """The layout of a stream, of the kind that its bus's driver knows; see `frame_layout`."""
     given = machine.streams[stream].layout
     if isinstance(given, PlainLayout | DbcLayout):
@@ -111,10 +111,10 @@ def modbus_layout(machine: MachineFile, stream: str) -> ModbusLayout:
     layout: ModbusLayout
     if isinstance(given, RegistersLayout):
         fields = tuple(_register_field(c, c.address) for c in given.channels)
-        forbidden = tuple(Run(first, last - first + 1) for first, last in given.forbidden)
+        forbidden = tuple(RegisterRun(first, last - first + 1) for first, last in given.forbidden)
         limits = RunLimits(given.max_gap, given.max_count, forbidden)
         runs = plan_runs([field.run for field in fields], limits)
-        layout = Trend(given.unit, given.table, RegisterRecord(fields, runs), limits)
+        layout = TrendLayout(given.unit, given.table, RegisterRecord(fields, runs), limits)
     elif isinstance(given, FifoLayout | RingLayout | WaveformLayout):
         layout = _sampled_layout(given, rate_hz)
     else:
@@ -198,8 +198,8 @@ def _serial_layout(given: SerialLayout) -> FrameLayout:
     )
 
 
-def _line_layout(given: LineSettings) -> LineLayout:
-    return LineLayout(
+def _line_layout(given: LineSettings) -> TextLayout:
+    return TextLayout(
         columns=given.line,
         channels=given.channel_names,
         scale=np.array([channel.scale for channel in given.channels]),

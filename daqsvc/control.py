@@ -1,7 +1,7 @@
 """Commands from people on the box: a Unix socket in the store, and the client for it.
 
-A request is one line of JSON, and so is its answer; `Request` and `Answer` say what is in them. The socket
-is ``control.sock`` in the store's directory, mode 0600: only the service's own user and root may open it, and
+A request is one line of JSON, and so is its answer: see `ControlRequest` and `ControlAnswer`. The socket is
+``control.sock`` in the store's directory, mode 0600: only the service's own user and root may open it, and
 whoever may open it may command the alarms. Whatever a client sends or leaves unsent costs the service a
 counter and a few kilobytes at most. Clients that hang keep nobody out: each user has connections of their
 own, and the quietest of them makes way for a new one.
@@ -70,7 +70,7 @@ def _finite(value: float) -> float:
 _Words = Annotated[str, AfterValidator(printable)]
 
 
-class Request(BaseModel):
+class ControlRequest(BaseModel):
     """What a person asks for."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
@@ -96,7 +96,7 @@ class Request(BaseModel):
         )
 
 
-class Answer(BaseModel):
+class ControlAnswer(BaseModel):
     """What came of it.
 
     ``waiting`` counts the alarm events that are in the service's memory only.
@@ -297,20 +297,20 @@ class ControlServer:
             else:
                 writer.close()
 
-    async def _answer(self, line: bytes, source: str) -> Answer:
+    async def _answer(self, line: bytes, source: str) -> ControlAnswer:
         if line.strip() == _QUESTION:
-            return Answer(accepted=True, reason="", waiting=self._waiting())
+            return ControlAnswer(accepted=True, reason="", waiting=self._waiting())
         try:
             request = parse_request(line, self._machine)
         except ValueError as error:
             self.counters.malformed += 1
-            return Answer(accepted=False, reason=f"{error}")
+            return ControlAnswer(accepted=False, reason=f"{error}")
         self.counters.requests += 1
         outcome = await self._obey(request.command(), source)
-        return Answer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
+        return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
 
 
-def parse_request(line: bytes, machine: str) -> Request:
+def parse_request(line: bytes, machine: str) -> ControlRequest:
     """The request in a line to the service that watches ``machine``.
 
     Raises:
@@ -319,7 +319,7 @@ def parse_request(line: bytes, machine: str) -> Request:
     if len(line) > LONGEST_LINE:
         raise ValueError(f"the request is longer than {LONGEST_LINE} bytes")
     try:
-        request = Request.model_validate_json(line)
+        request = ControlRequest.model_validate_json(line)
     except ValidationError as error:
         raise ValueError(f"the request is not valid, {_first_problem(error)}") from None
     refuse_twice(line)
@@ -328,7 +328,7 @@ def parse_request(line: bytes, machine: str) -> Request:
     return request
 
 
-def request_of(command: AlarmCommand, machine: str | None) -> Request:
+def request_of(command: AlarmCommand, machine: str | None) -> ControlRequest:
     """The request for a command.
 
     Args:
@@ -339,7 +339,7 @@ def request_of(command: AlarmCommand, machine: str | None) -> Request:
         ControlError: it cannot be asked, e.g. because a text is too long.
     """
     try:
-        return Request(
+        return ControlRequest(
             schema_=_REQUEST,
             verb=command.verb,
             alarm=command.alarm,
@@ -362,7 +362,7 @@ def events_waiting(store: Path, timeout_s: float = PATIENCE_S) -> int:
     return _asked(store, _QUESTION + b"\n", timeout_s).waiting
 
 
-def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOutcome:
+def ask(store: Path, request: ControlRequest, timeout_s: float = ANSWER_S) -> CommandOutcome:
     """Have the service that runs on a store carry a command out; blocks.
 
     Args:
@@ -377,7 +377,7 @@ def ask(store: Path, request: Request, timeout_s: float = ANSWER_S) -> CommandOu
     return CommandOutcome(accepted=answer.accepted, reason=answer.reason, events=answer.events)
 
 
-def _asked(store: Path, line: bytes, timeout_s: float) -> Answer:
+def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
     path = store / SOCKET
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -386,7 +386,7 @@ def _asked(store: Path, line: bytes, timeout_s: float) -> Answer:
                 client.connect(address)
             client.sendall(line)
             with client.makefile("rb") as answers:
-                return Answer.model_validate_json(answers.readline(LONGEST_LINE))
+                return ControlAnswer.model_validate_json(answers.readline(LONGEST_LINE))
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
         raise ControlError(
             f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
@@ -425,7 +425,7 @@ async def _next_line(reader: asyncio.StreamReader) -> bytes | None:
         return None
 
 
-def _json_line(message: Request | Answer) -> bytes:
+def _json_line(message: ControlRequest | ControlAnswer) -> bytes:
     return json.dumps(message.model_dump(mode="json", by_alias=True)).encode("ascii") + b"\n"
 
 

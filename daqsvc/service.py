@@ -15,7 +15,7 @@ from daqsvc import assembly_drivers
 from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
-from daqsvc.acquisition.standing import Standing
+from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarm_desk import AlarmDesk
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
@@ -135,7 +135,7 @@ class Service:
         watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
-        self._standings = dict.fromkeys(machine.streams, Standing())
+        self._standings = dict.fromkeys(machine.streams, StreamState())
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, self.clock, self._deliver)
         self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver, self._stand)
@@ -291,17 +291,17 @@ class Service:
             self.rings[block.stream].write(block)
             self.alignment.accept(block)
 
-    def _stand(self, stream: str, standing: Standing) -> None:
+    def _stand(self, stream: str, standing: StreamState) -> None:
         """Tell the pipeline how a stream stands, and every grid that it is on: that is no better."""
         self._standings[stream] = standing
         for grid in self._grids:
             if stream in grid.streams:
                 standings = [self._standings[name] for name in grid.streams]
-                worst = next((one for one in standings if one.doubt), Standing())
+                worst = next((one for one in standings if one.doubt), StreamState())
                 proven = all(one.proven for one in standings)
                 self.pipeline.stand(grid.name, worst._replace(proven=proven))
 
-    def _fall_silent(self, stream: str, standing: Standing) -> None:
+    def _fall_silent(self, stream: str, standing: StreamState) -> None:
         """Take in that nothing comes any more of a stream in doubt; a grid stands as its streams do."""
         if stream in self._standings:
             self._stand(stream, standing)

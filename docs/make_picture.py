@@ -12,7 +12,7 @@ from rich.console import Console
 
 from daqsvc import kernel_cache
 from sim_hw.demo.command import DemoCommand, script_of
-from sim_hw.demo.session import Session
+from sim_hw.demo.session import DemoSession
 from sim_hw.demo.summary import summarise
 from sim_hw.demo.view import View
 
@@ -29,7 +29,7 @@ def main() -> None:
     script = script_of(arguments)
     console = Console(record=True, width=WIDTH, file=io.StringIO())
     view = View(script, arguments.speed, Console(file=io.StringIO()))
-    session = Session(script, speed=arguments.speed, broker_url=arguments.broker, hear=view.hear)
+    session = DemoSession(script, speed=arguments.speed, broker_url=arguments.broker, hear=view.hear)
     outcome = asyncio.run(session.run())
     console.print(view.picture())
     view.show_summary(summarise(script, outcome, speed=arguments.speed), console)

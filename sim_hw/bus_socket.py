@@ -30,7 +30,7 @@ from daqsvc.commands.arguments import ArgumentParser
 from sim_hw.bus_socket_hub import QUEUE_FRAMES, Hub, HubError, HubTakenError, check_path
 from sim_hw.bus_socket_wire import (
     LONGEST,
-    Wish,
+    ClientOption,
     is_frame,
     overflow_message,
     pack_frame,
@@ -99,9 +99,9 @@ class UnixBus(can.BusABC):
         """Frames that were lost because this end did not read them in time."""
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         self._fd = fd
-        wish = Wish.ECHO if receive_own_messages else Wish.NOTHING
-        wish |= Wish.NOTHING if receive else Wish.DEAF
-        wish |= Wish.NOTHING if fd else Wish.CLASSIC
+        wish = ClientOption.ECHO if receive_own_messages else ClientOption.NOTHING
+        wish |= ClientOption.NOTHING if receive else ClientOption.DEAF
+        wish |= ClientOption.NOTHING if fd else ClientOption.CLASSIC
         self._socket = _join(self.channel, wish, queue_frames if hub == "start" else None)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
@@ -199,7 +199,7 @@ def _stamp_s(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
     return time.time()
 
 
-def _join(path: str, wish: Wish, queue_frames: int | None) -> socket.socket:
+def _join(path: str, wish: ClientOption, queue_frames: int | None) -> socket.socket:
     """A connection to the hub at ``path``, which is started if there is none, given ``queue_frames``."""
     until_s = time.monotonic() + OPEN_S
     try:
@@ -226,7 +226,7 @@ def _join(path: str, wish: Wish, queue_frames: int | None) -> socket.socket:
         raise can.CanInitializationError(str(error)) from error
 
 
-def _greeted(path: str, wish: Wish) -> socket.socket | None:
+def _greeted(path: str, wish: ClientOption) -> socket.socket | None:
     """A connection that the hub has answered on, so that no later frame is missed; None without a hub."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:

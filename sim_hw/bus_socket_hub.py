@@ -21,7 +21,7 @@ from pathlib import Path
 
 from sim_hw.bus_socket_wire import (
     LONGEST,
-    Wish,
+    ClientOption,
     is_fd_frame,
     is_frame,
     pack_greeting,
@@ -66,24 +66,24 @@ class HubCounters:
     clients: int = 0
 
 
-class _Client:
+class _HubClient:
     """One end of the bus, as the hub sees it."""
 
     def __init__(self, connection: socket.socket, limit: int) -> None:
         self.connection = connection
         self.joined = False
-        self.wish = Wish.NOTHING
+        self.wish = ClientOption.NOTHING
         self.backlog: deque[bytes] = deque()
         self._limit = limit
         self._untold = 0
 
-    def hears(self, sender: _Client, packet: bytes) -> bool:
+    def hears(self, sender: _HubClient, packet: bytes) -> bool:
         """Whether a frame of that sender is for this end."""
-        if not self.joined or Wish.DEAF in self.wish:
+        if not self.joined or ClientOption.DEAF in self.wish:
             return False
-        if Wish.CLASSIC in self.wish and is_fd_frame(packet):
+        if ClientOption.CLASSIC in self.wish and is_fd_frame(packet):
             return False
-        return sender is not self or Wish.ECHO in self.wish
+        return sender is not self or ClientOption.ECHO in self.wish
 
     def offer(self, packet: bytes) -> bool:
         """Send a packet, or queue it; False if it was lost because the queue is full.
@@ -149,7 +149,7 @@ class Hub:
         self._queue_frames = queue_frames
         self._until_empty = until_empty
         self._stopping = threading.Event()
-        self._clients: dict[socket.socket, _Client] = {}
+        self._clients: dict[socket.socket, _HubClient] = {}
         check_path(self.path)
         self._lock = _lock(self.path)
         try:
@@ -216,11 +216,11 @@ class Hub:
     def _accept(self) -> None:
         connection, _ = self._listener.accept()
         connection.setblocking(False)
-        self._clients[connection] = _Client(connection, self._queue_frames)
+        self._clients[connection] = _HubClient(connection, self._queue_frames)
         self._selector.register(connection, selectors.EVENT_READ)
         self.counters.clients += 1
 
-    def _receive(self, client: _Client) -> bool:
+    def _receive(self, client: _HubClient) -> bool:
         """Take what a client has sent, up to a burst; whether more may be there."""
         for _ in range(BURST_FRAMES):
             try:
@@ -238,7 +238,7 @@ class Hub:
             self._take(client, packet)
         return True
 
-    def _drain(self, client: _Client) -> None:
+    def _drain(self, client: _HubClient) -> None:
         """Take what a client had sent before its sending was shut off."""
         while True:
             try:
@@ -251,7 +251,7 @@ class Hub:
                 return
             self._take(client, packet)
 
-    def _take(self, client: _Client, packet: bytes) -> None:
+    def _take(self, client: _HubClient, packet: bytes) -> None:
         if not client.joined:
             wish = unpack_greeting(packet)
             if wish is None:
@@ -268,7 +268,7 @@ class Hub:
         else:
             self.counters.malformed += 1
 
-    def _deliver(self, client: _Client, packet: bytes) -> None:
+    def _deliver(self, client: _HubClient, packet: bytes) -> None:
         waited = bool(client.backlog)
         try:
             taken = client.offer(packet)
@@ -280,11 +280,11 @@ class Hub:
         if bool(client.backlog) != waited:
             self._watch(client)
 
-    def _watch(self, client: _Client) -> None:
+    def _watch(self, client: _HubClient) -> None:
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.backlog else 0)
         self._selector.modify(client.connection, events)
 
-    def _leave(self, client: _Client) -> None:
+    def _leave(self, client: _HubClient) -> None:
         if self._clients.pop(client.connection, None) is not None:
             self._selector.unregister(client.connection)
             client.connection.close()

@@ -35,7 +35,7 @@ _ERROR_RX_OVERFLOW = 0x01
 """Its second byte: the receive buffer ran over (CAN_ERR_CRTL_RX_OVERFLOW)."""
 
 
-class Wish(IntFlag):
+class ClientOption(IntFlag):
     """What a client asks of the hub in its greeting."""
 
     NOTHING = 0
@@ -101,17 +101,21 @@ def is_fd_frame(packet: bytes) -> bool:
     return len(packet) == FD_BYTES
 
 
-def pack_greeting(wish: Wish) -> bytes:
+def pack_greeting(wish: ClientOption) -> bytes:
     """The first packet of a client; the hub answers with the same."""
     return _GREETING.pack(_GREETED, wish)
 
 
-def unpack_greeting(packet: bytes) -> Wish | None:
+def unpack_greeting(packet: bytes) -> ClientOption | None:
     """What a client's first packet asks for; None if it is no greeting."""
     if len(packet) != _GREETING.size:
         return None
     mark, wish = _GREETING.unpack(packet)
-    return Wish(wish & (Wish.ECHO | Wish.DEAF | Wish.CLASSIC)) if mark == _GREETED else None
+    return (
+        ClientOption(wish & (ClientOption.ECHO | ClientOption.DEAF | ClientOption.CLASSIC))
+        if mark == _GREETED
+        else None
+    )
 
 
 def pack_lost(frames: int) -> bytes:

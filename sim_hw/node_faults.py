@@ -42,7 +42,7 @@ MOST_PPM = 10_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class FaultWindow:
     """A span of playing time, from its start up to, not including, its end.
 
     Attributes:
@@ -69,14 +69,14 @@ class Window:
         return held
 
 
-EVER = Window()
+EVER = FaultWindow()
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
     """The node's clock runs ``ppm`` too fast (too slow if negative)."""
 
-    window: Window
+    window: FaultWindow
     ppm: float
 
     def __post_init__(self) -> None:
@@ -85,10 +85,10 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True)
-class Delay:
+class FrameDelay:
     """Frames are late, each by ``delay_s`` and by up to ``jitter_s`` more, evenly distributed."""
 
-    window: Window
+    window: FaultWindow
     delay_s: float = 0.0
     jitter_s: float = 0.0
 
@@ -102,7 +102,7 @@ class Delay:
 class Babble:
     """Another node sends frames ``frame_id`` without data, ``rate_hz`` of them a second."""
 
-    window: Window
+    window: FaultWindow
     rate_hz: float
     frame_id: int = 0
 
@@ -117,7 +117,7 @@ BABBLER = -1
 """Stands for the frame's number where a frame is a babbling node's."""
 
 
-class Mark(IntEnum):
+class CountRestart(IntEnum):
     """Why a node's count begins again with a frame."""
 
     NONE = 0
@@ -132,7 +132,7 @@ class Schedule:
     Attributes:
         sample: int64 ``[f]``, which sample of the plant is the first of each frame.
         count: int64 ``[f]``, the node's own count of it.
-        mark: uint8 ``[f]``, a `Mark` where the count begins again, else 0.
+        mark: uint8 ``[f]``, a `CountRestart` where the count begins again, else 0.
         t_ns: int64 ``[f]``, when the last sample of each frame is taken.
     """
 
@@ -155,7 +155,7 @@ class NodePlan:
         fault: uint8 ``[m]``, the `Fault` done to it.
         flips: uint8 ``[m, length]``, bits to flip in the frame.
         late: bool ``[m]``, whether it is sent later than it was due.
-        mark: uint8 ``[m]``, a `Mark` at the frame with which the node counts anew.
+        mark: uint8 ``[m]``, a `CountRestart` at the frame with which the node counts anew.
         babble_id: int64 ``[m]``, id of a babbling node's frame, else -1.
     """
 
@@ -180,8 +180,8 @@ class NodePlan:
         return FaultCounts.of(
             self.fault[part],
             delayed=int(self.late[part].sum()),
-            brown_outs=int((self.mark[part] == Mark.BROWN_OUT).sum()),
-            counter_resets=int((self.mark[part] == Mark.COUNTER_RESET).sum()),
+            brown_outs=int((self.mark[part] == CountRestart.BROWN_OUT).sum()),
+            counter_resets=int((self.mark[part] == CountRestart.COUNTER_RESET).sum()),
         )
 
 
@@ -205,11 +205,11 @@ class NodeFaults:
     """
 
     drift: Sequence[Drift] = ()
-    brown_out: Sequence[Window] = ()
+    brown_out: Sequence[FaultWindow] = ()
     counter_reset_s: Sequence[float] = ()
-    silence: Sequence[Window] = ()
-    link: Sequence[tuple[Window, LinkFaults]] = ()
-    delay: Sequence[Delay] = ()
+    silence: Sequence[FaultWindow] = ()
+    link: Sequence[tuple[FaultWindow, LinkFaults]] = ()
+    delay: Sequence[FrameDelay] = ()
     babble: Sequence[Babble] = ()
     seed: int = 0
 
@@ -268,7 +268,7 @@ class NodeFaults:
         return _with_babble(plan, self.babble)
 
 
-def _refuse_overlap(what: str, windows: Iterable[Window]) -> None:
+def _refuse_overlap(what: str, windows: Iterable[FaultWindow]) -> None:
     ordered = sorted(windows, key=lambda window: window.start_s)
     for one, other in itertools.pairwise(ordered):
         if other.start_s < one.end_s:
@@ -332,10 +332,10 @@ def _taken_ns(drifts: Sequence[Drift], samples: int, rate_hz: float) -> Times:
     return np.rint(taken_s * NS_PER_S).astype(np.int64)
 
 
-def _sessions(faults: NodeFaults, taken_ns: Times, per_frame: int) -> Iterator[tuple[int, int, Mark]]:
+def _sessions(faults: NodeFaults, taken_ns: Times, per_frame: int) -> Iterator[tuple[int, int, CountRestart]]:
     """First sample and end of each stretch over which the node's count is one, and why it begins."""
     resets = sorted(_index(taken_ns, at) for at in faults.counter_reset_s)
-    begin, mark = 0, Mark.NONE
+    begin, mark = 0, CountRestart.NONE
     for off in [*sorted(faults.brown_out, key=lambda window: window.start_s), None]:
         end = len(taken_ns) if off is None else _index(taken_ns, off.start_s)
         for reset in resets:
@@ -343,10 +343,10 @@ def _sessions(faults: NodeFaults, taken_ns: Times, per_frame: int) -> Iterator[t
             at = begin - (begin - reset) // per_frame * per_frame
             if begin < at < end:
                 yield begin, at, mark
-                begin, mark = at, Mark.COUNTER_RESET
+                begin, mark = at, CountRestart.COUNTER_RESET
         yield begin, end, mark
         if off is not None:
-            begin, mark = _index(taken_ns, off.end_s), Mark.BROWN_OUT
+            begin, mark = _index(taken_ns, off.end_s), CountRestart.BROWN_OUT
 
 
 def _schedule(faults: NodeFaults, taken_ns: Times, per_frame: int, first_index: int) -> Schedule:
@@ -357,8 +357,8 @@ def _schedule(faults: NodeFaults, taken_ns: Times, per_frame: int, first_index: 
         frames = max(end - begin, 0) // per_frame
         since = per_frame * np.arange(frames, dtype=np.int64)
         sample.append(begin + since)
-        count.append(since + (first_index if why == Mark.NONE else 0))
-        mark.append(np.where(since == 0, why, Mark.NONE).astype(np.uint8))
+        count.append(since + (first_index if why == CountRestart.NONE else 0))
+        mark.append(np.where(since == 0, why, CountRestart.NONE).astype(np.uint8))
     firsts = np.concatenate(sample)
     return Schedule(
         sample=firsts,
@@ -371,7 +371,7 @@ def _schedule(faults: NodeFaults, taken_ns: Times, per_frame: int, first_index: 
 def _on_the_link(faults: NodeFaults, schedule: Schedule, length: int) -> _Events:
     """What is sent, and what the link does to it."""
     frames = len(schedule.t_ns)
-    begins = schedule.mark != Mark.NONE
+    begins = schedule.mark != CountRestart.NONE
     begins[:1] = True
     session = np.cumsum(begins)
     at_an_end = begins | np.append(begins[1:], True)
@@ -393,7 +393,7 @@ def _on_the_link(faults: NodeFaults, schedule: Schedule, length: int) -> _Events
     return _Events.joined(parts, length)
 
 
-def _arrivals(delays: Sequence[Delay], t_ns: Times, rng: np.random.Generator) -> Times:
+def _arrivals(delays: Sequence[FrameDelay], t_ns: Times, rng: np.random.Generator) -> Times:
     """When each frame arrives: after its delay, and not before those ahead of it."""
     wait_s = np.zeros(len(t_ns))
     for delay in delays:
@@ -422,12 +422,12 @@ def _with_babble(plan: NodePlan, babbles: Sequence[Babble]) -> NodePlan:
         fault=filled(plan.fault, Fault.BABBLED),
         flips=filled(plan.flips, 0),
         late=filled(plan.late, 0),
-        mark=filled(plan.mark, Mark.NONE),
+        mark=filled(plan.mark, CountRestart.NONE),
         babble_id=np.concatenate([plan.babble_id, *ids])[order],
     )
 
 
-def _any_holds(windows: Iterable[Window], t_ns: Times) -> NDArray[np.bool_]:
+def _any_holds(windows: Iterable[FaultWindow], t_ns: Times) -> NDArray[np.bool_]:
     held = np.zeros(len(t_ns), np.bool_)
     for window in windows:
         held |= window.holds(t_ns)

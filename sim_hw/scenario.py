@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
-from sim_hw.plants.rotor import Change, RotorParameters, simulate
+from sim_hw.plants.rotor import Change, PlantParameters, simulate
 from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
 from sim_hw.scenario_bearing import BearingScenario
-from sim_hw.scenario_faults import FaultTable, LinkFaultRates, planned_faults
+from sim_hw.scenario_faults import FaultTable, LinkFaultRates, ScenarioTable, planned_faults
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
 
 _BUILTIN = "scenarios"
-_Kind = TypeVar("_Kind", bound=BaseModel)
+_Kind = TypeVar("_Kind", bound=ScenarioTable)
 
 
 class ScenarioError(ValueError):
@@ -79,18 +79,14 @@ class SimulatedMachine:
         return len(self.channels["keyphasor_v"])
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Plant(_Table):
-    """The machine. Rotor parameters not given are the paper's (`RotorParameters`)."""
+class Plant(ScenarioTable):
+    """The machine. Rotor parameters not given are the paper's (`PlantParameters`)."""
 
     kind: Literal["rotor"]
     healthy_mode: str = Field(default="N", min_length=1)
     speed_rpm: float = Field(default=600.0, gt=0, allow_inf_nan=False)
     clearance_um: float = Field(default=100.0, gt=0, allow_inf_nan=False)
-    rotor: RotorParameters = RotorParameters()
+    rotor: PlantParameters = PlantParameters()
     process_noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
     @model_validator(mode="before")
@@ -101,7 +97,7 @@ class Plant(_Table):
         return table
 
 
-class Noise(_Table):
+class Noise(ScenarioTable):
     """Noise of the sensors.
 
     ``snr_db`` is the AC power of a channel in the healthy mode over the noise's variance, in the whole
@@ -112,7 +108,7 @@ class Noise(_Table):
     keyphasor_v: float = Field(default=0.02, ge=0, allow_inf_nan=False)
 
 
-class Mode(_Table):
+class ScenarioMode(ScenarioTable):
     """A change of the machine: from ``at_rev`` on, ``change`` replaces these of its healthy parameters."""
 
     mode: str = Field(min_length=1)
@@ -125,7 +121,7 @@ class Mode(_Table):
         return self
 
 
-class Scenario(_Table):
+class Scenario(ScenarioTable):
     """One scenario file.
 
     Attributes:
@@ -149,7 +145,7 @@ class Scenario(_Table):
     dither_rev: float = Field(default=0.5, ge=0, allow_inf_nan=False)
     plant: Plant
     noise: Noise = Noise()
-    onset: tuple[Mode, ...] = ()
+    onset: tuple[ScenarioMode, ...] = ()
     link_faults: LinkFaultRates | None = None
     fault: tuple[FaultTable, ...] = ()
 
@@ -181,7 +177,7 @@ class Scenario(_Table):
         self.node_faults()
         return self
 
-    def _parameters(self, onset: Mode) -> RotorParameters:
+    def _parameters(self, onset: ScenarioMode) -> PlantParameters:
         return replace(self.plant.rotor, **onset.change)
 
     @property
@@ -301,7 +297,7 @@ def _builtin_files() -> dict[str, Traversable]:
 
 
 def _check_names(parameters: dict[str, object] | dict[str, float]) -> None:
-    known = [field.name for field in fields(RotorParameters)]
+    known = [field.name for field in fields(PlantParameters)]
     unknown = [name for name in parameters if name not in known]
     if unknown:
         raise ValueError(

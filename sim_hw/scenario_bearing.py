@@ -7,10 +7,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from sim_hw.plants.bearing import BearingMachine, FaultSignal, Levels, levels, simulate
-from sim_hw.scenario_faults import FaultTable, LinkFaultRates, planned_faults
+from sim_hw.plants.bearing import BearingMachine, FaultSignal, NoiseLevels, levels, simulate
+from sim_hw.scenario_faults import FaultTable, LinkFaultRates, ScenarioTable, planned_faults
 
 if TYPE_CHECKING:
     from typing import Self
@@ -22,14 +22,10 @@ if TYPE_CHECKING:
 
     Floats: TypeAlias = NDArray[np.float64]
 
-_SILENT = Levels((0.0, 0.0), 0.0)
+_SILENT = NoiseLevels((0.0, 0.0), 0.0)
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class BearingPlant(_Table):
+class BearingPlant(ScenarioTable):
     """A machine by its masses, stiffnesses and dampings, in SI units.
 
     Those not given have the mode of its rolling elements at 4.2 kHz (the set ``S3`` of the bearing's model).
@@ -50,14 +46,14 @@ class BearingPlant(_Table):
         )
 
 
-class Damage(_Table):
+class RaceDamage(ScenarioTable):
     """From ``at_s`` on these parts are damaged, and no others."""
 
     part: Literal["healthy", "inner", "outer", "ball", "inner_and_outer"]
     at_s: float = Field(ge=0, allow_inf_nan=False)
 
 
-class BearingScenario(_Table):
+class BearingScenario(ScenarioTable):
     """One scenario file whose plant is a bearing.
 
     Attributes:
@@ -74,7 +70,7 @@ class BearingScenario(_Table):
     seed: int = Field(default=1, ge=0)
     duration_s: float = Field(gt=0, le=3600)
     plant: BearingPlant
-    damage: tuple[Damage, ...] = ()
+    damage: tuple[RaceDamage, ...] = ()
     link_faults: LinkFaultRates | None = None
     fault: tuple[FaultTable, ...] = ()
 
@@ -93,7 +89,9 @@ class BearingScenario(_Table):
         """What goes wrong with nodes and link; None if nothing does."""
         return planned_faults(self.fault, self.link_faults, self.seed if seed is None else seed)
 
-    def accelerations(self, rate_hz: float, seed: int | None = None, snr_db: float | None = None) -> Run:
+    def accelerations(
+        self, rate_hz: float, seed: int | None = None, snr_db: float | None = None
+    ) -> ScenarioRun:
         """Run the scenario; the same seed gives the same samples.
 
         Args:
@@ -113,7 +111,7 @@ class BearingScenario(_Table):
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(1 + len(self.damage))
         )
 
-        def run(part: Fault, level: Levels, rng: np.random.Generator) -> Floats:
+        def run(part: Fault, level: NoiseLevels, rng: np.random.Generator) -> Floats:
             machine = self.plant.machine
             return simulate(machine, signal, part, level, rng, seconds=self.duration_s, rate_hz=rate_hz).y
 
@@ -123,11 +121,11 @@ class BearingScenario(_Table):
         for damage, (from_s, to_s), rng in zip(self.damage, pairwise(borders_s), of_damage, strict=True):
             part = slice(round(from_s * rate_hz), round(to_s * rate_hz))
             y[part] += run(damage.part, _SILENT, rng)[part]
-        return Run(rotor_m_s2=y[:, 0], housing_m_s2=y[:, 1])
+        return ScenarioRun(rotor_m_s2=y[:, 0], housing_m_s2=y[:, 1])
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ScenarioRun:
     """What accelerometers on the rotor and on the housing said: float64 ``[n]`` each, in m/s^2."""
 
     rotor_m_s2: Floats

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sim_hw.link_faults import LinkFaults
-from sim_hw.node_faults import EVER, Babble, Delay, Drift, NodeFaults, Window
+from sim_hw.node_faults import EVER, Babble, Drift, FaultWindow, FrameDelay, NodeFaults
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,20 +18,22 @@ Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _MS_PER_S = 1000.0
 
 
-class _Table(BaseModel):
+class ScenarioTable(BaseModel):
+    """A table of a scenario file: no key but those that are known."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _Timed(_Table):
+class _Timed(ScenarioTable):
     """A fault from ``from_s`` to ``to_s`` of the playing; for all the rest of it unless ``to_s`` is given."""
 
     from_s: Seconds = 0.0
     to_s: Seconds | None = None
 
     @property
-    def window(self) -> Window:
+    def window(self) -> FaultWindow:
         """When it is there."""
-        return Window(self.from_s, math.inf if self.to_s is None else self.to_s)
+        return FaultWindow(self.from_s, math.inf if self.to_s is None else self.to_s)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -39,7 +41,7 @@ class _Timed(_Table):
         return self
 
 
-class LinkFaultRates(_Table):
+class LinkFaultRates(ScenarioTable):
     """Probabilities per frame of what the link does wrong, see `LinkFaults`."""
 
     drop: float = 0.0
@@ -106,7 +108,7 @@ class BabbleTable(_Timed):
     id: int = Field(default=0, ge=0, lt=2**11)
 
 
-class CounterResetTable(_Table):
+class CounterResetTable(ScenarioTable):
     """The nodes count from 0 again, without a pause."""
 
     kind: Literal["counter-reset"]
@@ -143,7 +145,7 @@ def planned_faults(
         silence=[t.window for t in tables if isinstance(t, SilenceTable)],
         link=link,
         delay=[
-            Delay(t.window, t.delay_ms / _MS_PER_S, t.jitter_ms / _MS_PER_S)
+            FrameDelay(t.window, t.delay_ms / _MS_PER_S, t.jitter_ms / _MS_PER_S)
             for t in tables
             if isinstance(t, DelayTable)
         ],

@@ -12,12 +12,12 @@ import numpy as np
 from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from sim_hw.node_faults import NodeFaults
-from sim_hw.nodes.modbus_node import Answer, ModbusNode, ModbusRtuServer, ModbusTcpServer
+from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.sim_command_order import NodeError
 
 if TYPE_CHECKING:
-    from sim_hw.node_faults import Window
+    from sim_hw.node_faults import FaultWindow
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.sim_command_order import NodeOrder
 
@@ -60,25 +60,25 @@ class ReplyFaults:
         """The playing begins now."""
         self._start_ns = self._clock.monotonic_ns()
 
-    def __call__(self, unit: int, pdu: bytes) -> Answer:
+    def __call__(self, unit: int, pdu: bytes) -> PlannedReply:
         """What becomes of the reply to this request."""
         del unit, pdu
         t_s = (self._clock.monotonic_ns() - self._start_ns) / NS_PER_S
         self.injected["requests"] += 1
         draw, late = self._rng.random(2)
         if any(_holds(window, t_s) for window in self._faults.silence):
-            return self._counted("silenced", Answer("silent"))
+            return self._counted("silenced", PlannedReply("silent"))
         for window, link in self._faults.link:
             if _holds(window, t_s) and draw < link.drop:
-                return self._counted("dropped", Answer("silent"))
+                return self._counted("dropped", PlannedReply("silent"))
             if _holds(window, t_s) and draw < link.drop + link.corrupt:
-                return self._counted("corrupted", Answer("corrupt"))
+                return self._counted("corrupted", PlannedReply("corrupt"))
         delay_s = sum(d.delay_s + d.jitter_s * late for d in self._faults.delay if _holds(d.window, t_s))
         if delay_s:
-            return self._counted("delayed", Answer(delay_ns=round(delay_s * NS_PER_S)))
-        return Answer()
+            return self._counted("delayed", PlannedReply(delay_ns=round(delay_s * NS_PER_S)))
+        return PlannedReply()
 
-    def _counted(self, what: str, answer: Answer) -> Answer:
+    def _counted(self, what: str, answer: PlannedReply) -> PlannedReply:
         self.injected[what] += 1
         return answer
 
@@ -159,5 +159,5 @@ class ModbusNodes:
         self._server.stop()
 
 
-def _holds(window: Window, t_s: float) -> bool:
+def _holds(window: FaultWindow, t_s: float) -> bool:
     return window.start_s <= t_s < window.end_s

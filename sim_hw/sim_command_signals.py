@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
     from daqsvc.settings.sensors import BaseSensor
-    from sim_hw.scenario_bearing import BearingScenario, Run
+    from sim_hw.scenario_bearing import BearingScenario, ScenarioRun
 
 logger = logging.getLogger(__name__)
 
@@ -138,7 +138,7 @@ class BearingSignals:
             kept = tuple(damage for damage in scenario.damage if damage.at_s < duration_s)
             scenario = scenario.model_copy(update={"duration_s": duration_s, "damage": kept})
         self._scenario, self._seed, self._snr_db = scenario, seed, snr_db
-        self._runs: dict[float, Run] = {}
+        self._runs: dict[float, ScenarioRun] = {}
         self._seen: list[str] = []
 
     def of(self, sensor: BaseSensor, rate_hz: float) -> NDArray[np.float64]:

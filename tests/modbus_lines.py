@@ -14,7 +14,7 @@ from pymodbus.transport import CommParams, CommType, ModbusProtocol
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from sim_hw.nodes.modbus_node import ModbusWire
+from sim_hw.nodes.modbus_node import UnitConnection
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
@@ -136,7 +136,7 @@ class _Cable:
     """A serial cable: units on it do not know who has opened its other end, and send to whoever has."""
 
     def __init__(self, units: Mapping[int, ModbusUnit], plan: FaultPlan) -> None:
-        self.wire = ModbusWire(units, self._send, serial=True, plan=plan, clock=LoopClock())
+        self.wire = UnitConnection(units, self._send, serial=True, plan=plan, clock=LoopClock())
         self.end: ModbusProtocol | None = None
 
     def _send(self, data: bytes) -> None:
@@ -166,7 +166,7 @@ class Responder(ModbusProtocol):
         if cable is not None:
             self._wire = cable.wire
         else:
-            self._wire = ModbusWire(units, self.send, serial=False, plan=plan, clock=LoopClock())
+            self._wire = UnitConnection(units, self.send, serial=False, plan=plan, clock=LoopClock())
 
     def callback_new_connection(self) -> ModbusProtocol:
         connection = Responder(*self._given, cable=self._cable)

@@ -15,7 +15,7 @@ import numpy as np
 from daqsvc import assembly_drivers
 from drivers.base import StreamSpec
 from drivers.serial.driver import framing_of
-from sim_hw.nodes.modbus_node import Answer, ModbusRtuServer, ModbusTcpServer
+from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
@@ -140,13 +140,15 @@ class ModbusRogue:
         self.unit.put("holding", RING_PLACES.start, self._values(2 * len(RING_PLACES)))
         self.unit.put("holding", TREND, self._rng.bytes(4))
 
-    def plan(self, unit: int, pdu: bytes) -> Answer:
+    def plan(self, unit: int, pdu: bytes) -> PlannedReply:
         """What becomes of a reply."""
         del unit, pdu
         spoilt = self._phase.damage or float(self._phase.values == "noise")
         if self._rng.random() >= spoilt:
-            return Answer()
-        return Answer(FAULTS[int(self._rng.integers(len(FAULTS)))], int(self._rng.integers(0, 20_000_000)))  # type: ignore[arg-type]
+            return PlannedReply()
+        return PlannedReply(
+            FAULTS[int(self._rng.integers(len(FAULTS)))], int(self._rng.integers(0, 20_000_000))
+        )  # type: ignore[arg-type]
 
     def _counter(self) -> bytes:
         count = {

@@ -25,7 +25,7 @@ from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
 PER_REV = 64
 DURATION = 2.0 * math.pi / PER_REV
 CLEARANCE_UM = 100.0
-HEALTHY = plant.RotorParameters()
+HEALTHY = plant.PlantParameters()
 PROCESS_NOISE = 1e-4
 
 ROTOR = RotorParameters(
@@ -129,9 +129,9 @@ def run(changes, revolutions, seed, healthy=HEALTHY, process_noise=0.0):
     """Simulate; ``changes`` are pairs of revolution and altered parameters, dithered by up to half a turn."""
     rng = np.random.default_rng([seed, 1])
     begins = [at + rng.uniform(-0.5, 0.5) for at, _ in changes]
-    base = {name: getattr(healthy, name) for name in plant.RotorParameters.__slots__}
+    base = {name: getattr(healthy, name) for name in plant.PlantParameters.__slots__}
     steps = [
-        plant.Change(at, plant.RotorParameters(**{**base, **change}))
+        plant.Change(at, plant.PlantParameters(**{**base, **change}))
         for at, (_, change) in zip(begins, changes, strict=True)
     ]
     motion = plant.simulate(

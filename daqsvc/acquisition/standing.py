@@ -23,7 +23,7 @@ PROVING_NS = 5 * NS_PER_S
 """Until then a stream's rate is either known, or it is not waited for."""
 
 
-class Standing(NamedTuple):
+class StreamState(NamedTuple):
     """How a stream stands.
 
     Attributes:
@@ -39,11 +39,11 @@ class Standing(NamedTuple):
 
 _FIGURE = re.compile("[0-9]")
 
-Tell: TypeAlias = "Callable[[str, Standing], None]"
+Tell: TypeAlias = "Callable[[str, StreamState], None]"
 """Called with the name of a stream and its standing whenever that changes; a doubt also while frames come."""
 
 
-def tell_nobody(stream: str, standing: Standing) -> None:
+def tell_nobody(stream: str, standing: StreamState) -> None:
     """Nobody wants to know how a stream stands."""
 
 
@@ -63,7 +63,7 @@ class StreamStanding:
     def __init__(self, stream: str, tell: Tell) -> None:
         self._stream = stream
         self._tell = tell
-        self._now: Standing | None = None
+        self._now: StreamState | None = None
         self._begun_ns: int | None = None
         self._told_ns = 0
         self._said_ns: dict[str, int] = {}
@@ -73,7 +73,7 @@ class StreamStanding:
         """Take in how the stream stands.
 
         Args:
-            doubt: see `Standing.doubt`.
+            doubt: see `StreamState.doubt`.
             now_ns: arrival of its newest frame.
             known: whether its rate is known.
         """
@@ -82,7 +82,7 @@ class StreamStanding:
         proven = known or bool(doubt) or now_ns - self._begun_ns >= PROVING_NS
         if self._now is not None:
             proven = proven or self._now.proven
-        standing = Standing(doubt, proven)
+        standing = StreamState(doubt, proven)
         if standing == self._now and not (doubt and abs(now_ns - self._told_ns) >= AGAIN_NS):
             return
         before, self._now = self._now, standing

@@ -10,23 +10,23 @@ from daqsvc.alarms.chatter import ChatterWatch
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
 from daqsvc.alarms.states import (
     AlarmState,
+    CommandNotAllowedError,
     Hold,
     Level,
-    RefusedError,
     Stimulus,
     shown,
     strongest_first,
     transition,
 )
-from daqsvc.alarms.status import AlarmStatus, Request
+from daqsvc.alarms.status import AlarmStatus, HandlingRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from daqsvc.alarms.chatter import ChatterLimit
     from daqsvc.alarms.events import Identity
-    from daqsvc.alarms.rules import Finding
-    from daqsvc.alarms.status import Instant
+    from daqsvc.alarms.rules import RuleFinding
+    from daqsvc.alarms.status import ClockReading
     from daqsvc.diagnosis.record import Diagnosis
 
 CHANGES_NS = 5 * NS_PER_S
@@ -67,7 +67,7 @@ class Alarm:
         self._shelved_until_ns: int | None = None
         self._occurrence: str | None = None
         self._cause: Diagnosis | None = None
-        self._since: Instant | None = None
+        self._since: ClockReading | None = None
         self._message = ""
         self._changed_ns: int | None = None
 
@@ -105,12 +105,12 @@ class Alarm:
         """Whether ``hold`` covers the state."""
         return bool(self._holds) and hold in self._holds
 
-    def resume(self, told: AlarmEvent, found: str, since: Instant, now: Instant) -> None:
+    def resume(self, told: AlarmEvent, found: str, since: ClockReading, now: ClockReading) -> None:
         """Stand as the last event before a restart said.
 
         Args:
             told: that event.
-            found: `Finding.identity` of what stood; empty if nobody knows.
+            found: `RuleFinding.identity` of what stood; empty if nobody knows.
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
                 left of it at ``told`` is never exceeded.
@@ -126,23 +126,29 @@ class Alarm:
         self._chatter.resume(chattering=told.chattering)
         self._since, self._message = since, told.message
 
-    def withdraw(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
+    def withdraw(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Return to normal, from whatever state, because nobody will judge the alarm any more."""
         before = self._shown
         self._holds, self._shelved_until_ns, self.doubts = set(), None, ()
         self._chatter.resume(chattering=False)
         message = f"{self.name} returned to normal: {reason}"
         return self._change(
-            EventKind.RETURNED, AlarmState.NORMAL, Level.NORMAL, cause, Request("", at), message, before
+            EventKind.RETURNED,
+            AlarmState.NORMAL,
+            Level.NORMAL,
+            cause,
+            HandlingRequest("", at),
+            message,
+            before,
         )
 
-    def apply(self, finding: Finding, cause: Diagnosis, at: Instant) -> list[AlarmEvent]:
+    def apply(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """Take in what the rule finds; no event if that is nothing new."""
         events: list[AlarmEvent] = []
         if self._chatter.chattering:
             if self._chatter.quietens(finding.level, at.t_ns):
                 message = f"{self.name} is quiet again: {finding.sentence}"
-                events.append(self._event(EventKind.QUIET, cause, Request("", at), message))
+                events.append(self._event(EventKind.QUIET, cause, HandlingRequest("", at), message))
             elif finding.level < self._level:
                 return self._held_back(finding, cause, at)
         event = self._found_normal(finding, cause, at) or self._found_bad(finding, cause, at)
@@ -151,10 +157,10 @@ class Alarm:
         events.append(event)
         if event.kind in ANNUNCIATIONS and self._chatter.raised(at.t_ns):
             message = f"{self.name} chatters: its returns are held back until it is quiet"
-            events.append(self._event(EventKind.CHATTERING, cause, Request("", at), message))
+            events.append(self._event(EventKind.CHATTERING, cause, HandlingRequest("", at), message))
         return events
 
-    def waits(self, finding: Finding, at: Instant) -> bool:
+    def waits(self, finding: RuleFinding, at: ClockReading) -> bool:
         """Whether a finding of a quality alarm has nothing new but its reason, and the last is too recent.
 
         Apply it again later, then: the reason that stands by that time is told.
@@ -168,7 +174,7 @@ class Alarm:
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
         )
 
-    def _held_back(self, finding: Finding, cause: Diagnosis, at: Instant) -> list[AlarmEvent]:
+    def _held_back(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
         not_ok, told = ({d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts))
         # That nobody lacks samples any more the next good statement after a restart says, too.
@@ -179,23 +185,25 @@ class Alarm:
             return []
         self._found = finding.identity
         message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"
-        return [self._event(EventKind.CHANGED, cause, Request("", at), message)]
+        return [self._event(EventKind.CHANGED, cause, HandlingRequest("", at), message)]
 
     def hold(self) -> None:
         """Data are missing: everything stays, and no time counts."""
         self._chatter.hold()
 
-    def _found_normal(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
+    def _found_normal(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
         if finding.level is not Level.NORMAL or not self._state.is_active:
             return None
         state = transition(self._state, Stimulus.CLEAR, latching=self._latching)
         if state.is_latched:
             message = f"{self.name} latched at {self._level.label}: {finding.sentence}"
-            return self._change(EventKind.LATCHED, state, self._level, cause, Request("", at), message)
+            return self._change(
+                EventKind.LATCHED, state, self._level, cause, HandlingRequest("", at), message
+            )
         message = f"{self.name} returned to normal: {finding.sentence}"
-        return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, Request("", at), message)
+        return self._change(EventKind.RETURNED, state, Level.NORMAL, cause, HandlingRequest("", at), message)
 
-    def _found_bad(self, finding: Finding, cause: Diagnosis, at: Instant) -> AlarmEvent | None:
+    def _found_bad(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> AlarmEvent | None:
         kind, level = self._worsening(finding)
         if kind is None:
             return None
@@ -205,9 +213,9 @@ class Alarm:
         stimulus = Stimulus.ESCALATE if kind is EventKind.ESCALATED else Stimulus.RAISE
         state = transition(self._state, stimulus, latching=self._latching)
         message = f"{self.name} {level.label}: {finding.sentence}"
-        return self._change(kind, state, level, cause, Request("", at), message)
+        return self._change(kind, state, level, cause, HandlingRequest("", at), message)
 
-    def _worsening(self, finding: Finding) -> tuple[EventKind | None, Level]:
+    def _worsening(self, finding: RuleFinding) -> tuple[EventKind | None, Level]:
         """What a finding that is not normal means here, and the level that it leads to."""
         if finding.level is Level.NORMAL:
             return None, self._level
@@ -222,20 +230,20 @@ class Alarm:
             return EventKind.LOWERED, level
         return (EventKind.CHANGED if finding.identity != self._found else None), level
 
-    def suppress(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
+    def suppress(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Cover the state because a sensor is not OK."""
         before = self._cover(Hold.SUPPRESSED)
         self.hold()
         message = f"{self.name} suppressed: {reason}"
-        return self._event(EventKind.SUPPRESSED, cause, Request("", at), message, before)
+        return self._event(EventKind.SUPPRESSED, cause, HandlingRequest("", at), message, before)
 
-    def unsuppress(self, reason: str, cause: Diagnosis, at: Instant) -> AlarmEvent:
+    def unsuppress(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Show the state again that was covered."""
         before = self._uncover(Hold.SUPPRESSED)
         message = f"{self.name} unsuppressed: {reason}"
-        return self._event(EventKind.UNSUPPRESSED, cause, Request("", at), message, before)
+        return self._event(EventKind.UNSUPPRESSED, cause, HandlingRequest("", at), message, before)
 
-    def shelve(self, until_ns: int, request: Request, nothing: Diagnosis) -> AlarmEvent:
+    def shelve(self, until_ns: int, request: HandlingRequest, nothing: Diagnosis) -> AlarmEvent:
         """Cover the state until ``until_ns`` by the monotonic clock, or change that time.
 
         Args:
@@ -248,80 +256,82 @@ class Alarm:
         message = f"{self.name} shelved{_signed(request, f' for {_lasting(until_ns - request.at.t_ns)}')}"
         return self._event(EventKind.SHELVED, self._cause or nothing, request, message, before)
 
-    def unshelve(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+    def unshelve(self, request: HandlingRequest, nothing: Diagnosis) -> AlarmEvent:
         """Show the state again before the shelving is over.
 
         Raises:
-            RefusedError: it is not shelved.
+            CommandNotAllowedError: it is not shelved.
         """
         self._expect(Hold.SHELVED, "unshelve")
         before = self._uncover(Hold.SHELVED)
         message = f"{self.name} unshelved{_signed(request)}"
         return self._event(EventKind.UNSHELVED, self._cause or nothing, request, message, before)
 
-    def expire(self, at: Instant, nothing: Diagnosis) -> AlarmEvent | None:
+    def expire(self, at: ClockReading, nothing: Diagnosis) -> AlarmEvent | None:
         """Show the state again if the shelving is over."""
         if self._shelved_until_ns is None or at.t_ns < self._shelved_until_ns:
             return None
         before = self._uncover(Hold.SHELVED)
         message = f"{self.name} unshelved: its time is over"
-        return self._event(EventKind.UNSHELVED, self._cause or nothing, Request("", at), message, before)
+        return self._event(
+            EventKind.UNSHELVED, self._cause or nothing, HandlingRequest("", at), message, before
+        )
 
-    def bypass(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+    def bypass(self, request: HandlingRequest, nothing: Diagnosis) -> AlarmEvent:
         """Cover the state until somebody puts the alarm back into service.
 
         Raises:
-            RefusedError: it is out of service already.
+            CommandNotAllowedError: it is out of service already.
         """
         if self.is_held(Hold.OUT_OF_SERVICE):
-            raise RefusedError(f"cannot bypass {self.name}: it is out of service already")
+            raise CommandNotAllowedError(f"cannot bypass {self.name}: it is out of service already")
         before = self._cover(Hold.OUT_OF_SERVICE)
         message = f"{self.name} taken out of service{_signed(request)}"
         return self._event(EventKind.BYPASSED, self._cause or nothing, request, message, before)
 
-    def unbypass(self, request: Request, nothing: Diagnosis) -> AlarmEvent:
+    def unbypass(self, request: HandlingRequest, nothing: Diagnosis) -> AlarmEvent:
         """Put the alarm back into service.
 
         Raises:
-            RefusedError: it is in service.
+            CommandNotAllowedError: it is in service.
         """
         self._expect(Hold.OUT_OF_SERVICE, "unbypass")
         before = self._uncover(Hold.OUT_OF_SERVICE)
         message = f"{self.name} put back into service{_signed(request)}"
         return self._event(EventKind.UNBYPASSED, self._cause or nothing, request, message, before)
 
-    def acknowledge(self, request: Request) -> AlarmEvent:
+    def acknowledge(self, request: HandlingRequest) -> AlarmEvent:
         """A person has seen it.
 
         Raises:
-            RefusedError: there is nothing to acknowledge, or the alarm is held.
+            CommandNotAllowedError: there is nothing to acknowledge, or the alarm is held.
         """
         return self._obey(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, request)
 
-    def reset(self, request: Request) -> AlarmEvent:
+    def reset(self, request: HandlingRequest) -> AlarmEvent:
         """A person lets go of a latched alarm.
 
         Raises:
-            RefusedError: its condition stands, there is nothing to reset, or the alarm is held.
+            CommandNotAllowedError: its condition stands, there is nothing to reset, or the alarm is held.
         """
         return self._obey(Stimulus.RESET, EventKind.RESET, request)
 
-    def _obey(self, stimulus: Stimulus, kind: EventKind, request: Request) -> AlarmEvent:
+    def _obey(self, stimulus: Stimulus, kind: EventKind, request: HandlingRequest) -> AlarmEvent:
         cause = self._cause
         if self._holds or cause is None:
             reason = f"it is {self._shown.in_words}" if self._holds else "it has never been raised"
-            raise RefusedError(f"cannot {stimulus.value} {self.name}: {reason}")
+            raise CommandNotAllowedError(f"cannot {stimulus.value} {self.name}: {reason}")
         try:
             state = transition(self._state, stimulus, latching=self._latching)
-        except RefusedError as refusal:
-            raise RefusedError(f"cannot {stimulus.value} {self.name}: {refusal}") from None
+        except CommandNotAllowedError as refusal:
+            raise CommandNotAllowedError(f"cannot {stimulus.value} {self.name}: {refusal}") from None
         level = Level.NORMAL if kind is EventKind.RESET else self._level
         message = f"{self.name} {kind.value}{_signed(request)}"
         return self._change(kind, state, level, cause, request, message)
 
     def _expect(self, hold: Hold, verb: str) -> None:
         if not self.is_held(hold):
-            raise RefusedError(f"cannot {verb} {self.name}: it is not {hold.value.in_words}")
+            raise CommandNotAllowedError(f"cannot {verb} {self.name}: it is not {hold.value.in_words}")
 
     def _cover(self, hold: Hold) -> AlarmState:
         """Lay ``hold`` over the state; what was seen before."""
@@ -342,7 +352,7 @@ class Alarm:
         state: AlarmState,
         level: Level,
         cause: Diagnosis,
-        request: Request,
+        request: HandlingRequest,
         message: str,
         before: AlarmState | None = None,
     ) -> AlarmEvent:
@@ -357,7 +367,7 @@ class Alarm:
         self,
         kind: EventKind,
         cause: Diagnosis,
-        request: Request,
+        request: HandlingRequest,
         message: str,
         before: AlarmState | None = None,
         level_before: Level | None = None,
@@ -393,7 +403,7 @@ class Alarm:
         )
 
 
-def _signed(request: Request, lasting: str = "") -> str:
+def _signed(request: HandlingRequest, lasting: str = "") -> str:
     """Who asked, for how long, and why, as the end of a sentence."""
     by = f" by {request.by}" if request.by else ""
     return by + lasting + (f": {request.reason}" if request.reason else "")

@@ -10,7 +10,7 @@ from daqsvc.diagnosis.record import Diagnosis
 
 if TYPE_CHECKING:
     from daqsvc.alarms.events import AlarmEvent
-    from daqsvc.alarms.status import Instant
+    from daqsvc.alarms.status import ClockReading
 
 SERVICE = "service"
 """The "detector" of such conditions."""
@@ -21,17 +21,17 @@ RESERVED = frozenset({ALARM_FLOOD, TRIP_MULTIPLY})
 """Names that no alarm of a machine file may have; other conditions have a ``/`` in theirs, which none may."""
 
 
-def statement(machine: str, condition: str, level: Level, at: Instant) -> Diagnosis:
+def statement(machine: str, condition: str, level: Level, at: ClockReading) -> Diagnosis:
     """The service's statement that ``condition`` stands at ``level``."""
     return _statement(machine, condition, level, at)
 
 
-def no_statement(machine: str, at: Instant) -> Diagnosis:
+def no_statement(machine: str, at: ClockReading) -> Diagnosis:
     """Stands in for the cause of an alarm that nobody has judged yet."""
     return _statement(machine, UNDETERMINED, Level.NORMAL, at)
 
 
-def unjudged(machine: str, name: str, at: Instant, *, is_condition: bool) -> Diagnosis:
+def unjudged(machine: str, name: str, at: ClockReading, *, is_condition: bool) -> Diagnosis:
     """The cause of what people do with alarm ``name`` before anybody has judged it.
 
     For a condition of the service it names that, so that it is known again after a restart.
@@ -44,7 +44,7 @@ def is_condition(event: AlarmEvent) -> bool:
     return event.cause.detector == SERVICE and event.cause.decision == event.alarm
 
 
-def _statement(machine: str, decision: str, level: Level, at: Instant) -> Diagnosis:
+def _statement(machine: str, decision: str, level: Level, at: ClockReading) -> Diagnosis:
     return Diagnosis(
         machine=machine,
         detector=SERVICE,

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daqsvc.alarms.states import RefusedError
+from daqsvc.alarms.states import CommandNotAllowedError
 
 if TYPE_CHECKING:
     from daqsvc.alarms.chatter import ChatterLimit
@@ -39,12 +39,12 @@ class AlarmHandling:
         """How long a command shelves, in ns.
 
         Raises:
-            RefusedError: it states no time, or a longer one than is allowed.
+            CommandNotAllowedError: it states no time, or a longer one than is allowed.
         """
         longest_s, duration_s = self.shelve_at_most_s, command.duration_s
         if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
             stated = "no time" if duration_s is None else in_units(duration_s)
-            raise RefusedError(
+            raise CommandNotAllowedError(
                 f"cannot shelve {command.alarm} for {stated}; "
                 f"state a time above 0 and up to {in_units(longest_s)}"
             )

@@ -27,11 +27,11 @@ from daqsvc.alarms.flood import FloodWatch
 from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
 from daqsvc.alarms.quality import PREFIXES, Doubts
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
-from daqsvc.alarms.rules import Circumstances, DiagnosisRule, Finding, LevelRule
+from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
 from daqsvc.alarms.shelving import ShelvingEnds
 from daqsvc.alarms.start_up import StartUpSignal
-from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError
-from daqsvc.alarms.status import Instant, Request
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
+from daqsvc.alarms.status import ClockReading, HandlingRequest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -172,12 +172,12 @@ class AlarmManager:
         """Do what a person asks.
 
         Raises:
-            RefusedError: there is no such alarm, or its state does not allow it; the text is the reason.
+            CommandNotAllowedError: there is no such alarm, or its state does not allow it; the text says why.
         """
         try:
             alarm = self._named(command.alarm)
             event = self._obeyed(command, alarm)
-        except RefusedError:
+        except CommandNotAllowedError:
             self.counters.refused += 1
             raise
         self._alarms[alarm.name] = alarm
@@ -191,7 +191,7 @@ class AlarmManager:
         """Why `obey` would refuse a command now; None if it would not. Nothing changes by asking."""
         try:
             self._obeyed(command, self._named(command.alarm).twin())
-        except RefusedError as refusal:
+        except CommandNotAllowedError as refusal:
             return f"{refusal}"
         return None
 
@@ -278,7 +278,7 @@ class AlarmManager:
         if now is not AlarmState.NORMAL:
             self._shown[now] += 1
 
-    def _events(self, diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
+    def _events(self, diagnosis: Diagnosis, at: ClockReading) -> Iterator[AlarmEvent]:
         self._start_up.take(diagnosis)
         touched = self._doubts.take(diagnosis)
         yield from self._quality(touched.alarms, diagnosis, at)
@@ -301,7 +301,7 @@ class AlarmManager:
             elif diagnosis.partial:
                 ruled.alarm.hold()
 
-    def _quality(self, names: Iterable[str], diagnosis: Diagnosis, at: Instant) -> Iterator[AlarmEvent]:
+    def _quality(self, names: Iterable[str], diagnosis: Diagnosis, at: ClockReading) -> Iterator[AlarmEvent]:
         """Raise, change or return the quality alarms that the diagnosis bears on."""
         for name in names:
             doubts = self._doubts.of(name)
@@ -319,7 +319,7 @@ class AlarmManager:
             yield from alarm.apply(finding, diagnosis, at)
 
     def _suppression(
-        self, sensors: Collection[str], diagnosis: Diagnosis, at: Instant
+        self, sensors: Collection[str], diagnosis: Diagnosis, at: ClockReading
     ) -> Iterator[AlarmEvent]:
         """Suppress what rests on a sensor that is not OK, and lift that when it is good again.
 
@@ -336,7 +336,7 @@ class AlarmManager:
             else:
                 yield ruled.alarm.unsuppress("its sensors are good again", diagnosis, at)
 
-    def _timed(self, now: Instant) -> Iterator[AlarmEvent]:
+    def _timed(self, now: ClockReading) -> Iterator[AlarmEvent]:
         for name in self._shelving_ends.due(now.t_ns):
             expired = self._alarms[name].expire(now, self._unjudged(name, now))
             if expired is not None:
@@ -350,7 +350,7 @@ class AlarmManager:
         if until_ns is not None:
             self._shelving_ends.put(alarm.name, until_ns)
 
-    def _stand(self, name: str, level: Level, sentence: str, at: Instant) -> list[AlarmEvent]:
+    def _stand(self, name: str, level: Level, sentence: str, at: ClockReading) -> list[AlarmEvent]:
         if name in self._alarms and name not in self._conditions:
             raise ValueError(f"condition {name!r} has the name of an alarm; put a / into it")
         if name not in self._alarms:
@@ -359,17 +359,17 @@ class AlarmManager:
             self._add(name, latching=False)
             self._conditions.add(name)
         cause = statement(self._identity.machine, name, level, at)
-        return self._alarms[name].apply(Finding(level, "", lambda: sentence), cause, at)
+        return self._alarms[name].apply(RuleFinding(level, "", lambda: sentence), cause, at)
 
     def _obeyed(self, command: AlarmCommand, alarm: Alarm) -> AlarmEvent:
         standing = alarm.status.occurrence
         if command.occurrence is not None and command.occurrence != standing:
             stands = "it is normal" if standing is None else f"now {standing} stands"
-            raise RefusedError(
+            raise CommandNotAllowedError(
                 f"cannot {command.verb} {alarm.name}: occurrence {command.occurrence} is over, {stands}"
             )
         now = self._now()
-        request, nothing = Request(command.by, now, command.reason), self._unjudged(alarm.name, now)
+        request, nothing = HandlingRequest(command.by, now, command.reason), self._unjudged(alarm.name, now)
         match command.verb:
             case Verb.ACKNOWLEDGE:
                 return alarm.acknowledge(request)
@@ -384,7 +384,7 @@ class AlarmManager:
             case Verb.UNBYPASS:
                 return alarm.unbypass(request, nothing)
 
-    def _unjudged(self, name: str, at: Instant) -> Diagnosis:
+    def _unjudged(self, name: str, at: ClockReading) -> Diagnosis:
         is_condition = name in self._conditions or name in self._expected.conditions
         return unjudged(self._identity.machine, name, at, is_condition=is_condition)
 
@@ -398,7 +398,7 @@ class AlarmManager:
         there_are = f"there are: {', '.join(sorted(known)) or 'none'}"
         if len(known) > MOST_NAMED:
             there_are = f"there are {len(known)} others; daqsvc check lists those of the machine file"
-        raise RefusedError(f"no alarm is named {name!r}; {there_are}")
+        raise CommandNotAllowedError(f"no alarm is named {name!r}; {there_are}")
 
     def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
         """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
@@ -437,9 +437,9 @@ class AlarmManager:
         alarm.resume(event, "", self._since(event.wall_ns), self._now())
         return alarm.withdraw("the machine file no longer has it", event.cause, self._now())
 
-    def _since(self, wall_ns: int) -> Instant:
+    def _since(self, wall_ns: int) -> ClockReading:
         """An instant before the restart, by its label: the monotonic clock may have begun anew."""
-        return Instant(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
+        return ClockReading(self._clock.monotonic_ns() - self._clock.wall_ns() + wall_ns, wall_ns)
 
     def _add(self, name: str, *, latching: bool) -> Alarm:
         alarm = self._alarms[name] = self._made(name, latching=latching)
@@ -451,12 +451,12 @@ class AlarmManager:
             self._identity, name, latching=latching, new_occurrence=self._new_occurrence, chatter=chatter
         )
 
-    def _now(self) -> Instant:
+    def _now(self) -> ClockReading:
         return self._instant(self._clock.monotonic_ns())
 
-    def _instant(self, t_ns: int) -> Instant:
+    def _instant(self, t_ns: int) -> ClockReading:
         """The wall-clock label of a monotonic time."""
-        return Instant(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
+        return ClockReading(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
 
 
 class _Statuses(Mapping[str, "AlarmStatus"]):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.standing import cause_of
 from daqsvc.alarms.events import Doubt
-from daqsvc.alarms.rules import Finding
+from daqsvc.alarms.rules import RuleFinding
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
@@ -186,18 +186,18 @@ class Doubts:
         """What is said against the subject of the quality alarm ``name``, by detector."""
         return tuple(sorted(self._by_alarm.get(name, {}).values()))
 
-    def finding(self, name: str) -> Finding:
+    def finding(self, name: str) -> RuleFinding:
         """What the quality alarm ``name`` is to say."""
         subject, doubts = name.partition("/")[2], self.of(name)
         if not doubts:
-            return Finding(Level.NORMAL, "good", lambda: f"{subject} is good again")
+            return RuleFinding(Level.NORMAL, "good", lambda: f"{subject} is good again")
         worst = min(doubts, key=lambda doubt: doubt.quality != "not_ok")
         what = "cannot be judged" if worst.quality == "missing" else "not OK"
         because = f": {worst.reason}" if worst.reason else ""
         said = "|".join(
             f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
         )
-        return Finding(Level.ALERT, said, lambda: f"{subject} {what}{because}")
+        return RuleFinding(Level.ALERT, said, lambda: f"{subject} {what}{because}")
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` cannot speak while it rests on ``sensors``; None if it can.

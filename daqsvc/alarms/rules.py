@@ -48,7 +48,7 @@ _IN_WORDS = {
 """Decisions that are no names of a state."""
 
 
-class Finding(NamedTuple):
+class RuleFinding(NamedTuple):
     """What a rule makes of a diagnosis.
 
     Attributes:
@@ -82,7 +82,7 @@ class Circumstances(NamedTuple):
 class Watch(Protocol):
     """The memory of one rule."""
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
         """What a good diagnosis says, or a partial one; None if it says nothing new and everything holds."""
         ...
 
@@ -98,7 +98,7 @@ class Watch(Protocol):
             told: the last event.
 
         Returns:
-            `Finding.identity` of what stood; empty if ``told`` does not tell.
+            `RuleFinding.identity` of what stood; empty if ``told`` does not tell.
         """
         ...
 
@@ -328,12 +328,12 @@ class _LevelWatch:
         self._sensor = rule.sensor
         self._watch = MeasureWatch(rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply)
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
         found = self._watch.find(diagnosis, given)
         if found is None:
             return None
         level, value = found
-        return Finding(
+        return RuleFinding(
             level, self._watch.side(value), lambda: self._watch.in_words(diagnosis, self._sensor, value)
         )
 
@@ -351,7 +351,7 @@ class _DecisionWatch:
         self._rule = rule
         self._group: tuple[str, ...] | None = None
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:  # noqa: ARG002
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:  # noqa: ARG002
         if diagnosis.decision == UNDETERMINED:
             return None
         level, evidence = Level.of(diagnosis.severity), decision_evidence(diagnosis)
@@ -361,7 +361,7 @@ class _DecisionWatch:
             # A group may flicker with the evidence from statement to statement; only what the detector itself
             # calls a change makes another finding of it.
             self._group = diagnosis.group
-        return Finding(
+        return RuleFinding(
             level,
             _identity(diagnosis.decision, self._group),
             lambda: self._sentence(diagnosis, evidence),

@@ -106,7 +106,7 @@ class Stimulus(StrEnum):
     RESET = "reset"
 
 
-class RefusedError(Exception):
+class CommandNotAllowedError(Exception):
     """A person asked for something that the alarm's state does not allow; the text is the reason."""
 
 
@@ -149,17 +149,17 @@ def transition(state: AlarmState, stimulus: Stimulus, *, latching: bool) -> Alar
         latching: whether the alarm outlives its condition until it is reset.
 
     Raises:
-        RefusedError: a person's acknowledgement or reset that the state does not allow.
+        CommandNotAllowedError: a person's acknowledgement or reset that the state does not allow.
     """
     after = moves(latching=latching).get((state, stimulus))
     if after is not None:
         return after
     if stimulus is Stimulus.ACKNOWLEDGE:
-        raise RefusedError(f"there is nothing to acknowledge: it is {state.in_words}")
+        raise CommandNotAllowedError(f"there is nothing to acknowledge: it is {state.in_words}")
     if stimulus is Stimulus.RESET:
         if state.is_active:
-            raise RefusedError("its condition still stands; remove the cause, then reset")
-        raise RefusedError(f"there is nothing to reset: it is {state.in_words}")
+            raise CommandNotAllowedError("its condition still stands; remove the cause, then reset")
+        raise CommandNotAllowedError(f"there is nothing to reset: it is {state.in_words}")
     return state
 
 

@@ -7,18 +7,18 @@ from typing import NamedTuple
 from daqsvc.alarms.states import AlarmState, Level
 
 
-class Instant(NamedTuple):
+class ClockReading(NamedTuple):
     """When something happened, by both clocks."""
 
     t_ns: int
     wall_ns: int
 
 
-class Request(NamedTuple):
+class HandlingRequest(NamedTuple):
     """Who asks for something, when, and why."""
 
     by: str
-    at: Instant
+    at: ClockReading
     reason: str = ""
 
 
@@ -41,7 +41,7 @@ class AlarmStatus(NamedTuple):
     state: AlarmState
     level: Level
     occurrence: str | None
-    since: Instant | None
+    since: ClockReading | None
     message: str
     own_state: AlarmState = AlarmState.NORMAL
     holds: tuple[AlarmState, ...] = ()

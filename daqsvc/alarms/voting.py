@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from daqsvc.alarms.rules import MACHINE_GROUP, Finding, MeasureWatch
+from daqsvc.alarms.rules import MACHINE_GROUP, MeasureWatch, RuleFinding
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class _VotingWatch:
         self._at_least: dict[str, Level] = {}
         self._level = Level.NORMAL
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> Finding | None:
+    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
         sensor = self._sensor_of[diagnosis.detector]
         watch = self._watches[sensor]
         found = watch.find(diagnosis, given)
@@ -118,7 +118,7 @@ class _VotingWatch:
             return None
         self._level = level
         known = valid | sure_of
-        return Finding(level, "", lambda: self._sentence(watch.in_words(diagnosis, sensor, value), known))
+        return RuleFinding(level, "", lambda: self._sentence(watch.in_words(diagnosis, sensor, value), known))
 
     def hold(self, diagnosis: Diagnosis) -> None:
         sensor = self._sensor_of[diagnosis.detector]

@@ -25,7 +25,7 @@ from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import FrameSorter, Sorted
 from drivers.replay.can_log import CanLog
-from drivers.replay.files import RecordingError as LogError
+from drivers.replay.files import RecordedLogError as LogError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

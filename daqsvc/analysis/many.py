@@ -16,7 +16,7 @@ from daqsvc.recording.recording import get_limits, set_limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from daqsvc.confined.limits import Limits
+    from daqsvc.confined.limits import ResourceLimits
 
 _BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -105,7 +105,7 @@ def _judge(recording: str, figures: str | None) -> Outcome:
     return _analysts[0].judge(recording, figures)
 
 
-def _prepare(analyst: Analyst, limits: Limits) -> None:
+def _prepare(analyst: Analyst, limits: ResourceLimits) -> None:
     """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
     _analysts.append(analyst)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

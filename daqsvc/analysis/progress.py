@@ -66,7 +66,7 @@ class _RichBar:
         self._progress.stop()
 
 
-class Patience:
+class ProgressInterval:
     """Shows a bar once something has taken `PATIENCE_S`, and only on a terminal.
 
     Args:
@@ -101,9 +101,9 @@ class Patience:
 
 
 @contextlib.contextmanager
-def progress_bar(label: str) -> Iterator[Patience]:
+def progress_bar(label: str) -> Iterator[ProgressInterval]:
     """A bar that is gone at the end, whatever happens."""
-    bar = Patience(label)
+    bar = ProgressInterval(label)
     try:
         yield bar
     finally:

@@ -51,11 +51,11 @@ class BaselineFileError(ValueError):
     """A file with a healthy machine cannot be read, used or written; the message says why and what to do."""
 
 
-class _Table(BaseModel):
+class _FileTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class _Residual(_Table):
+class _ResidualTable(_FileTable):
     channels: Annotated[list[str], Field(min_length=1)]
     window_samples: Annotated[int, Field(ge=16)]
     windows: Annotated[int, Field(ge=2)]
@@ -99,11 +99,11 @@ _part_fields: dict[str, Any] = {
     one.name: (get_type_hints(PartEvidence)[one.name], ... if one.default is MISSING else one.default)
     for one in fields(PartEvidence)
 }
-_Part = create_model("_Part", __base__=_Table, **_part_fields)
+_Part = create_model("_Part", __base__=_FileTable, **_part_fields)
 """A table with the fields of `PartEvidence`, whatever these are."""
 
 
-class _Race(_Table):
+class _Race(_FileTable):
     channel: str
     speed_rpm: Positive
     edges_hz: Annotated[list[Positive], Field(min_length=2)]
@@ -124,7 +124,7 @@ class _Race(_Table):
         return RaceBaseline(evidence, BandLevels(tuple(self.edges_hz), tuple(self.power)), self.speed_rpm)
 
 
-class _Spectrum(_Table):
+class _SpectrumTable(_FileTable):
     frames: Annotated[int, Field(ge=1)]
     lines: list[Annotated[list[float], Field(min_length=4, max_length=4)]]
 
@@ -144,22 +144,22 @@ class _Spectrum(_Table):
         return HealthySpectrum(covariance, self.frames)
 
 
-class _Gains(_Table):
+class _Gains(_FileTable):
     inner: Positive
     outer: Positive
     leak: Positive
 
 
-class _Energies(_Table):
+class _Energies(_FileTable):
     inner_unit: Positive
     outer_unit: Positive
 
 
-class _Pair(_Table):
+class _Pair(_FileTable):
     channels: Annotated[list[str], Field(min_length=2, max_length=2)]
     parameters: Mapping[str, float]
-    detection: _Spectrum
-    isolation: _Spectrum
+    detection: _SpectrumTable
+    isolation: _SpectrumTable
     gains: _Gains
     energies: _Energies
 
@@ -182,14 +182,14 @@ class _Pair(_Table):
             raise ValueError(f"pair of {', '.join(self.channels)}: a figure is missing: {error}") from None
 
 
-class _File(_Table):
+class _File(_FileTable):
     schema_version: Literal[1]
     kind: Literal["bearing"]
     written: str = ""
     source: str = ""
     rate_hz: Positive
     speed_rpm: Positive
-    residual: Annotated[list[_Residual], Field(min_length=1)]
+    residual: Annotated[list[_ResidualTable], Field(min_length=1)]
     race: list[_Race] = []
     pair: list[_Pair] = []
 

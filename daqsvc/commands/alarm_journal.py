@@ -25,7 +25,7 @@ _FINDINGS = {"raised", "escalated", "lowered", "changed", "recurred", "latched",
 """Events that say what was found, rather than what somebody did about it."""
 
 
-class Standing(NamedTuple):
+class AlarmView(NamedTuple):
     """How an alarm stands, and how that came about.
 
     Attributes:
@@ -50,7 +50,7 @@ def current(store: Path) -> list[Told]:
     return list(_told(view.latest))
 
 
-def standing(store: Path, events: Sequence[Told]) -> list[Standing]:
+def standing(store: Path, events: Sequence[Told]) -> list[AlarmView]:
     """How alarms stand, with what their own past adds to it; blocks.
 
     Args:
@@ -79,7 +79,7 @@ def standing(store: Path, events: Sequence[Told]) -> list[Standing]:
         message = told["message"]
         if findings and findings[-1] != message:
             message = f"{findings[-1]}; {message}"
-        found.append(Standing(told, past[0]["wall_ns"] if past else told["wall_ns"], message))
+        found.append(AlarmView(told, past[0]["wall_ns"] if past else told["wall_ns"], message))
     return found
 
 

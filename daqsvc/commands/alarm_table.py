@@ -10,7 +10,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from daqsvc.commands.alarm_journal import Standing
+    from daqsvc.commands.alarm_journal import AlarmView
 
     Told = Mapping[str, Any]
     """An alarm payload (schema ``daqsvc.alarm/1``), as it was published."""
@@ -22,7 +22,7 @@ _AGES = ((86_400, "d"), (3600, "h"), (60, "min"))
 _GAP = "  "
 
 
-def current(alarms: Sequence[Standing], now_ns: int) -> str:
+def current(alarms: Sequence[AlarmView], now_ns: int) -> str:
     """How alarms stand: one line each, the worst first, then the newest.
 
     Args:

@@ -37,7 +37,7 @@ def default_memory_bytes() -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ResourceLimits:
     """What reading one file may take.
 
     Attributes:
@@ -62,7 +62,7 @@ class Budget:
 
     Attributes:
         file_bytes: size of the file.
-        content_bytes: see `Limits`.
+        content_bytes: see `ResourceLimits`.
         taken_bytes: what has been unpacked of it.
     """
 
@@ -71,7 +71,7 @@ class Budget:
     taken_bytes: int = 0
 
     @classmethod
-    def of(cls, path: Path, limits: Limits) -> Budget:
+    def of(cls, path: Path, limits: ResourceLimits) -> Budget:
         """The budget of a file.
 
         Raises:

@@ -70,7 +70,7 @@ class RaisedThereError(Exception):
         self.message = message
 
 
-class Answer(NamedTuple):
+class WorkResult(NamedTuple):
     """What the work has found.
 
     Attributes:
@@ -106,7 +106,9 @@ class ConfinedProcess:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def call(self, function: str, arguments: Mapping[str, Any], *, memory_bytes: int, cpu_s: float) -> Answer:
+    def call(
+        self, function: str, arguments: Mapping[str, Any], *, memory_bytes: int, cpu_s: float
+    ) -> WorkResult:
         """Call a function there.
 
         Args:
@@ -194,7 +196,7 @@ def _begin() -> _Running:
     return _Running(process, request_out, reply_in)
 
 
-def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float) -> Answer:
+def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until: float) -> WorkResult:
     try:
         rest = json.dumps(request).encode() + b"\n"
         while rest:
@@ -214,7 +216,7 @@ def _ask(running: _Running, request: Mapping[str, Any], memory_bytes: int, until
     for array in arrays:
         if array.size:
             _take(running, array.reshape(-1).view(np.uint8).data, until)
-    return Answer(header["found"], arrays)
+    return WorkResult(header["found"], arrays)
 
 
 def _take(running: _Running, into: bytearray | memoryview, until: float) -> bytearray | memoryview:

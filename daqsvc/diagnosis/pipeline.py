@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
-from daqsvc.acquisition.standing import Standing
+from daqsvc.acquisition.standing import StreamState
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.record import silence_reason
@@ -100,7 +100,7 @@ class Pipeline:
         self._settling_ns = settling_ns or {}
         self._patience = {name: Patience() for name in rings} | dict(patience or {})
         self._silent_until_ns = dict.fromkeys(rings, -1)
-        self._standings = dict.fromkeys(rings, Standing())
+        self._standings = dict.fromkeys(rings, StreamState())
         self._fall_silent = fall_silent or self.stand
         self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
@@ -118,7 +118,7 @@ class Pipeline:
         """Samples that the slowest detector has not read yet."""
         return max((reader.behind for reader in self._readers.values()), default=0)
 
-    def stand(self, stream: str, standing: Standing) -> None:
+    def stand(self, stream: str, standing: StreamState) -> None:
         """Take in how a stream stands; call on the event loop.
 
         While nothing can be judged by it its detectors get none of its samples, and hold what they have said.
@@ -233,7 +233,7 @@ class Pipeline:
         if standing.doubt:
             # What the stream was doubted for is no longer what is wrong.
             reason = silence_reason(stream, silence_s)
-            self._fall_silent(stream, Standing(reason, standing.proven, silent=True))
+            self._fall_silent(stream, StreamState(reason, standing.proven, silent=True))
             return
         self._let_go(stream)
         self._silent_until_ns[stream] = now_ns

@@ -16,7 +16,7 @@ STANDARD_GRAVITY = 9.80665
 """m/s2 per g (CGPM 1901)."""
 
 
-class Levels(NamedTuple):
+class SignalLevels(NamedTuple):
     """Levels of one channel over one window, about its mean.
 
     Attributes:
@@ -35,7 +35,7 @@ class Levels(NamedTuple):
     peak_to_peak: float
 
 
-def levels(samples: NDArray[np.float32]) -> Levels:
+def levels(samples: NDArray[np.float32]) -> SignalLevels:
     """Levels of the samples that are there; NaN rows are left out.
 
     Args:
@@ -46,7 +46,7 @@ def levels(samples: NDArray[np.float32]) -> Levels:
     swing = there - mean
     rms = float(np.sqrt(np.mean(swing**2)))
     peak = float(np.abs(swing).max())
-    return Levels(mean, rms, peak, peak / rms if rms > 0 else 0.0, float(np.ptp(there)))
+    return SignalLevels(mean, rms, peak, peak / rms if rms > 0 else 0.0, float(np.ptp(there)))
 
 
 @lru_cache(maxsize=64)

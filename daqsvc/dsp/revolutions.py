@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Protocol
 
-from daqsvc.dsp.marks import Edge, EdgeCounts, EdgeFinder, Mark, MarkLine
+from daqsvc.dsp.marks import AngleMark, Edge, EdgeCounts, EdgeFinder, MarkLine
 from daqsvc.dsp.orbit_speed import OrbitPhase
 from daqsvc.dsp.shaft import WAIT_REVOLUTIONS, Between, Revolutions, Shaft
 from daqsvc.dsp.steady_edges import SharpEdges, SteadyEdges
@@ -79,14 +79,14 @@ class FixedSpeedCutter:
     def reset(self) -> None:
         """See `RevolutionCutter.reset`."""
         self._shaft = Shaft()
-        self._edge = Mark(0, 0.0)
+        self._edge = AngleMark(0, 0.0)
         self._done = 0
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
         """See `RevolutionCutter.process`; ``marker`` is not looked at."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
-        while (end := Mark.at((self._done + 1) * self._period)).index <= self._shaft.position:
+        while (end := AngleMark.at((self._done + 1) * self._period)).index <= self._shaft.position:
             self._shaft.turn(self._edge, end, 1, bend=0.0, trusted=True)
             self._edge = end
             self._done += 1
@@ -197,14 +197,14 @@ class OrbitCutter:
         """See `RevolutionCutter.reset`."""
         self._shaft = Shaft()
         self._phase = OrbitPhase(self._period)
-        self._last: Mark | None = None
+        self._last: AngleMark | None = None
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
         """See `RevolutionCutter.process`; ``marker`` is not looked at."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
         for zero in self._phase.process(xy):
-            mark = Mark.at(zero.sample)
+            mark = AngleMark.at(zero.sample)
             if self._last is not None:
                 self._shaft.turn(self._last, mark, 1, bend=0.0, trusted=zero.trusted)
             self._last = mark

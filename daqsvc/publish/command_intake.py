@@ -52,7 +52,7 @@ class CommandRefusedError(Exception):
 
 
 @dataclass(slots=True)
-class CommandCounters:
+class IntakeCounters:
     """What became of the commands that came over the broker.
 
     Attributes:
@@ -109,7 +109,7 @@ class CommandIntake:
         clock: Clock,
         ids: CommandIds,
     ) -> None:
-        self.counters = CommandCounters()
+        self.counters = IntakeCounters()
         self._settings = settings
         self._topics = topics
         self._handler = handler

@@ -31,7 +31,7 @@ Number = Annotated[float | None, BeforeValidator(_finite_or_none)]
 WholeOrNumber = Annotated[int | float | None, BeforeValidator(_finite_or_none)]
 
 
-class Payload(BaseModel):
+class JsonPayload(BaseModel):
     """What all payloads have in common."""
 
     model_config = ConfigDict(
@@ -46,7 +46,7 @@ class Payload(BaseModel):
         return self.model_dump_json(by_alias=True).encode()
 
 
-class Stamped(Payload):
+class Stamped(JsonPayload):
     """A payload that says whose it is and when it was true."""
 
     site: str
@@ -56,7 +56,7 @@ class Stamped(Payload):
     monotonic_ns: int = Field(description="the same instant on the box's monotonic clock; orders events")
 
 
-class WindowPayload(Payload):
+class WindowPayload(JsonPayload):
     """Which samples a statement rests on: absolute sample indices of the stream."""
 
     stream: str
@@ -64,7 +64,7 @@ class WindowPayload(Payload):
     end_index: int = Field(description="one past the last sample")
 
 
-class _Statement(Payload):
+class _Statement(JsonPayload):
     detector: str
     decision: str
     severity: Severity
@@ -97,14 +97,14 @@ class CausePayload(_Statement):
     monotonic_ns: int = Field(description="when the last sample of the window was taken")
 
 
-class PreviousPayload(Payload):
+class PreviousPayload(JsonPayload):
     """How the alarm stood before the event."""
 
     state: AlarmState
     level: Severity
 
 
-class DoubtPayload(Payload):
+class DoubtPayload(JsonPayload):
     """What a detector has against a sensor."""
 
     detector: str

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the annotations
-from daqsvc.publish.payloads import Payload, Stamped, stamp_now
+from daqsvc.publish.payloads import JsonPayload, Stamped, stamp_now
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -25,7 +25,7 @@ _HIDDEN = {AlarmState.SUPPRESSED, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE}
 _GONE = {AlarmState.NORMAL, AlarmState.RETURNED_UNACKNOWLEDGED}
 
 
-class StandingPayload(Payload):
+class StandingPayload(JsonPayload):
     """How one alarm stands."""
 
     problem: Literal["ON", "OFF"] | None = Field(
@@ -47,7 +47,7 @@ class SummaryPayload(Stamped):
     alarms: dict[str, StandingPayload]
 
 
-class _Told(BaseModel):
+class _AlarmEvent(BaseModel):
     """What is read of an alarm's message."""
 
     alarm: str
@@ -100,7 +100,7 @@ class Summary:
         """
         if not message.topic.startswith(self._prefix):
             return False
-        told = _Told.model_validate_json(message.payload)
+        told = _AlarmEvent.model_validate_json(message.payload)
         problem: Literal["ON", "OFF"] = "OFF" if told.state in _GONE else "ON"
         self._put(
             told.alarm,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from daqsvc.confined.limits import Limits
+from daqsvc.confined.limits import ResourceLimits
 from daqsvc.recording.contents import NUMERIC
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import read
@@ -38,7 +38,7 @@ def load(
         RecordingError: see there.
     """
     file = Path(path)
-    contents = read(file, Limits(memory_bytes))
+    contents = read(file, ResourceLimits(memory_bytes))
     left_out: dict[str, int] = {}
     if not channels:
         channels, left_out = _longest(file, contents)
@@ -65,7 +65,7 @@ def channels_of(path: str, memory_bytes: int) -> tuple[dict[str, int], tuple[()]
     Raises:
         RecordingError: see there.
     """
-    vectors = read(Path(path), Limits(memory_bytes)).vectors()
+    vectors = read(Path(path), ResourceLimits(memory_bytes)).vectors()
     return {name: len(values) for name, values in vectors.items() if len(values) > 1}, ()
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from daqsvc.confined.limits import Limits
+from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import find
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.confined.process import Answer
+    from daqsvc.confined.process import WorkResult
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -54,30 +54,30 @@ class Recording:
     notes: tuple[str, ...] = ()
 
 
-class _Reading:
+class _ReadingLimits:
     """How recordings are read by this process."""
 
-    limits = Limits()
+    limits = ResourceLimits()
 
 
-def set_limits(limits: Limits) -> None:
+def set_limits(limits: ResourceLimits) -> None:
     """Say what reading one recording may take, from now on.
 
     Args:
         limits: of the process that reads them.
     """
-    _Reading.limits = limits
+    _ReadingLimits.limits = limits
 
 
 def set_memory(memory_bytes: int | None) -> None:
     """What ``--max-memory`` says; None leaves it as it is."""
     if memory_bytes is not None:
-        set_limits(Limits(memory_bytes))
+        set_limits(ResourceLimits(memory_bytes))
 
 
-def get_limits() -> Limits:
+def get_limits() -> ResourceLimits:
     """What reading one recording may take."""
-    return _Reading.limits
+    return _ReadingLimits.limits
 
 
 def load_recording(
@@ -131,7 +131,7 @@ def stop_reading() -> None:
     shared.close()
 
 
-def _there(function: str, path: Path, arguments: Mapping[str, Any]) -> Answer:
+def _there(function: str, path: Path, arguments: Mapping[str, Any]) -> WorkResult:
     """Call a function of `daqsvc.recording.loading` about a file in the process that reads.
 
     Raises:

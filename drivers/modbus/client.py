@@ -18,9 +18,9 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersRequest,
 )
 
-from drivers.modbus.outcomes import LineLostError, RefusedError
+from drivers.modbus.outcomes import LineLostError, RequestRefusedError
 from drivers.modbus.replies import READ_HOLDING, READ_INPUT, register_bytes
-from drivers.modbus.wire import ModbusWire, Request
+from drivers.modbus.wire import ModbusRequest, ModbusWire
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 _READS = {READ_HOLDING: ReadHoldingRegistersRequest, READ_INPUT: ReadInputRegistersRequest}
 
 
-def _encoded(request: ModbusPDU, data_bytes: int | None = None) -> Request:
-    return Request(request.dev_id, bytes([request.function_code]) + request.encode(), data_bytes)
+def _encoded(request: ModbusPDU, data_bytes: int | None = None) -> ModbusRequest:
+    return ModbusRequest(request.dev_id, bytes([request.function_code]) + request.encode(), data_bytes)
 
 
 @lru_cache(maxsize=1024)
-def _read_request(unit: int, function: int, address: int, count: int) -> Request:
+def _read_request(unit: int, function: int, address: int, count: int) -> ModbusRequest:
     """A read; what is polled is asked for in the same bytes every time."""
     return _encoded(_READS[function](address=address, count=count, dev_id=unit), 2 * count)
 
@@ -101,7 +101,7 @@ class ModbusClient:
         Raises:
             LineLostError: the connection is gone.
             NoReplyError: no sound reply came in time.
-            RefusedError: the unit answers with an exception.
+            RequestRefusedError: the unit answers with an exception.
         """
         return await self._ask(_read_request(unit, function, address, count))
 
@@ -114,7 +114,7 @@ class ModbusClient:
         request = WriteMultipleRegistersRequest(address=address, registers=list(values), dev_id=unit)
         await self._ask(_encoded(request))
 
-    async def _ask(self, request: Request) -> bytes:
+    async def _ask(self, request: ModbusRequest) -> bytes:
         if not self._wire.is_active():
             raise LineLostError(self._wire.why_lost)
         self._counters.requests += 1
@@ -122,5 +122,7 @@ class ModbusClient:
         self._counters.replies += 1
         if pdu[0] != request.pdu[0]:
             kind = self._counters.note_exception(pdu[1])
-            raise RefusedError(f"unit {request.unit} refuses function {request.pdu[0]}: {kind}", pdu[1])
+            raise RequestRefusedError(
+                f"unit {request.unit} refuses function {request.pdu[0]}: {kind}", pdu[1]
+            )
         return register_bytes(pdu)

@@ -17,9 +17,9 @@ from drivers.keeping import Attempt, CannotOpenError, keep_up
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.line import ModbusLine, WritableRun
 from drivers.modbus.outcomes import LineLostError, ModbusCounters
-from drivers.modbus.registers import Run
+from drivers.modbus.registers import RegisterRun
 from drivers.modbus.sampling import readers_for
-from drivers.modbus.silence import Patience, SparingByEnquiry
+from drivers.modbus.silence import RetryPolicy, SparingByEnquiry
 from drivers.modbus.wire import LineOptions
 from drivers.tty import Character, CharacterFormat
 
@@ -55,7 +55,7 @@ class ModbusDriver:
         self._options = _line_options(port.options)
         self._patience = _patience(port.options, self._options)
         self._writable = [
-            WritableRun(entry["unit"], Run(entry["address"], entry.get("count", 1)))
+            WritableRun(entry["unit"], RegisterRun(entry["address"], entry.get("count", 1)))
             for entry in port.options.get("writes") or ()
         ]
         kind = "Modbus TCP" if self._options.transport == "tcp" else "Modbus RTU"
@@ -165,12 +165,12 @@ def _line_options(options: Mapping[str, Any]) -> LineOptions:
     return LineOptions(**given, timeout_ns=round(options.get("timeout_ms", 500.0) * _NS_PER_MS))
 
 
-def _patience(options: Mapping[str, Any], line: LineOptions) -> Patience:
+def _patience(options: Mapping[str, Any], line: LineOptions) -> RetryPolicy:
     quiet_ms = options.get("quiet_ms")
     quiet_ns = 0 if line.transport == "tcp" else max(line.timeout_ns, line.gap_ns)
     if line.transport == "rtu" and quiet_ms is not None:
         quiet_ns = max(quiet_ns, round(quiet_ms * _NS_PER_MS))
-    return Patience(
+    return RetryPolicy(
         quiet_ns=quiet_ns,
         gap_ns=line.gap_ns,
         demote_after=options.get("demote_after", 3),

@@ -7,7 +7,7 @@ from functools import reduce
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from drivers.frames import LayoutError
-from drivers.modbus.registers import RegisterRecord, Run, RunLimits, plan_runs
+from drivers.modbus.registers import RegisterRecord, RegisterRun, RunLimits, plan_runs
 from drivers.modbus.replies import FIFO_REGISTERS, READ_HOLDING, READ_INPUT
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ MAX_REGISTERS = 125
 
 
 @dataclass(frozen=True)
-class Trend:
+class TrendLayout:
     """Registers that always show the present values; a sample is what one round of requests reads.
 
     Attributes:
@@ -54,9 +54,9 @@ class Count:
     low_word_first: bool = False
 
     @property
-    def run(self) -> Run:
+    def run(self) -> RegisterRun:
         """Its registers."""
-        return Run(self.address, self.bits // 16)
+        return RegisterRun(self.address, self.bits // 16)
 
     @property
     def modulus(self) -> int:
@@ -206,7 +206,7 @@ class Waveform:
     poll_ns: int = 100_000_000
 
     @property
-    def pages(self) -> tuple[tuple[Run, ...], ...]:
+    def pages(self) -> tuple[tuple[RegisterRun, ...], ...]:
         """The requests that read each page of a block; without a window there is one page."""
         left = self.samples * self.record.registers
         window = left if self.page is None else self.page.registers
@@ -215,7 +215,7 @@ class Waveform:
             inside = min(left, window)
             pages.append(
                 tuple(
-                    Run(self.address + start, min(MAX_REGISTERS, inside - start))
+                    RegisterRun(self.address + start, min(MAX_REGISTERS, inside - start))
                     for start in range(0, inside, MAX_REGISTERS)
                 )
             )
@@ -223,7 +223,7 @@ class Waveform:
         return tuple(pages)
 
 
-ModbusLayout: TypeAlias = Trend | Fifo | Ring | Waveform
+ModbusLayout: TypeAlias = TrendLayout | Fifo | Ring | Waveform
 
 
 def in_units(layout: ModbusLayout, conversion: Mapping[str, tuple[float, float]]) -> ModbusLayout:
@@ -231,7 +231,7 @@ def in_units(layout: ModbusLayout, conversion: Mapping[str, tuple[float, float]]
     return replace(layout, record=layout.record.in_units(conversion))
 
 
-def shared_runs(layouts: Sequence[Trend]) -> tuple[Run, ...] | None:
+def shared_runs(layouts: Sequence[TrendLayout]) -> tuple[RegisterRun, ...] | None:
     """The requests that read the registers of several streams of one unit and table together.
 
     Args:
@@ -254,4 +254,4 @@ def shared_runs(layouts: Sequence[Trend]) -> tuple[Run, ...] | None:
 
 def sample_record(fields: Sequence[RegisterField]) -> RegisterRecord:
     """A record of one sample, from fields whose addresses count from the sample's first register."""
-    return RegisterRecord(tuple(fields), (Run(0, max(field.run.end for field in fields)),))
+    return RegisterRecord(tuple(fields), (RegisterRun(0, max(field.run.end for field in fields)),))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from numbers import Integral
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from drivers.modbus.outcomes import LineLostError, NoReplyError, RefusedError
+from drivers.modbus.outcomes import LineLostError, NoReplyError, RequestRefusedError
 from drivers.modbus.replies import GATEWAY_CODES, READ_FIFO, WRITE_REGISTERS
 from drivers.modbus.silence import Enquiry, UnitSilence
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from drivers.modbus.client import ModbusClient
     from drivers.modbus.outcomes import ModbusCounters
-    from drivers.modbus.registers import Run
-    from drivers.modbus.silence import Patience, Silence, SparingByEnquiry
+    from drivers.modbus.registers import RegisterRun
+    from drivers.modbus.silence import RetryPolicy, Silence, SparingByEnquiry
 
 LONGEST_BABBLE = 4
 """Quiet times for which a line that does not fall silent is waited for, before it is used all the same."""
@@ -49,10 +49,10 @@ class WritableRun:
     """Holding registers of a unit that may be written."""
 
     unit: int
-    run: Run
+    run: RegisterRun
 
 
-class Reading(NamedTuple):
+class RegisterValues(NamedTuple):
     """Registers, and when they were read.
 
     Attributes:
@@ -85,7 +85,7 @@ class ModbusLine:
         client: ModbusClient,
         clock: Clock,
         counters: ModbusCounters,
-        patience: Patience,
+        patience: RetryPolicy,
         *,
         units: Sequence[int],
         writable: Sequence[WritableRun] = (),
@@ -110,14 +110,14 @@ class ModbusLine:
         """Know when somebody will next ask: what may stay without reply is put between such times."""
         self._due_ns[who] = due_ns
 
-    async def poll(self, unit: int, function: int, run: Run, what: str = "") -> Reading:
+    async def poll(self, unit: int, function: int, run: RegisterRun, what: str = "") -> RegisterValues:
         """Read registers, and tell when that was; see `read`."""
         enquiry = Enquiry(function, what)
-        return Reading(
+        return RegisterValues(
             *await self._ask(unit, enquiry, lambda: self._client.read(unit, function, run.address, run.count))
         )
 
-    async def read(self, unit: int, function: int, run: Run, what: str = "") -> bytes:
+    async def read(self, unit: int, function: int, run: RegisterRun, what: str = "") -> bytes:
         """Read registers; see `ModbusClient.read` for what is returned and raised.
 
         Args:
@@ -183,7 +183,7 @@ class ModbusLine:
             except NoReplyError as error:
                 self._miss(asked, silence, f"{error}")
                 raise
-            except RefusedError as error:
+            except RequestRefusedError as error:
                 self._failed = False
                 if error.code in GATEWAY_CODES:
                     self._miss(asked, silence, f"{error}")

@@ -16,7 +16,7 @@ class NoReplyError(Exception):
     """A unit has not answered in time, or what it answered was no reply to the request."""
 
 
-class RefusedError(Exception):
+class RequestRefusedError(Exception):
     """A unit has answered with a Modbus exception.
 
     Attributes:

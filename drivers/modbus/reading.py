@@ -6,7 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol
 
-from drivers.modbus.outcomes import LineLostError, NoReplyError, RefusedError
+from drivers.modbus.outcomes import LineLostError, NoReplyError, RequestRefusedError
 from drivers.modbus.replies import OTHER_REMEDY, REMEDIES
 
 if TYPE_CHECKING:
@@ -57,12 +57,12 @@ class PollingReader(ABC):
                 await self._look(line)
             except LineLostError:
                 return
-            except (NoReplyError, RefusedError) as error:
-                if isinstance(error, RefusedError):
+            except (NoReplyError, RequestRefusedError) as error:
+                if isinstance(error, RequestRefusedError):
                     self._tell(error)
                 await self._pause_after_failure()
 
-    def _tell(self, error: RefusedError, who: str = "") -> None:
+    def _tell(self, error: RequestRefusedError, who: str = "") -> None:
         """Tell each refusal once; how often there are such, the counters of the bus say.
 
         Args:

@@ -43,7 +43,7 @@ _DTYPES: dict[RegisterType, str] = {
 
 
 @dataclass(frozen=True, order=True, slots=True)
-class Run:
+class RegisterRun:
     """Registers side by side: ``count`` of them from ``address`` on."""
 
     address: int
@@ -67,7 +67,7 @@ class RunLimits:
 
     max_gap: int = 0
     max_count: int = 125
-    forbidden: tuple[Run, ...] = ()
+    forbidden: tuple[RegisterRun, ...] = ()
 
     def both(self, other: RunLimits) -> RunLimits:
         """What these and the other limits allow."""
@@ -109,9 +109,9 @@ class RegisterField:
         return np.dtype(_DTYPES[self.type])
 
     @property
-    def run(self) -> Run:
+    def run(self) -> RegisterRun:
         """Its registers."""
-        return Run(self.address, self.dtype.itemsize // 2)
+        return RegisterRun(self.address, self.dtype.itemsize // 2)
 
     @property
     def byte_places(self) -> NDArray[np.int64]:
@@ -159,7 +159,7 @@ class RegisterRecord:
     """
 
     fields: tuple[RegisterField, ...]
-    runs: tuple[Run, ...]
+    runs: tuple[RegisterRun, ...]
 
     def __post_init__(self) -> None:
         for field in self.fields:
@@ -299,7 +299,7 @@ def _bytes_of(field: RegisterField, values: NDArray[np.float64]) -> NDArray[np.u
     return np.ascontiguousarray(numbers).view(np.uint8).reshape(len(values), -1)
 
 
-def plan_runs(wanted: Sequence[Run], limits: RunLimits = ANY_RUN) -> tuple[Run, ...]:
+def plan_runs(wanted: Sequence[RegisterRun], limits: RunLimits = ANY_RUN) -> tuple[RegisterRun, ...]:
     """Few requests that read every wanted register exactly once.
 
     Neighbours are merged where the limits allow it. What lies together (registers of one number, or of
@@ -315,11 +315,11 @@ def plan_runs(wanted: Sequence[Run], limits: RunLimits = ANY_RUN) -> tuple[Run, 
     Raises:
         LayoutError: a wanted register is forbidden, or what must stay together exceeds ``max_count``.
     """
-    together: list[Run] = []
+    together: list[RegisterRun] = []
     for run in sorted(wanted):
         if together and run.address < together[-1].end:
             last = together.pop()
-            run = Run(last.address, max(last.end, run.end) - last.address)  # noqa: PLW2901 - it has grown
+            run = RegisterRun(last.address, max(last.end, run.end) - last.address)  # noqa: PLW2901 - it has grown
         together.append(run)
     for run in together:
         if run.count > limits.max_count:
@@ -328,10 +328,10 @@ def plan_runs(wanted: Sequence[Run], limits: RunLimits = ANY_RUN) -> tuple[Run, 
                 f"{limits.max_count}; raise max_count (up to 125)"
             )
         _refuse_forbidden(run, limits.forbidden)
-    runs: list[Run] = together[:1]
+    runs: list[RegisterRun] = together[:1]
     for before, run in pairwise(together):
-        gap = Run(before.end, run.address - before.end)
-        merged = Run(runs[-1].address, run.end - runs[-1].address)
+        gap = RegisterRun(before.end, run.address - before.end)
+        merged = RegisterRun(runs[-1].address, run.end - runs[-1].address)
         if (
             gap.count <= limits.max_gap
             and merged.count <= limits.max_count
@@ -343,11 +343,11 @@ def plan_runs(wanted: Sequence[Run], limits: RunLimits = ANY_RUN) -> tuple[Run, 
     return tuple(runs)
 
 
-def _overlap(a: Run, b: Run) -> bool:
+def _overlap(a: RegisterRun, b: RegisterRun) -> bool:
     return max(a.address, b.address) < min(a.end, b.end)
 
 
-def _refuse_forbidden(run: Run, forbidden: Sequence[Run]) -> None:
+def _refuse_forbidden(run: RegisterRun, forbidden: Sequence[RegisterRun]) -> None:
     for other in forbidden:
         if _overlap(run, other):
             raise LayoutError(

@@ -71,7 +71,7 @@ _WRITES = (WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS)
 _READS = (READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT)
 
 
-class Expected(NamedTuple):
+class ExpectedReply(NamedTuple):
     """The reply that is waited for.
 
     Attributes:
@@ -87,7 +87,7 @@ class Expected(NamedTuple):
     transaction: int = 0
 
 
-class Verdict(NamedTuple):
+class ReplyVerdict(NamedTuple):
     """What the bytes received so far are.
 
     Attributes:
@@ -123,7 +123,7 @@ def pdu_bytes(start: bytes) -> int | None:
     raise ValueError(f"function {function} of a reply is not one that was ever asked for")
 
 
-def judge_pdu(pdu: bytes, expected: Expected) -> Fault | None:  # noqa: PLR0911 - one for each fault
+def judge_pdu(pdu: bytes, expected: ExpectedReply) -> Fault | None:  # noqa: PLR0911 - one for each fault
     """What is wrong with the PDU of the unit and transaction that were asked; None if nothing is."""
     if not pdu:
         return "truncated"
@@ -148,33 +148,33 @@ def register_bytes(pdu: bytes) -> bytes:
     return pdu[2:] if pdu[0] in _READS else b""
 
 
-def judge_tcp(data: bytes, expected: Expected | None) -> Verdict:  # noqa: PLR0911 - one for each fault
+def judge_tcp(data: bytes, expected: ExpectedReply | None) -> ReplyVerdict:  # noqa: PLR0911 - one for each fault
     """What stands at the head of the bytes received over TCP (MBAP frames)."""
     if len(data) < MBAP_BYTES:
-        return Verdict()
+        return ReplyVerdict()
     transaction, protocol, length, unit = _MBAP.unpack_from(data)
     if protocol != 0:
         # No length can be believed any more: nothing tells where the next frame begins.
-        return Verdict(len(data), fault="wrong_protocol", final=True)
+        return ReplyVerdict(len(data), fault="wrong_protocol", final=True)
     if length < 2:
-        return Verdict(len(data), fault="truncated", final=True)
+        return ReplyVerdict(len(data), fault="truncated", final=True)
     end = MBAP_BYTES - 1 + length
     if end > MAX_TCP_BYTES:
-        return Verdict(len(data), fault="oversized", final=True)
+        return ReplyVerdict(len(data), fault="oversized", final=True)
     if len(data) < end:
-        return Verdict()
+        return ReplyVerdict()
     if expected is None or transaction != expected.transaction:
-        return Verdict(end, fault="wrong_transaction")
+        return ReplyVerdict(end, fault="wrong_transaction")
     if unit != expected.unit:
-        return Verdict(end, fault="wrong_unit")
+        return ReplyVerdict(end, fault="wrong_unit")
     pdu = data[MBAP_BYTES:end]
     fault = judge_pdu(pdu, expected)
-    return Verdict(end, None if fault else pdu, fault, final=True)
+    return ReplyVerdict(end, None if fault else pdu, fault, final=True)
 
 
 def judge_rtu(  # noqa: PLR0911 - one for each fault
-    data: bytes, expected: Expected, crc_of: Callable[[bytes], int]
-) -> Verdict:
+    data: bytes, expected: ExpectedReply, crc_of: Callable[[bytes], int]
+) -> ReplyVerdict:
     """What stands at the head of the bytes received on a serial line.
 
     Args:
@@ -183,25 +183,25 @@ def judge_rtu(  # noqa: PLR0911 - one for each fault
         crc_of: CRC-16/MODBUS of some bytes, as an int of its two bytes in their order on the line.
     """
     if len(data) < 2:
-        return Verdict()
+        return ReplyVerdict()
     try:
         length = pdu_bytes(data[1:4])
     except ValueError:
-        return Verdict(len(data), fault="corrupt")
+        return ReplyVerdict(len(data), fault="corrupt")
     if length is None:
-        return Verdict()
+        return ReplyVerdict()
     end = 1 + length + 2
     if end > MAX_RTU_BYTES:
-        return Verdict(len(data), fault="oversized")
+        return ReplyVerdict(len(data), fault="oversized")
     if len(data) < end:
-        return Verdict()
+        return ReplyVerdict()
     if crc_of(data[: end - 2]) != int.from_bytes(data[end - 2 : end], "big"):
-        return Verdict(len(data), fault="corrupt")
+        return ReplyVerdict(len(data), fault="corrupt")
     if data[0] != expected.unit:
-        return Verdict(end, fault="wrong_unit")
+        return ReplyVerdict(end, fault="wrong_unit")
     pdu = data[1 : end - 2]
     fault = judge_pdu(pdu, expected)
-    return Verdict(end, None if fault else pdu, fault, final=True)
+    return ReplyVerdict(end, None if fault else pdu, fault, final=True)
 
 
 def _judge_fifo(pdu: bytes) -> Fault | None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.modbus.counted import SURE, CountedReader
 from drivers.modbus.layouts import FUNCTIONS, Ring
-from drivers.modbus.registers import Run
+from drivers.modbus.registers import RegisterRun
 
 if TYPE_CHECKING:
     from drivers.base import BusPort, StreamSpec
@@ -31,7 +31,7 @@ class _Look(NamedTuple):
     seen_ns: int
 
 
-class RingReader(CountedReader[Ring]):
+class DeviceRingReader(CountedReader[Ring]):
     """Follows the write counter of a ring.
 
     What was written between two looks at the counter is read, and the look after that tells whether any of
@@ -182,13 +182,13 @@ class RingReader(CountedReader[Ring]):
             return 0  # it has not begun at 0, so where it has is not known
         return look.written - following if look.written >= following else look.written
 
-    def _runs(self, start: int, due: int) -> list[Run]:
+    def _runs(self, start: int, due: int) -> list[RegisterRun]:
         """The requests for ``due`` samples from ``start`` on; the ring may end in between."""
         width, depth = self._layout.record.registers, self._layout.depth
         runs = []
         while due:
             place = start % depth
             count = min(due, depth - place, self._layout.samples_per_read)
-            runs.append(Run(self._layout.address + place * width, count * width))
+            runs.append(RegisterRun(self._layout.address + place * width, count * width))
             start, due = start + count, due - count
         return runs

@@ -7,8 +7,8 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
 from drivers.modbus.fifo import FifoReader
-from drivers.modbus.layouts import Fifo, Ring, Trend, shared_runs
-from drivers.modbus.ring import RingReader
+from drivers.modbus.layouts import Fifo, Ring, TrendLayout, shared_runs
+from drivers.modbus.ring import DeviceRingReader
 from drivers.modbus.trend import TrendReader
 from drivers.modbus.waveform import WaveformReader
 
@@ -26,12 +26,12 @@ def readers_for(port: BusPort, counters: ModbusCounters) -> list[Reader]:
     checked = port.options.get("transport") == "rtu"  # each frame with its CRC
     for spec in port.streams:
         layout = spec.layout
-        if isinstance(layout, Trend):
+        if isinstance(layout, TrendLayout):
             polled.setdefault((layout.unit, layout.table, spec.rate_hz), []).append(spec)
         elif isinstance(layout, Fifo):
             readers.append(FifoReader(spec, port, checked=checked))
         elif isinstance(layout, Ring):
-            readers.append(RingReader(spec, port, counters, checked=checked))
+            readers.append(DeviceRingReader(spec, port, counters, checked=checked))
         else:
             readers.append(WaveformReader(spec, port, counters, windows[layout.unit]))
     for specs in polled.values():

@@ -29,7 +29,7 @@ class UnitSetAsideError(NoReplyError):
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
+class RetryPolicy:
     """How long to bear with a line and its units.
 
     Attributes:
@@ -104,7 +104,7 @@ class Silence:
     probe_ns: int | None = None
     hopeful: bool = False
 
-    def set_aside(self, patience: Patience, now_ns: int) -> bool:
+    def set_aside(self, patience: RetryPolicy, now_ns: int) -> bool:
         """Let nobody ask for a while; returns whether that is new."""
         new = self.probe_ns is None
         self.wait_ns = patience.demotion_ns if new else min(2 * self.wait_ns, patience.longest_demotion_ns)
@@ -131,7 +131,11 @@ class UnitSilence:
     """
 
     def __init__(
-        self, unit: int, patience: Patience, counters: ModbusCounters, sparing: SparingByEnquiry | None = None
+        self,
+        unit: int,
+        patience: RetryPolicy,
+        counters: ModbusCounters,
+        sparing: SparingByEnquiry | None = None,
     ) -> None:
         self._unit = unit
         self._patience = patience

@@ -20,7 +20,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from drivers.modbus.layouts import FUNCTIONS
-from drivers.modbus.outcomes import NoReplyError, RefusedError
+from drivers.modbus.outcomes import NoReplyError, RequestRefusedError
 from drivers.modbus.reading import PollingReader, streams_in_words
 
 if TYPE_CHECKING:
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import Samples
     from drivers.base import BusPort, StreamSpec
-    from drivers.modbus.layouts import Trend
-    from drivers.modbus.line import ModbusLine, Reading
-    from drivers.modbus.registers import Run
+    from drivers.modbus.layouts import TrendLayout
+    from drivers.modbus.line import ModbusLine, RegisterValues
+    from drivers.modbus.registers import RegisterRun
 
 logger = logging.getLogger(__name__)
 
@@ -56,14 +56,14 @@ APART_MOST_NS = 3600 * NS_PER_S
 class _Failure(NamedTuple):
     """A request that failed: why, for what, and whose samples it costs."""
 
-    error: NoReplyError | RefusedError
-    run: Run
+    error: NoReplyError | RequestRefusedError
+    run: RegisterRun
     takers: frozenset[_TrendStream]
 
     @property
     def of_sharing(self) -> bool:
         """Whether the unit may have each stream's registers, and not all that lies between them."""
-        refused = isinstance(self.error, RefusedError) and self.error.code in REFUSALS_OF_REGISTERS
+        refused = isinstance(self.error, RequestRefusedError) and self.error.code in REFUSALS_OF_REGISTERS
         return refused and len(self.takers) > 1
 
 
@@ -83,7 +83,7 @@ class _TrendStream:
     from even steps as its polls were from the schedule: that is in the block's error, too.
     """
 
-    def __init__(self, spec: StreamSpec[Trend], port: BusPort) -> None:
+    def __init__(self, spec: StreamSpec[TrendLayout], port: BusPort) -> None:
         self.name = spec.name
         self.own_runs = spec.layout.record.runs
         self.counters = StreamCounters()
@@ -103,7 +103,7 @@ class _TrendStream:
         late_ns = float(np.percentile(self._lateness_ns, 95)) if self._lateness_ns else 0.0
         return TimeBaseState(self._period_ns, 0.0, late_ns, self._next is not None, 0, self._error_ns)
 
-    def places_in(self, runs: Sequence[Run]) -> tuple[int, ...]:
+    def places_in(self, runs: Sequence[RegisterRun]) -> tuple[int, ...]:
         """Places of those runs that its quantities lie in."""
         wanted = [field.run for field in self._record.fields]
         return tuple(
@@ -112,13 +112,13 @@ class _TrendStream:
             if any(run.address <= one.address and one.end <= run.end for one in wanted)
         )
 
-    def take_from(self, runs: Sequence[Run], places: Sequence[int]) -> None:
+    def take_from(self, runs: Sequence[RegisterRun], places: Sequence[int]) -> None:
         """Say which runs are read from now on, and which of them are for this stream."""
         self.flush()
         self._places = tuple(places)
         self._record = replace(self._record, runs=tuple(runs[place] for place in places))
 
-    def take(self, slot: int, start_ns: int, readings: Sequence[Reading | None]) -> None:
+    def take(self, slot: int, start_ns: int, readings: Sequence[RegisterValues | None]) -> None:
         """Take the sample of a slot, from what each run holds; without one of its own it is lost.
 
         Args:
@@ -181,7 +181,10 @@ class TrendReader(PollingReader):
     """
 
     def __init__(
-        self, specs: Sequence[StreamSpec[Trend]], port: BusPort, runs: Sequence[Run] | None = None
+        self,
+        specs: Sequence[StreamSpec[TrendLayout]],
+        port: BusPort,
+        runs: Sequence[RegisterRun] | None = None,
     ) -> None:
         super().__init__([spec.name for spec in specs], port.clock)
         self._unit = specs[0].layout.unit
@@ -224,9 +227,9 @@ class TrendReader(PollingReader):
         if failure is not None:
             self._fail(failure)
 
-    async def _ask(self, line: ModbusLine) -> tuple[list[Reading | None], _Failure | None]:
+    async def _ask(self, line: ModbusLine) -> tuple[list[RegisterValues | None], _Failure | None]:
         """Read all runs; the last failure that cost some stream its sample, if any."""
-        readings: list[Reading | None] = []
+        readings: list[RegisterValues | None] = []
         lost: frozenset[_TrendStream] = frozenset()
         failure: _Failure | None = None
         for run, what, takers in self._plan:
@@ -234,13 +237,13 @@ class TrendReader(PollingReader):
             if not takers <= lost:  # else nobody's sample can be whole any more
                 try:
                     reading = await line.poll(self._unit, self._function, run, what)
-                except (NoReplyError, RefusedError) as error:
+                except (NoReplyError, RequestRefusedError) as error:
                     failure = _Failure(error, run, takers)
                     lost |= takers
             readings.append(reading)
         return readings, failure
 
-    def _take(self, slot: int, readings: Sequence[Reading | None]) -> None:
+    def _take(self, slot: int, readings: Sequence[RegisterValues | None]) -> None:
         """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
         asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
         if asked_ns is None:
@@ -268,27 +271,27 @@ class TrendReader(PollingReader):
 
     def _fail(self, failure: _Failure) -> None:
         """Tell a refusal with whom it concerns; whoever is silent is told by the line."""
-        if not isinstance(failure.error, RefusedError):
+        if not isinstance(failure.error, RequestRefusedError):
             raise failure.error
-        told = RefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
+        told = RequestRefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
         self._tell(told, streams_in_words(sorted(stream.name for stream in failure.takers)))
 
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""
 
-    def _read_together(self, runs: Sequence[Run]) -> None:
+    def _read_together(self, runs: Sequence[RegisterRun]) -> None:
         self._together_at_ns = None
         self._read_from(runs, {stream: stream.places_in(runs) for stream in self._streams})
 
     def _read_apart(self) -> None:
-        runs: list[Run] = []
+        runs: list[RegisterRun] = []
         places = {}
         for stream in self._streams:
             places[stream] = range(len(runs), len(runs) + len(stream.own_runs))
             runs += stream.own_runs
         self._read_from(runs, places)
 
-    def _read_from(self, runs: Sequence[Run], places: Mapping[_TrendStream, Sequence[int]]) -> None:
+    def _read_from(self, runs: Sequence[RegisterRun], places: Mapping[_TrendStream, Sequence[int]]) -> None:
         for stream in self._streams:
             stream.take_from(runs, places[stream])
         self._plan = [
@@ -319,5 +322,5 @@ class TrendReader(PollingReader):
         return self._start_ns + round(slot * self._period_ns)
 
 
-def _words(run: Run) -> str:
+def _words(run: RegisterRun) -> str:
     return f"registers {run.address} to {run.end - 1}"

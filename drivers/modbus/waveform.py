@@ -15,7 +15,7 @@ from daqsvc.acquisition.timebase import TimeBaseState
 from drivers.modbus.counted import SURE, SampleClock
 from drivers.modbus.layouts import FUNCTIONS
 from drivers.modbus.reading import PollingReader
-from drivers.modbus.registers import Run
+from drivers.modbus.registers import RegisterRun
 
 if TYPE_CHECKING:
     import asyncio
@@ -155,7 +155,7 @@ class WaveformReader(PollingReader):
     async def _id(self, line: ModbusLine) -> int:
         """The id of the block that the device shows, and with a new one when that block ended."""
         layout = self._layout
-        run = Run(layout.block_id, 1)
+        run = RegisterRun(layout.block_id, 1)
         while True:
             first = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
             again = first

@@ -16,7 +16,7 @@ from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.outcomes import LineLostError, ModbusCounters, NoReplyError
-from drivers.modbus.replies import FAULTY, Expected, Verdict, judge_rtu, judge_tcp
+from drivers.modbus.replies import FAULTY, ExpectedReply, ReplyVerdict, judge_rtu, judge_tcp
 from drivers.tty import why_not_open
 
 if TYPE_CHECKING:
@@ -72,13 +72,13 @@ class LineOptions:
         return max(round(3.5 * BITS_PER_CHARACTER * NS_PER_S / self.baud), 1_750_000)
 
 
-class Request(NamedTuple):
+class ModbusRequest(NamedTuple):
     """A request as it is sent.
 
     Attributes:
         unit: address of the unit.
         pdu: function and data.
-        data_bytes: bytes of register data in the reply, see `Expected`.
+        data_bytes: bytes of register data in the reply, see `ExpectedReply`.
     """
 
     unit: int
@@ -115,7 +115,7 @@ class ModbusWire(ModbusProtocol):
         self._transaction = 0
         self._deadline_s = 0.0
         self._alarm: asyncio.TimerHandle | None = None
-        self._expected: Expected | None = None
+        self._expected: ExpectedReply | None = None
         self._reply: asyncio.Future[bytes] = self.loop.create_future()
 
     async def open(self) -> None:
@@ -133,7 +133,7 @@ class ModbusWire(ModbusProtocol):
             why = self._why_not_open(error, patience_s)
             raise LineLostError(f"it cannot be opened: {why}") from error
 
-    async def exchange(self, request: Request) -> bytes:
+    async def exchange(self, request: ModbusRequest) -> bytes:
         """Send a request and wait for its reply.
 
         Returns:
@@ -148,7 +148,7 @@ class ModbusWire(ModbusProtocol):
         if not self._serial:
             self._transaction = self._transaction % _LAST_TRANSACTION + 1
         unit, pdu, data_bytes = request
-        self._expected = Expected(unit, pdu[0], data_bytes, self._transaction)
+        self._expected = ExpectedReply(unit, pdu[0], data_bytes, self._transaction)
         self._reply = self.loop.create_future()
         self._deadline_s = self.loop.time() + self._timeout_s
         if self._alarm is None:
@@ -221,17 +221,17 @@ class ModbusWire(ModbusProtocol):
                 port.reset_input_buffer()
                 self._counters.note("unasked")
 
-    def _judge(self, data: bytes) -> Verdict:
+    def _judge(self, data: bytes) -> ReplyVerdict:
         if len(data) > _BUFFER_BYTES:
-            return Verdict(len(data), fault="oversized", final=True)
+            return ReplyVerdict(len(data), fault="oversized", final=True)
         if not self._serial:
             return judge_tcp(data, self._expected)
         if self._expected is None:
             self._counters.note("unasked")
-            return Verdict(len(data))
+            return ReplyVerdict(len(data))
         return judge_rtu(data, self._expected, FramerRTU.compute_CRC)
 
-    def _settle(self, verdict: Verdict) -> None:
+    def _settle(self, verdict: ReplyVerdict) -> None:
         """End the request: with its reply, or because this was its reply and it is faulty."""
         if verdict.pdu is not None:
             if self._waits:

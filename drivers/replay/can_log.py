@@ -15,7 +15,7 @@ from can.io.generic import BinaryIOMessageReader, TextIOMessageReader
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import UNBOUNDED, Budget, CountedFile
 from drivers.replay.blf import BlfFile
-from drivers.replay.files import RecordingError, words
+from drivers.replay.files import RecordedLogError, words
 from drivers.replay.lines import TextLog, whole
 from drivers.replay.table import no_file
 
@@ -49,7 +49,7 @@ class CanLog:
         sort: sorts messages with their times to streams.
 
     Raises:
-        RecordingError: the file cannot be opened, or is of no format that can be played.
+        RecordedLogError: the file cannot be opened, or is of no format that can be played.
     """
 
     def __init__(self, path: Path, sort: Sort) -> None:
@@ -63,16 +63,16 @@ class CanLog:
             self._messages = self._open()
         except Exception as error:
             self._files.close()
-            raise RecordingError(
+            raise RecordedLogError(
                 f"{path} cannot be read as a CAN log: {words(error)}; give a file of a format that "
                 "python-can reads, with its usual ending (.asc, .blf, .log, .trc; .gz behind it if zipped)"
             ) from error
         self._ahead: can.Message | None = None
-        self._damage: RecordingError | None = None
+        self._damage: RecordedLogError | None = None
 
     @property
     def first_malformed(self) -> str:
-        """See `drivers.replay.files.Recording.first_malformed`."""
+        """See `drivers.replay.files.RecordedLog.first_malformed`."""
         if self._text is None or not self._text.malformed:
             return ""
         return f"line {self._text.first_malformed_at}, {self._text.first_malformed}"
@@ -110,13 +110,13 @@ class CanLog:
         return self._files.enter_context(self._path.open("rb"))
 
     def read(self, span_ns: int) -> Sorted | None:
-        """See `drivers.replay.files.Recording.read`."""
+        """See `drivers.replay.files.RecordedLog.read`."""
         messages: list[can.Message] = []
         t_ns: list[int] = []
         while len(messages) < PIECE_FRAMES and self._damage is None:
             try:
                 message = self._ahead or self._next()
-            except RecordingError as error:
+            except RecordedLogError as error:
                 self._damage = error  # for the next read, after what came before it
                 break
             self._ahead = None
@@ -145,7 +145,7 @@ class CanLog:
                 return None
             whole(message)
         except Exception as error:
-            raise RecordingError(
+            raise RecordedLogError(
                 f"{self._path} is damaged behind frame {self._frames}: {words(error)}; "
                 "the frames before that have been played"
             ) from error
@@ -156,7 +156,7 @@ class CanLog:
         return message
 
     def close(self) -> None:
-        """See `drivers.replay.files.Recording.close`."""
+        """See `drivers.replay.files.RecordedLog.close`."""
         self._files.close()
 
 

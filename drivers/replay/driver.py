@@ -18,7 +18,7 @@ import numpy as np
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
-from daqsvc.confined.limits import GIGABYTE, Limits
+from daqsvc.confined.limits import GIGABYTE, ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
 from drivers.base import BusCounters, BusPort
 from drivers.can.adapter import batch_of
@@ -30,7 +30,7 @@ from drivers.replay.channel import ChannelChoice
 from drivers.replay.files import (
     TABLE_COUNTER_BITS,
     ColumnLayout,
-    RecordingError,
+    RecordedLogError,
     SampleTable,
     kind_of,
     words,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
     from drivers.can.batches import Sorted
-    from drivers.replay.files import Recording
+    from drivers.replay.files import RecordedLog
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ class ReplayDriver:
         self._place = Place()
         self._reader = ConfinedProcess()
         memory_gb = port.options.get("max_memory_gb")
-        self._limits = Limits() if memory_gb is None else Limits(round(memory_gb * GIGABYTE))
+        self._limits = ResourceLimits() if memory_gb is None else ResourceLimits(round(memory_gb * GIGABYTE))
         self._first_index: dict[str, int] = {}
         self._to_its_end = False
         self._shift_ns: int | None = None
@@ -166,27 +166,29 @@ class ReplayDriver:
     def _frames(self) -> int:
         return sum(a.counters.frames_received for a in self._assemblers.values())
 
-    async def _open(self) -> Recording:
+    async def _open(self) -> RecordedLog:
         self._reader.close()  # it may have been told to stop when it had just ended
         try:
             return await in_thread(self._open_file, undo=self._close, abort=self._reader.abort)
-        except RecordingError as error:
+        except RecordedLogError as error:
             self.counters.open_failures += 1
             raise CannotOpenError(f"{error}") from error
         except Exception as error:
             self.counters.open_failures += 1
             raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
 
-    def _open_file(self) -> Recording:
+    def _open_file(self) -> RecordedLog:
         if not self._path.exists():
-            raise RecordingError(f"there is no file {self._path}; correct the bus's file, or record it first")
+            raise RecordedLogError(
+                f"there is no file {self._path}; correct the bus's file, or record it first"
+            )
         if self._at_end == "wait":
             return GrowingCandump(self._path, self._sort, self._place)
         if kind_of(self._path) == "table":
             return SampleTable(self._path, self._port.streams, self._first_index, self._limits, self._reader)
         return CanLog(self._path, self._sort)
 
-    def _close(self, recording: Recording) -> None:
+    def _close(self, recording: RecordedLog) -> None:
         try:
             recording.close()
         except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
@@ -199,7 +201,7 @@ class ReplayDriver:
         found.note("frames_other_channel", len(messages) - len(chosen))
         return found
 
-    async def _play(self, recording: Recording) -> Ending:
+    async def _play(self, recording: RecordedLog) -> Ending:
         """Play until there is no more; returns why."""
         if self._at_end != "wait":
             self._begin_anew(recording)
@@ -216,7 +218,7 @@ class ReplayDriver:
                         f"{recording.first_malformed}"
                     )
                 await self._take(piece)
-        except RecordingError as error:
+        except RecordedLogError as error:
             if self._at_end != "wait":
                 self.counters.passes_damaged += 1
                 self._say_once(f"{error}")
@@ -233,7 +235,7 @@ class ReplayDriver:
             self._said.add(what)
             logger.warning("replayed bus %r: %s", self.name, what)
 
-    def _begin_anew(self, recording: Recording) -> None:
+    def _begin_anew(self, recording: RecordedLog) -> None:
         """The recording is played from its beginning: nothing is missing between this and what was before."""
         if not (isinstance(recording, SampleTable) and recording.seamless and self._to_its_end):
             for assembler in self._assemblers.values():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.confined.limits import Limits
+from daqsvc.confined.limits import ResourceLimits
 from drivers.can.batches import Sorted, StreamFrames
 from drivers.frames import Decoded
 from drivers.replay.table import TableError, read_columns
@@ -32,11 +32,11 @@ MOST_NAMED = 50
 """Columns that a message names."""
 
 
-class RecordingError(Exception):
+class RecordedLogError(Exception):
     """A recording cannot be read, or no longer; says the file, the reason and the remedy."""
 
 
-class Recording(Protocol):
+class RecordedLog(Protocol):
     """An open recording; all calls come from one thread at a time."""
 
     @property
@@ -51,7 +51,7 @@ class Recording(Protocol):
             None at the end; an empty piece if there may be more later.
 
         Raises:
-            RecordingError: the rest cannot be read.
+            RecordedLogError: the rest cannot be read.
         """
         ...
 
@@ -102,7 +102,7 @@ class SampleTable:
         seamless: whether all streams last as long: played again, it goes on without a step in time.
 
     Raises:
-        RecordingError: the file cannot be read, a column is missing, or columns differ in length.
+        RecordedLogError: the file cannot be read, a column is missing, or columns differ in length.
     """
 
     first_malformed = ""
@@ -112,18 +112,18 @@ class SampleTable:
         path: Path,
         specs: Sequence[StreamSpec[ColumnLayout]],
         first_index: dict[str, int],
-        limits: Limits | None = None,
+        limits: ResourceLimits | None = None,
         reader: ConfinedProcess | None = None,
     ) -> None:
         self._first_index = first_index
         wanted = [column for spec in specs for column in spec.layout.columns]
-        table = _table(path, wanted, limits or Limits(), reader)
+        table = _table(path, wanted, limits or ResourceLimits(), reader)
         self._streams: list[tuple[StreamSpec[ColumnLayout], NDArray[np.float32]]] = []
         for spec in specs:
             columns = [table[name] for name in spec.layout.columns]
             if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
                 shapes = {n: list(c.shape) for n, c in zip(spec.layout.columns, columns, strict=True)}
-                raise RecordingError(
+                raise RecordedLogError(
                     f"{path}: the columns of stream {spec.name!r} have the shapes {shapes}; "
                     "they must have one dimension and one length"
                 )
@@ -136,7 +136,7 @@ class SampleTable:
         self.seamless = len({len(values) / spec.rate_hz for spec, values in self._streams}) == 1
 
     def read(self, span_ns: int) -> Sorted | None:
-        """See `Recording.read`; the recording begins at time 0."""
+        """See `RecordedLog.read`; the recording begins at time 0."""
         rates = [spec.rate_hz for spec, _ in self._streams]
         # A short span may hold no sample of a slow stream, but must hold some of another.
         span_ns = max(span_ns, round(2 * NS_PER_S / max(rates)))
@@ -166,7 +166,7 @@ class SampleTable:
         return StreamFrames(spec.name, Decoded(counter, values[first:last, None, :], intact), t_ns)
 
     def close(self) -> None:
-        """See `Recording.close`."""
+        """See `RecordedLog.close`."""
         self._streams = []
 
 
@@ -184,12 +184,12 @@ def words(error: BaseException) -> str:
 
 
 def _table(
-    path: Path, wanted: Sequence[str], limits: Limits, reader: ConfinedProcess | None
+    path: Path, wanted: Sequence[str], limits: ResourceLimits, reader: ConfinedProcess | None
 ) -> dict[str, NDArray[np.float64]]:
     try:
         there, found = read_columns(path, wanted, limits, reader)
     except TableError as error:
-        raise RecordingError(
+        raise RecordedLogError(
             f"{path} cannot be read as a table of samples: {words(error)}; give an NPZ file with an array "
             "per column, or a CSV file of numbers with the columns' names in its first line"
         ) from error
@@ -197,5 +197,5 @@ def _table(
         shown = ", ".join(there[:MOST_NAMED]) + (
             f" and {len(there) - MOST_NAMED} more" * (len(there) > MOST_NAMED)
         )
-        raise RecordingError(f"{path} has no column {missing[0]!r}; it has {shown}")
+        raise RecordedLogError(f"{path} has no column {missing[0]!r}; it has {shown}")
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from can.io.canutils import CanutilsLogReader
 
 from drivers.replay.can_log import PIECE_FRAMES, recorded_ns
-from drivers.replay.files import RecordingError
+from drivers.replay.files import RecordedLogError
 from drivers.replay.lines import LONGEST_LINE, TextLog
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class GrowingCandump:
         place: how far the file has been read before; kept up to date.
 
     Raises:
-        RecordingError: the file cannot be opened.
+        RecordedLogError: the file cannot be opened.
     """
 
     def __init__(self, path: Path, sort: Sort, place: Place) -> None:
@@ -57,17 +57,17 @@ class GrowingCandump:
         try:
             self._file = path.open("rb")
         except OSError as error:
-            raise RecordingError(f"{path} cannot be opened: {error.strerror}") from error
+            raise RecordedLogError(f"{path} cannot be opened: {error.strerror}") from error
         status = os.fstat(self._file.fileno())
         if place.file != (status.st_dev, status.st_ino) or place.offset > status.st_size:
             place.file, place.offset = (status.st_dev, status.st_ino), 0
         self._file.seek(place.offset)
 
     def read(self, span_ns: int) -> Sorted | None:
-        """See `Recording.read`; never at the end.
+        """See `RecordedLog.read`; never at the end.
 
         Raises:
-            RecordingError: the file has been taken away, replaced or cut short, and what was in it is read.
+            RecordedLogError: the file has been taken away, replaced or cut short, and what was in it is read.
         """
         if not self._pending:
             self._read_on()
@@ -88,7 +88,7 @@ class GrowingCandump:
         try:
             chunk = self._file.read(CHUNK_BYTES)
         except OSError as error:
-            raise RecordingError(f"{self._path} cannot be read: {error.strerror}") from error
+            raise RecordedLogError(f"{self._path} cannot be read: {error.strerror}") from error
         whole, newline, rest = (self._rest + chunk).rpartition(b"\n")
         if not newline and len(rest) > LONGEST_LINE:
             # No line of a log is as long: bound what is held for the end of one.
@@ -105,14 +105,14 @@ class GrowingCandump:
         try:
             status = self._path.stat()
         except OSError as error:
-            raise RecordingError(f"{self._path} is gone: {error.strerror}") from error
+            raise RecordedLogError(f"{self._path} is gone: {error.strerror}") from error
         if (status.st_dev, status.st_ino) != self._place.file:
-            raise RecordingError(f"{self._path} has been replaced by another file")
+            raise RecordedLogError(f"{self._path} has been replaced by another file")
         if status.st_size < self._place.offset:
-            raise RecordingError(f"{self._path} has been cut short")
+            raise RecordedLogError(f"{self._path} has been cut short")
 
     def close(self) -> None:
-        """See `Recording.close`."""
+        """See `RecordedLog.close`."""
         self._file.close()
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.confined.archives import load_array
-from daqsvc.confined.limits import Budget, Limits, TooLargeError
+from daqsvc.confined.limits import Budget, ResourceLimits, TooLargeError
 from daqsvc.confined.process import ConfinedError, ConfinedProcess, RaisedThereError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def no_file(path: Path) -> str:
 
 
 def read_columns(
-    path: Path, wanted: Sequence[str], limits: Limits, reader: ConfinedProcess | None = None
+    path: Path, wanted: Sequence[str], limits: ResourceLimits, reader: ConfinedProcess | None = None
 ) -> tuple[Sequence[str], dict[str, NDArray[np.float64]]]:
     """The names of all columns of an NPZ or CSV file, and those that are wanted and there.
 
@@ -77,7 +77,7 @@ def columns(
     file = Path(path)
     if not file.is_file():
         raise ValueError(no_file(file))
-    budget = Budget.of(file, Limits(memory_bytes))
+    budget = Budget.of(file, ResourceLimits(memory_bytes))
     if file.suffix.lower() == ".npz":
         there, found = _of_archive(file, wanted, budget)
     else:

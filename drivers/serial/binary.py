@@ -19,7 +19,7 @@ from cobs import cobs
 
 from drivers.frames import LayoutError
 from drivers.serial.framing import DelimitedFraming, Found, Frames
-from drivers.serial.kernels import CRC_BYTES, Step, crcs_match, gather, hunt, in_units, unstuff
+from drivers.serial.kernels import CRC_BYTES, SyncSearch, crcs_match, gather, hunt, in_units, unstuff
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -119,7 +119,7 @@ class BodyCodec:
             return np.ones(len(starts), np.bool_)
         return crcs_match(buffer, starts, lengths, self._initial, self._swap)
 
-    def hunt(self, buffer: NDArray[np.uint8], word: NDArray[np.uint8], step: Step) -> Hunted:
+    def hunt(self, buffer: NDArray[np.uint8], word: NDArray[np.uint8], step: SyncSearch) -> Hunted:
         """The bodies behind sync words; see `drivers.serial.kernels.hunt`."""
         limits = min(map(self.length, self._layouts)), self.longest
         return hunt(buffer, word, self._by_first_byte, limits, self._initial, self._swap, step)
@@ -248,7 +248,7 @@ class SyncFraming(_BinaryFraming):
     def restart(self) -> None:
         """See `Framing.restart`."""
         self._rest = np.empty(0, np.uint8)
-        self._step = Step()
+        self._step = SyncSearch()
 
     def _wrap(self, body: bytes) -> bytes:
         return self._sync.tobytes() + body
@@ -261,7 +261,7 @@ class SyncFraming(_BinaryFraming):
         found = Found(garbage_bytes=hunted.garbage_bytes, malformed=hunted.malformed, resyncs=hunted.resyncs)
         taken, tried, *state = hunted.step
         start = min(taken, tried)
-        self._rest, self._step = buffer[start:].copy(), Step(taken - start, tried - start, *state)
+        self._rest, self._step = buffer[start:].copy(), SyncSearch(taken - start, tried - start, *state)
         if len(hunted.ends):
             lengths = hunted.ends - hunted.starts
             self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, hunted.ends - kept), found)

@@ -22,8 +22,8 @@ from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusCounters, BusPort
 from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming, LineLayout
-from drivers.serial.reader import SHUTDOWN_S, Batch, SerialReader, close_port
+from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming, TextLayout
+from drivers.serial.reader import SHUTDOWN_S, ReceivedBytes, SerialReader, close_port
 from drivers.tty import Character, CharacterFormat, why_not_open
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class SerialDriver:
     ``baud``, ``data_bits``, ``parity``, ``stop_bits``, ``flow_control``, ``low_latency``; ``framing``, and
     what that framing needs: ``crc``, ``crc_order`` and ``stream_ids`` for ``"cobs"`` and ``"sync"``, the
     ``sync_word`` in hexadecimal, ``checksum`` and ``delimiter`` for ``"lines"``. The layouts of its streams
-    are `FrameLayout`, or `LineLayout` for lines.
+    are `FrameLayout`, or `TextLayout` for lines.
 
     Args:
         port: settings, streams, clock and where to deliver.
@@ -147,7 +147,7 @@ class SerialDriver:
             finally:
                 reader.finish()
 
-    def take(self, batch: Batch) -> None:
+    def take(self, batch: ReceivedBytes) -> None:
         """Take in what the reader thread has found; runs on the event loop."""
         found = batch.found
         counters = self.counters
@@ -217,7 +217,7 @@ def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -
         LayoutError: the streams do not fit it.
     """
     if options["framing"] == "lines":
-        lines: dict[str, LineLayout] = {s.name: s.layout for s in streams}
+        lines: dict[str, TextLayout] = {s.name: s.layout for s in streams}
         rates_hz = {s.name: s.rate_hz for s in streams}
         delimiter = options.get("delimiter", "\n").encode("ascii")
         windows_ns = {s.name: s.reorder_window_ns for s in streams}
@@ -244,8 +244,8 @@ def _warm(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> Non
 
 
 def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
-    layout: FrameLayout | LineLayout = spec.layout
-    timed = isinstance(layout, LineLayout) and layout.time is not None
+    layout: FrameLayout | TextLayout = spec.layout
+    timed = isinstance(layout, TextLayout) and layout.time is not None
     return StreamAssembler(
         spec.name,
         spec.rate_hz,

@@ -164,7 +164,7 @@ def in_units(
     return values
 
 
-class Step(NamedTuple):
+class SyncSearch(NamedTuple):
     """Where the hunt for sync words stands.
 
     Attributes:
@@ -196,7 +196,7 @@ class Hunted(NamedTuple):
     starts: Places
     ends: Places
     intact: NDArray[np.bool_]
-    step: Step
+    step: SyncSearch
     garbage_bytes: int
     malformed: int
     resyncs: int
@@ -221,7 +221,7 @@ def hunt(
     limits: tuple[int, int],
     initial: int,
     swap: bool,  # noqa: FBT001 - numba
-    step: Step,
+    step: SyncSearch,
 ) -> Hunted:
     """Find the frames behind sync words.
 
@@ -285,5 +285,5 @@ def hunt(
         taken = at
     found = starts[:n].copy(), ends[:n].copy(), intact[:n].copy()
     return Hunted(
-        found[0], found[1], found[2], Step(taken, at, fresh, astray), garbage_bytes, malformed, resyncs
+        found[0], found[1], found[2], SyncSearch(taken, at, fresh, astray), garbage_bytes, malformed, resyncs
     )

@@ -70,7 +70,7 @@ class Lines(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LineLayout:
+class TextLayout:
     """Which column of a line is what.
 
     Attributes:
@@ -128,7 +128,7 @@ class LineLayout:
         """One line, one count."""
         return 1
 
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> LineLayout:
+    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> TextLayout:
         """The same layout with each channel's value ``v`` turned into ``gain * v + shift``.
 
         Args:
@@ -237,7 +237,7 @@ class LineFraming(DelimitedFraming):
 
     def __init__(
         self,
-        layouts: Mapping[str, LineLayout],
+        layouts: Mapping[str, TextLayout],
         rates_hz: Mapping[str, float],
         checksum: Checksum = "none",
         delimiter: bytes = NEWLINE,

@@ -50,7 +50,7 @@ TIOCGICOUNT = 0x545D
 GONE = {errno.EIO, errno.ENXIO, errno.ENODEV, errno.EBADF}
 
 
-class Batch(NamedTuple):
+class ReceivedBytes(NamedTuple):
     """What one batch of bytes held.
 
     Attributes:
@@ -67,7 +67,7 @@ class Batch(NamedTuple):
 class Taker(Protocol):
     """Who is given what the reader finds; called on the event loop, once in a turn of it."""
 
-    def take(self, batch: Batch) -> None:
+    def take(self, batch: ReceivedBytes) -> None:
         """Take in a batch."""
         ...
 
@@ -250,7 +250,7 @@ class SerialReader(threading.Thread):
             name: at[np.searchsorted(ends, frames.ends, "left").clip(0, len(at) - 1)]
             for name, frames in found.frames.items()
         }
-        self._post(self._take, Batch(int(ends[-1]), found, arrivals))
+        self._post(self._take, ReceivedBytes(int(ends[-1]), found, arrivals))
 
     def _look_at_line(self, now_ns: int) -> None:
         """Count what the UART has found wrong since the last look."""
@@ -275,7 +275,7 @@ class SerialReader(threading.Thread):
                 return False
         return True
 
-    def _take(self, batch: Batch) -> None:
+    def _take(self, batch: ReceivedBytes) -> None:
         self._under_way.release()
         self._taker.take(batch)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from daqsvc.recording.recording import Recording
     from sim_hw.demo.listener import Received
-    from sim_hw.demo.session import Outcome, Script
+    from sim_hw.demo.session import DemoOutcome, Script
     from sim_hw.scenario_bearing import BearingScenario
 
 EXIT_FAILED = 1
@@ -131,7 +131,7 @@ def _run(arguments: argparse.Namespace) -> int:
     )
 
 
-async def _interruptible(playing: Coroutine[Any, Any, Outcome]) -> Outcome:
+async def _interruptible(playing: Coroutine[Any, Any, DemoOutcome]) -> DemoOutcome:
     """Have SIGTERM and a lost terminal cancel what is played, as Ctrl-C does: it then ends in order.
 
     Raises:
@@ -184,11 +184,11 @@ def _say(message: str) -> None:
 
 
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
-    from sim_hw.demo.session import Session  # noqa: PLC0415
+    from sim_hw.demo.session import DemoSession  # noqa: PLC0415
     from sim_hw.demo.summary import summarise  # noqa: PLC0415
 
-    def play(hear: Callable[[Received], None]) -> Outcome:
-        session = Session(script, speed=arguments.speed, broker_url=arguments.broker, hear=hear)
+    def play(hear: Callable[[Received], None]) -> DemoOutcome:
+        session = DemoSession(script, speed=arguments.speed, broker_url=arguments.broker, hear=hear)
         return asyncio.run(_interruptible(session.run()))
 
     if arguments.json:

@@ -82,7 +82,7 @@ class Script:
 
 
 @dataclass(slots=True)
-class Outcome:
+class DemoOutcome:
     """What came of a run.
 
     Attributes:
@@ -110,7 +110,7 @@ class Outcome:
     real_s: float = 0.0
 
 
-class Session:
+class DemoSession:
     """Plays a script.
 
     Args:
@@ -132,11 +132,11 @@ class Session:
         self.speed = speed
         self.service: Service | None = None
         self.node: CanNode | None = None
-        self.outcome = Outcome()
+        self.outcome = DemoOutcome()
         self._broker_url = broker_url
         self._hear = hear
 
-    async def run(self) -> Outcome:
+    async def run(self) -> DemoOutcome:
         """Play it from the beginning to the end.
 
         Raises:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sim_hw.demo.session import Outcome, Script
+    from sim_hw.demo.session import DemoOutcome, Script
     from sim_hw.scenario import Onset
 
 ROTOR_BANK = "rotor-bank"
 
 
-def summarise(script: Script, outcome: Outcome, *, speed: float) -> dict[str, Any]:
+def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str, Any]:
     """The summary as one JSON object.
 
     A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the

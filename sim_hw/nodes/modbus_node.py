@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from drivers.modbus.layouts import Trend
+from drivers.modbus.layouts import TrendLayout
 from sim_hw.nodes.modbus_unit import encode, store_for
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ _REQUEST_BYTES = {3: 5, 4: 5, 6: 5, 24: 3}
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class PlannedReply:
     """What becomes of one reply.
 
     Attributes:
@@ -62,16 +62,16 @@ class Answer:
     delay_ns: int = 0
 
 
-FaultPlan: TypeAlias = "Callable[[int, bytes], Answer]"
+FaultPlan: TypeAlias = "Callable[[int, bytes], PlannedReply]"
 """Says what becomes of the reply, from the unit and the PDU of the request."""
 
 
-def _sound(unit: int, pdu: bytes) -> Answer:
+def _sound(unit: int, pdu: bytes) -> PlannedReply:
     del unit, pdu
-    return Answer()
+    return PlannedReply()
 
 
-class ModbusWire:
+class UnitConnection:
     """One connection seen from the units: bytes of requests in, bytes of replies out.
 
     Args:
@@ -183,7 +183,7 @@ class _TcpConnection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - TCP streams are
         self._transport = transport
-        self._wire = ModbusWire(self._units, self._reply, serial=False, plan=self._plan)
+        self._wire = UnitConnection(self._units, self._reply, serial=False, plan=self._plan)
         self._connections.add(self)
 
     def data_received(self, data: bytes) -> None:
@@ -226,7 +226,7 @@ class ModbusRtuServer:
         self._plan = plan
         self._clock = clock
         self._fds: tuple[int, int] | None = None
-        self._wire: ModbusWire | None = None
+        self._wire: UnitConnection | None = None
 
     def start(self) -> None:
         """Plug in."""
@@ -237,7 +237,7 @@ class ModbusRtuServer:
         self._fds = line, device
         self._link.unlink(missing_ok=True)
         self._link.symlink_to(os.ttyname(device))
-        self._wire = ModbusWire(self._units, self._send, serial=True, plan=self._plan, clock=self._clock)
+        self._wire = UnitConnection(self._units, self._send, serial=True, plan=self._plan, clock=self._clock)
         asyncio.get_running_loop().add_reader(line, self._receive)
 
     def stop(self) -> None:
@@ -284,7 +284,7 @@ class ModbusNode:
     ) -> None:
         self._rows = encode(layout.record, samples)
         self._store = store_for(unit, layout)
-        if isinstance(layout, Trend):
+        if isinstance(layout, TrendLayout):
             # A device has measured before it is asked for the first time.
             self._store.put(first_index, self._rows[:1])
         self._period_ns = NS_PER_S / rate_hz

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from drivers.modbus.layouts import Fifo, Ring, Trend, Waveform
+from drivers.modbus.layouts import Fifo, Ring, TrendLayout, Waveform
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -118,7 +118,7 @@ class SampleStore(Protocol):
 class TrendStore:
     """Registers that show the newest sample."""
 
-    def __init__(self, unit: ModbusUnit, layout: Trend) -> None:
+    def __init__(self, unit: ModbusUnit, layout: TrendLayout) -> None:
         self._unit, self._layout = unit, layout
         for run in layout.record.runs:
             unit.map(layout.table, run.address, run.count)
@@ -266,7 +266,7 @@ class WaveformStore:
 
 def store_for(unit: ModbusUnit, layout: ModbusLayout) -> SampleStore:
     """A store of samples in a unit, as a layout says."""
-    if isinstance(layout, Trend):
+    if isinstance(layout, TrendLayout):
         return TrendStore(unit, layout)
     if isinstance(layout, Fifo):
         return FifoStore(unit, layout)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from drivers.frames import FrameLayout
     from drivers.serial.framing import Framing
-    from drivers.serial.lines import LineLayout
+    from drivers.serial.lines import TextLayout
     from sim_hw.link_faults import LinkFaults
     from sim_hw.node_faults import NodePlan
     from sim_hw.nodes.pacing import Pacer
@@ -55,7 +55,7 @@ class SerialNode(PlannedNode):
         cable: PseudoTerminal,
         framing: Framing,
         stream: str,
-        layout: FrameLayout | LineLayout,
+        layout: FrameLayout | TextLayout,
         samples: NDArray[np.float64] | NDArray[np.float32],
         rate_hz: float,
         *,

@@ -156,7 +156,7 @@ class BearingRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Levels:
+class NoiseLevels:
     """What noise and unbalance of a machine are, fixed while its faults come and go.
 
     Attributes:
@@ -176,7 +176,7 @@ def levels(
     rate_hz: float = 48_000.0,
     unbalance_ratio: float = 3.0,
     seed: int = 0,
-) -> Levels:
+) -> NoiseLevels:
     """Noise and unbalance of a machine.
 
     Args:
@@ -191,18 +191,20 @@ def levels(
     power = np.zeros(2)
     faults: tuple[Fault, ...] = ("inner", "outer")
     for fault in faults:
-        quiet = simulate(machine, signal, fault, Levels((0.0, 0.0), 0.0), rng, rate_hz=rate_hz)
+        quiet = simulate(machine, signal, fault, NoiseLevels((0.0, 0.0), 0.0), rng, rate_hz=rate_hz)
         power += np.square(quiet.y).mean(axis=0) / 2.0
     noise = np.sqrt(power) * 10.0 ** (-snr_db / 20.0)
     at_1x = np.abs(machine.accelerance(np.array([signal.shaft_hz]))[0, 0, 2]) / math.sqrt(2.0)
-    return Levels((float(noise[0]), float(noise[1])), float(unbalance_ratio * math.sqrt(power[0]) / at_1x))
+    return NoiseLevels(
+        (float(noise[0]), float(noise[1])), float(unbalance_ratio * math.sqrt(power[0]) / at_1x)
+    )
 
 
 def simulate(
     machine: BearingMachine,
     signal: FaultSignal,
     fault: Fault,
-    level: Levels,
+    level: NoiseLevels,
     rng: np.random.Generator,
     *,
     seconds: float = 0.5,

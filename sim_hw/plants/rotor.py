@@ -51,7 +51,7 @@ class RotorEscapeError(ArithmeticError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RotorParameters:
+class PlantParameters:
     """One operating condition of the rotor, dimensionless as in the paper.
 
     Attributes:
@@ -125,7 +125,7 @@ class Change:
     """From shaft revolution ``at_rev`` on, the rotor has these ``parameters``."""
 
     at_rev: float
-    parameters: RotorParameters
+    parameters: PlantParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ def contact_force(
     return -normal_over_r * (x - drag * y), -normal_over_r * (y + drag * x)
 
 
-def state_derivative(tau: float, state: Sequence[float] | Floats, rotor: RotorParameters) -> Sequence[float]:
+def state_derivative(tau: float, state: Sequence[float] | Floats, rotor: PlantParameters) -> Sequence[float]:
     """Right-hand side of the equations of motion.
 
     Args:
@@ -195,7 +195,7 @@ def state_derivative(tau: float, state: Sequence[float] | Floats, rotor: RotorPa
 
 
 def simulate(
-    healthy: RotorParameters,
+    healthy: PlantParameters,
     changes: Sequence[Change] = (),
     *,
     revolutions: float,
@@ -249,7 +249,7 @@ def simulate(
 
 
 def _check_schedule(
-    healthy: RotorParameters,
+    healthy: PlantParameters,
     changes: Sequence[Change],
     revolutions: float,
     samples_per_rev: float,
@@ -276,7 +276,7 @@ def _check_schedule(
         raise ValueError(f"process_noise is {process_noise} but there is no rng to draw it from")
 
 
-def _coefficients(rotor: RotorParameters) -> Coefficients:
+def _coefficients(rotor: PlantParameters) -> Coefficients:
     return (
         2 * rotor.damping_ratio,
         rotor.stiffness,
@@ -312,7 +312,7 @@ def _derivative(tau: float, state: Sequence[float] | Floats, coefficients: Coeff
     return vx, ax, vy, ay
 
 
-def _integrate(rotor: RotorParameters, instants: Floats, state: Floats) -> Floats:
+def _integrate(rotor: PlantParameters, instants: Floats, state: Floats) -> Floats:
     """States float64 ``[n, 4]`` at the ``instants`` (normalised times); ``state`` is that of the first."""
     course, report = odeint(
         _derivative,
@@ -333,7 +333,7 @@ def _integrate(rotor: RotorParameters, instants: Floats, state: Floats) -> Float
     return np.asarray(course, dtype=np.float64)
 
 
-def _integrate_kicked(rotor: RotorParameters, instants: Floats, state: Floats, kicks: Floats) -> Floats:
+def _integrate_kicked(rotor: PlantParameters, instants: Floats, state: Floats, kicks: Floats) -> Floats:
     """As `_integrate`, with a velocity kick float64 ``[n - 2, 2]`` at every instant but the two ends."""
     course = np.empty((len(instants), 4))
     course[0] = state

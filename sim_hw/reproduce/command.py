@@ -15,7 +15,7 @@ from sim_hw import arguments as arguments_of
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sim_hw.reproduce.results import Findings, Row
+    from sim_hw.reproduce.results import Findings, ResultRow
 
 EXIT_FAILED = 1
 SEED = 1
@@ -108,12 +108,12 @@ def _cannot_write_into(out: Path) -> str | None:
     return None
 
 
-def _reproduce(out: Path, seed: int, snr_db: float) -> list[Row]:
+def _reproduce(out: Path, seed: int, snr_db: float) -> list[ResultRow]:
     """Run every study; write figures and tables."""
     from sim_hw.reproduce import results  # noqa: PLC0415
     from sim_hw.reproduce.registry import STUDIES  # noqa: PLC0415
 
-    rows: list[Row] = []
+    rows: list[ResultRow] = []
     for study in STUDIES:
         _note(f"{study.title} ...")
         findings = study.run(seed, snr_db)
@@ -144,7 +144,7 @@ def _note(message: str) -> None:
         print(f"daqsvc reproduce: {message}", file=sys.stderr)  # noqa: T201
 
 
-def _print(rows: Sequence[Row], *, as_json: bool) -> None:
+def _print(rows: Sequence[ResultRow], *, as_json: bool) -> None:
     from sim_hw.reproduce.results import as_text  # noqa: PLC0415
 
     for line in [json.dumps(row.as_json()) for row in rows] if as_json else [as_text(rows)]:

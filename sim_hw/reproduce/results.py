@@ -20,7 +20,7 @@ _SHARES = (0.31, 0.34, 0.35)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class ResultRow:
     """One statement of the paper, and what became of it.
 
     Attributes:
@@ -55,11 +55,11 @@ class Findings:
         figures: for each figure file, by its name without ending, what draws it onto an empty figure.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ResultRow, ...]
     figures: Mapping[str, Callable[[Figure], None]]
 
 
-def write_csv(path: Path, rows: Iterable[Row]) -> None:
+def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
     """The table for programs: one line for each number, rows without numbers on one line of their own.
 
     Raises:
@@ -73,7 +73,7 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
             writer.writerows((*texts, *number) for number in row.values.items() or [("", "")])
 
 
-def write_markdown(path: Path, rows: Iterable[Row], *, heading: str) -> None:
+def write_markdown(path: Path, rows: Iterable[ResultRow], *, heading: str) -> None:
     """The table for people.
 
     Args:
@@ -90,7 +90,7 @@ def write_markdown(path: Path, rows: Iterable[Row], *, heading: str) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def as_text(rows: Iterable[Row], width: int | None = None) -> str:
+def as_text(rows: Iterable[ResultRow], width: int | None = None) -> str:
     """The table for a terminal.
 
     Args:
@@ -108,11 +108,11 @@ def as_text(rows: Iterable[Row], width: int | None = None) -> str:
     return "\n".join(lines).rstrip()
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: ResultRow) -> tuple[str, ...]:
     return (row.figure, row.paper or "(nothing)", row.obtained, _verdict(row), row.remark)
 
 
-def _verdict(row: Row) -> str:
+def _verdict(row: ResultRow) -> str:
     return {True: "yes", False: "no", None: "-"}[row.agrees]
 
 

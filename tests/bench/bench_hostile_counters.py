@@ -34,7 +34,7 @@ from drivers.can.driver import CanDriver
 from drivers.can.socketcan import SocketCan
 from drivers.frames import FrameLayout
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import LineLayout
+from drivers.serial.lines import TextLayout
 
 LOAD_S = 4.0
 TICK_S = 0.005
@@ -58,7 +58,7 @@ LAYOUT = FrameLayout.plain(
     counter_bits=32,
     first_byte=4,
 )
-LINES = LineLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+LINES = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
 
 
 class Load(NamedTuple):

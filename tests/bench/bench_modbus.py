@@ -26,8 +26,8 @@ from targets import Targets
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.layouts import Trend
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import TrendLayout
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -40,11 +40,12 @@ ROUNDS = 40
 ROUND_S = 0.2
 WARM_UP_S = 0.05
 ASKED_FOR = 1.5
-LAYOUT = Trend(
+LAYOUT = TrendLayout(
     UNIT,
     "input",
     RegisterRecord(
-        tuple(RegisterField(f"c{k}", k, "int16", scale=0.001) for k in range(CHANNELS)), (Run(0, CHANNELS),)
+        tuple(RegisterField(f"c{k}", k, "int16", scale=0.001) for k in range(CHANNELS)),
+        (RegisterRun(0, CHANNELS),),
     ),
 )
 

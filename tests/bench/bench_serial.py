@@ -30,7 +30,7 @@ from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.serial.binary import DELIMITER
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineLayout
+from drivers.serial.lines import TextLayout
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def frames(name: str, **options: str) -> Case:
 def lines(name: str, **options: str) -> Case:
     """A counter, three numbers of six decimals and a CRC in each line."""
     axes = ("x", "y", "z")
-    layout = LineLayout(("seq", *axes), axes, np.ones(3), np.zeros(3), counter="seq")
+    layout = TextLayout(("seq", *axes), axes, np.ones(3), np.zeros(3), counter="seq")
     samples = np.random.default_rng(0).normal(size=(LINES, 1, 3))
     framing = framing_of(options, [StreamSpec("a", layout, RATE_HZ)])
     data = b"".join(framing.encode("a", np.arange(LINES), samples))

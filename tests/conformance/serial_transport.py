@@ -15,7 +15,7 @@ from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.serial.binary import CobsFraming
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineFraming, LineLayout
+from drivers.serial.lines import LineFraming, TextLayout
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def packed(per_frame: int) -> FrameLayout:
     )
 
 
-LINES = LineLayout(
+LINES = TextLayout(
     columns=("seq", *CHANNELS),
     channels=CHANNELS,
     scale=np.ones(2),
@@ -118,7 +118,7 @@ class SerialTransport:
     overflow_frames = 40_000
     cannot = {}  # noqa: RUF012
 
-    def __init__(self, name: str, layout: FrameLayout | LineLayout, folder: Path, **options: str) -> None:
+    def __init__(self, name: str, layout: FrameLayout | TextLayout, folder: Path, **options: str) -> None:
         self.name = name
         self.samples_per_frame = layout.samples_per_frame
         self.time = SimulatedTime()

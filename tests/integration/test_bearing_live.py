@@ -23,7 +23,7 @@ from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import parse_machine_file
-from sim_hw.demo.session import Script, Session
+from sim_hw.demo.session import DemoSession, Script
 from sim_hw.link_faults import LinkFaults
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
 
@@ -309,7 +309,7 @@ async def test_damage_reaches_the_alarm_over_the_bus() -> None:
         rate_hz=RATE_HZ,
         faults=LinkFaults(drop=0.0003, seed=1),
     )
-    outcome = await Session(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
     assert outcome.complete
     alarms = [m.payload for m in heard if m.kind == "alarm" and m.payload["alarm"] == "bearing-damage"]
     assert [(p["kind"], p["cause"]["decision"]) for p in alarms] == [("raised", "outer")]

@@ -18,14 +18,14 @@ from brokers import eventually
 
 from daqsvc import control
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.control import ControlError, ControlServer, Request, ask, events_waiting
+from daqsvc.control import ControlError, ControlRequest, ControlServer, ask, events_waiting
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 MACHINE = "laval-rig"
 NOBODY = 65_534
-RESET = Request(schema="daqsvc.control/1", verb=Verb.RESET, alarm="a", by="b")
+RESET = ControlRequest(schema="daqsvc.control/1", verb=Verb.RESET, alarm="a", by="b")
 
 
 class Desk:
@@ -95,7 +95,7 @@ async def test_a_request_becomes_a_command_with_the_kernels_word_for_who_asks(tm
 
 async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -> None:
     desk = Desk()
-    request = Request(
+    request = ControlRequest(
         schema="daqsvc.control/1", verb=Verb.RESET, alarm="nothing", by="ann", occurrence="0d8c"
     )
     async with serving(tmp_path, desk):

@@ -21,7 +21,7 @@ from sim_hw.demo import broker, session
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.command import DemoCommand, script_of
 from sim_hw.demo.errors import DemoError
-from sim_hw.demo.session import Script, Session
+from sim_hw.demo.session import DemoSession, Script
 from sim_hw.demo.view import View, _PipeConsole
 
 if TYPE_CHECKING:
@@ -167,9 +167,9 @@ def test_channels_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.Capt
 # What ends the playing before its time.
 
 
-async def broken_off(script: Script, hear: Callable[[Received], None], url: str | None = None) -> Session:
+async def broken_off(script: Script, hear: Callable[[Received], None], url: str | None = None) -> DemoSession:
     """The session after its failure, with the service stopped and not much played."""
-    playing = Session(script, speed=20, broker_url=url, hear=hear)
+    playing = DemoSession(script, speed=20, broker_url=url, hear=hear)
     with pytest.raises((BrokenPipeError, DemoError)) as failed:
         await playing.run()
     playing.error = failed.value  # type: ignore[attr-defined]
@@ -222,7 +222,7 @@ async def test_kernels_may_take_their_time(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(Service, "run", slow)
     script = recorded(tmp_path, duration_s=1.0)
     # Only the kernels are slow: the links come up within the limit that was lowered for them.
-    outcome = await Session(script, speed=1000, broker_url=None, hear=lambda _: None).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=lambda _: None).run()
     assert outcome.complete
 
 
@@ -321,7 +321,7 @@ async def test_a_low_terminal_shows_loss_lag_and_the_newest_alarm() -> None:
     console = Console(width=60, height=24, file=io.StringIO())
     script = script_of(arguments_of())
     view = View(script, 1000, console)
-    await Session(script, speed=1000, broker_url=None, hear=view.hear).run()
+    await DemoSession(script, speed=1000, broker_url=None, hear=view.hear).run()
     lines = console.render_lines(view.picture(), pad=False)
     seen = ["".join(segment.text for segment in line) for line in lines][:22]
     text = "\n".join(seen)

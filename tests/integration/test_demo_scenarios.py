@@ -62,7 +62,7 @@ def test_a_receiver_that_stops_reading_ends_the_demo_in_a_sentence(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "DrivenPacer", functools.partial(DrivenPacer, stall_s=0.1))
-    monkeypatch.setattr(session.Session, "backlog", lambda _: 10**6)
+    monkeypatch.setattr(session.DemoSession, "backlog", lambda _: 10**6)
     code, _, err = demo(capsys, "--scenario", "healthy")
     assert code == 1
     assert "daqsvc demo: the playing came to a stop: the receiver has been 1000000 behind" in err

@@ -18,7 +18,7 @@ from daqsvc.recording.recording import Recording, load_recording
 from sim_hw.demo.baseline import setpoints
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
-from sim_hw.demo.session import Outcome, Script, Session
+from sim_hw.demo.session import DemoOutcome, DemoSession, Script
 from sim_hw.demo.summary import summarise
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.wire import quantised
@@ -73,8 +73,8 @@ async def play(
     *,
     broker_url: str | None = None,
     hear: Callable[[Received], None] = lambda _: None,
-) -> tuple[Session, Outcome]:
-    session = Session(script, speed=speed, broker_url=broker_url, hear=hear)
+) -> tuple[DemoSession, DemoOutcome]:
+    session = DemoSession(script, speed=speed, broker_url=broker_url, hear=hear)
     return session, await session.run()
 
 

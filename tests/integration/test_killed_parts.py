@@ -17,7 +17,7 @@ from brokers import Consumer, eventually
 from busy_service import Devices, busy_machine
 
 from daqsvc import supervision
-from daqsvc.control import ControlError, Request, ask
+from daqsvc.control import ControlError, ControlRequest, ask
 from daqsvc.service import Service
 from daqsvc.supervision import EssentialLostError
 
@@ -109,7 +109,7 @@ class Victim:
 
     async def _obeyed(self, verb: str) -> bool:
         duration_s = 60.0 if verb == "shelve" else None
-        wish = Request(
+        wish = ControlRequest(
             schema="daqsvc.control/1", verb=verb, alarm="never", by="t", reason="r", duration_s=duration_s
         )
         try:

@@ -17,7 +17,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import CanNode
-from sim_hw.nodes.modbus_node import Answer, ModbusTcpServer
+from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, WaveformStore, encode
 from sim_hw.nodes.pacing import RealTimePacer
 
@@ -145,10 +145,10 @@ async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block
     every_s, count = 0.6, 640
     written_s: list[float] = []
 
-    def plan(_unit: int, pdu: bytes) -> Answer:
+    def plan(_unit: int, pdu: bytes) -> PlannedReply:
         if pdu[0] == 16:
             written_s.append(time.monotonic())
-        return Answer()
+        return PlannedReply()
 
     unit = ModbusUnit()
     server = ModbusTcpServer({1: unit}, plan)

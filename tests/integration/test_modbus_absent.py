@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from drivers.modbus.layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
-from sim_hw.nodes.modbus_node import Answer
+from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
 
 FIELDS = (RegisterField("x", 0, "float32"), RegisterField("y", 2, "float64"))
@@ -22,7 +22,7 @@ SAMPLE = sample_record(list(FIELDS))
 SENT = [(1.5, -2.0), (math.inf, 1.0), (2.5, -math.inf), (math.nan, 3.0), (3.4e38, 1e39), (-1.5, 0.25)]
 ABSENT = 4  # 1e39 is more than any float32
 LAYOUTS = {
-    "registers": Trend(1, "holding", RegisterRecord(FIELDS, (Run(0, 6),))),
+    "registers": TrendLayout(1, "holding", RegisterRecord(FIELDS, (RegisterRun(0, 6),))),
     "fifo": Fifo(1, 33, Count(0, 32), SAMPLE, poll_ns=20_000_000),
     "ring": Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=20_000_000),
     "waveform": Waveform(1, "holding", 0, 100, len(SENT), SAMPLE, poll_ns=20_000_000),
@@ -40,7 +40,7 @@ def test_what_is_no_number_is_missing_and_counted(way, caplog):
         store = store_for(unit, layout)
         if way == "registers":
             store.put(0, rows[:1])
-        async with responding({1: unit}, lambda *_: Answer(), serial=False), rig.running():
+        async with responding({1: unit}, lambda *_: PlannedReply(), serial=False), rig.running():
             if way == "waveform":
                 await asyncio.sleep(0.1)
                 store.put(0, rows)

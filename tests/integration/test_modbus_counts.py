@@ -10,12 +10,12 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
 from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
 from drivers.modbus.registers import RegisterField
-from sim_hw.nodes.modbus_node import Answer
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, encode, store_for
 
 SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
 RATE_HZ = 200.0
-SOUND = lambda *_: Answer()  # noqa: E731
+SOUND = lambda *_: PlannedReply()  # noqa: E731
 
 
 async def sample(store, numbers, first):
@@ -41,7 +41,7 @@ def test_a_ring_whose_counter_goes_back_by_less_than_its_depth_is_not_read_where
     alive = [True]
 
     async def main():
-        plan = lambda *_: Answer("none" if alive[0] else "silent")  # noqa: E731
+        plan = lambda *_: PlannedReply("none" if alive[0] else "silent")  # noqa: E731
         async with responding(units, plan, serial=False), rig.running():
             await sample(store_for(units[1], layout), range(1, 901), 0)
             alive[0] = False
@@ -98,7 +98,7 @@ def test_a_queue_that_overflows_while_acknowledgements_are_lost_gives_each_sampl
 
     def plan(_unit, pdu):
         lost = pdu[0] == 16 and asyncio.get_running_loop().time() % 2.0 < 0.5
-        return Answer("silent" if lost else "none")
+        return PlannedReply("silent" if lost else "none")
 
     async def main():
         unit = ModbusUnit()
@@ -133,7 +133,7 @@ def test_streams_that_share_a_page_register_get_their_own_pages():
 
     async def main():
         unit.watch(90, show)
-        plan = lambda *_: Answer(delay_ns=1_000_000)  # noqa: E731
+        plan = lambda *_: PlannedReply(delay_ns=1_000_000)  # noqa: E731
         async with responding({1: unit}, plan, serial=False), rig.running():
             for block_id in range(1, 6):
                 unit.put("holding", 0, block_id.to_bytes(2, "big"))
@@ -175,7 +175,7 @@ def test_a_device_that_stands_still_begins_a_new_time_base_and_gives_nothing_twi
     async def main():
         unit = ModbusUnit()
         store = store_for(unit, layout)
-        plan = lambda *_: Answer("silent" if silent[0] else "none")  # noqa: E731
+        plan = lambda *_: PlannedReply("silent" if silent[0] else "none")  # noqa: E731
         async with responding({1: unit}, plan, serial=False), rig.running():
             await sample(store, range(1, 1001), 0)
             silent[0] = True

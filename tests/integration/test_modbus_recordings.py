@@ -13,24 +13,24 @@ from pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.modbus.client import ModbusClient
-from drivers.modbus.outcomes import ModbusCounters, RefusedError
+from drivers.modbus.outcomes import ModbusCounters, RequestRefusedError
 from drivers.modbus.replies import (
     EXCEPTIONS,
     READ_INPUT,
     WRITE_REGISTERS,
-    Expected,
+    ExpectedReply,
     judge_tcp,
     register_bytes,
 )
 from drivers.modbus.wire import LineOptions
-from sim_hw.nodes.modbus_node import ModbusTcpServer, ModbusWire
+from sim_hw.nodes.modbus_node import ModbusTcpServer, UnitConnection
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pcap import Conversation
 
-    from drivers.modbus.replies import Verdict
+    from drivers.modbus.replies import ReplyVerdict
     from sim_hw.nodes.modbus_unit import ModbusUnit
 
 pytestmark = pytest.mark.data
@@ -80,7 +80,7 @@ class Request:
     pdu: bytes
 
     @property
-    def expected(self) -> Expected | None:
+    def expected(self) -> ExpectedReply | None:
         """The reply that it waits for; None if nobody here would ask that."""
         function = self.pdu[0]
         if function not in JUDGED or len(self.pdu) < 3:
@@ -89,7 +89,7 @@ class Request:
         if function in BITS + REGISTERS:
             count = int.from_bytes(self.pdu[3:5], "big")
             data_bytes = -(-count // 8) if function in BITS else 2 * count
-        return Expected(self.unit, function, data_bytes, self.transaction)
+        return ExpectedReply(self.unit, function, data_bytes, self.transaction)
 
 
 @dataclass(slots=True)
@@ -98,7 +98,7 @@ class Told:
 
     requests: list[Request] = field(default_factory=list)
     answered: list[tuple[Request, bytes]] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
+    verdicts: list[ReplyVerdict] = field(default_factory=list)
     left_over: int = 0
 
 
@@ -129,7 +129,7 @@ def understood(conversation: Conversation) -> Told:
     heard: list[tuple[int, bytes]] = []
     frames: list[bytes] = []
     units = {unit: cast("ModbusUnit", Listener(unit, heard)) for unit in range(256)}
-    wire = ModbusWire(units, frames.append, serial=False)
+    wire = UnitConnection(units, frames.append, serial=False)
     rest = b""
     for segment in conversation.segments:
         if not segment.from_server:
@@ -255,7 +255,7 @@ async def test_our_client_asks_in_the_same_bytes_and_reads_the_same_replies(data
                     got = await client.read_fifo(unit, address)
                 else:
                     got = await client.read(unit, function, address, int.from_bytes(request.pdu[3:5], "big"))
-            except RefusedError as error:
+            except RequestRefusedError as error:
                 refusal = bytes([function | 0x80, error.code])
             registers = {FIFO: reply[5:], WRITE_REGISTERS: b""}.get(function, reply[2:])
             assert (got, refusal) == ((b"", reply) if reply[0] & 0x80 else (registers, None)), name

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from drivers.modbus.layouts import Trend, shared_runs
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
-from sim_hw.nodes.modbus_node import Answer
+from drivers.modbus.layouts import TrendLayout, shared_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 GAP_8 = RunLimits(max_gap=8)
@@ -21,7 +21,9 @@ GAP_8 = RunLimits(max_gap=8)
 
 def trend(addresses, limits=GAP_8, unit=1, table="holding"):
     fields = tuple(RegisterField(f"r{address}", address, "uint16") for address in addresses)
-    return Trend(unit, table, RegisterRecord(fields, plan_runs([f.run for f in fields], limits)), limits)
+    return TrendLayout(
+        unit, table, RegisterRecord(fields, plan_runs([f.run for f in fields], limits)), limits
+    )
 
 
 def units():
@@ -35,13 +37,15 @@ def units():
     return made
 
 
-def polled(streams, seconds, plan=lambda *_: Answer()):
+def polled(streams, seconds, plan=lambda *_: PlannedReply()):
     """What the driver has read in simulated time, and the requests that it took: unit, function, run."""
     rig = Rig(options_of(serial=True, timeout_ms=50.0, demote_after=30), streams, clock=LoopClock())
     asked = []
 
     def noted(unit, pdu):
-        asked.append((unit, pdu[0], Run(int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big"))))
+        asked.append(
+            (unit, pdu[0], RegisterRun(int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")))
+        )
         return plan(unit, pdu)
 
     async def main():
@@ -61,7 +65,7 @@ def watched(streams, unit_side, seconds):
     rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
 
     async def main():
-        async with responding(unit_side, lambda *_: Answer(), serial=True), rig.running():
+        async with responding(unit_side, lambda *_: PlannedReply(), serial=True), rig.running():
             await asyncio.sleep(seconds)
 
     simulate(main)
@@ -81,7 +85,7 @@ def without_register(address):
 def test_two_streams_of_one_gateway_are_read_in_one_request():
     streams = {"drive-end": (trend([16, 18, 20]), 10.0), "other-end": (trend([24, 26]), 10.0)}
     rig, asked = polled(streams, 3.0)
-    assert set(asked) == {(1, 3, Run(16, 11))}
+    assert set(asked) == {(1, 3, RegisterRun(16, 11))}
     for name in streams:
         assert rig.counters(name).samples_received == pytest.approx(30, abs=1)
         assert rig.counters(name).samples_lost == 0
@@ -96,14 +100,17 @@ def test_two_streams_of_one_gateway_are_read_in_one_request():
         (trend([24], unit=2), 10.0),
         (trend([40]), 10.0),  # too far away
         (trend([24], RunLimits(max_gap=2)), 10.0),  # its own limit is narrower
-        (trend([24], RunLimits(max_gap=8, forbidden=(Run(22, 1),))), 10.0),
-        (trend([24], RunLimits(max_gap=8, forbidden=(Run(20, 1),))), 10.0),  # what the first one reads
+        (trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(22, 1),))), 10.0),
+        (
+            trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(20, 1),))),
+            10.0,
+        ),  # what the first one reads
     ],
 )
 def test_what_does_not_belong_together_is_read_apart(other, rate_hz):
     streams = {"one": (trend([16, 20]), 10.0), "other": (other, rate_hz)}
     rig, asked = polled(streams, 2.0)
-    assert {run for *_, run in asked} == {Run(16, 5), *other.record.runs}
+    assert {run for *_, run in asked} == {RegisterRun(16, 5), *other.record.runs}
     assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 0
 
 
@@ -118,10 +125,10 @@ def test_a_request_that_fails_costs_a_sample_of_those_in_it_and_of_nobody_else()
 
     def plan(_unit, pdu):
         count[0] += pdu[2] == 90
-        return Answer("exception" if pdu[2] == 90 and count[0] % 3 == 0 else "none")
+        return PlannedReply("exception" if pdu[2] == 90 and count[0] % 3 == 0 else "none")
 
     rig, asked = polled(streams, 6.05, plan)
-    assert {run for *_, run in asked} == {Run(16, 5), Run(90, 1)}
+    assert {run for *_, run in asked} == {RegisterRun(16, 5), RegisterRun(90, 1)}
     refused = rig.driver.counters.exceptions["server device failure"]
     assert refused == pytest.approx(20, abs=1)
     for name in ("drive-end", "other-end"):
@@ -155,13 +162,13 @@ def test_streams_that_were_parted_are_tried_together_again():
     answer, asked = unit_side[1].answer, []
 
     def starting(pdu):
-        asked.append(Run(pdu[2], pdu[4]))
+        asked.append(RegisterRun(pdu[2], pdu[4]))
         return b"\x83\2" if len(asked) <= 7 else answer(pdu)
 
     unit_side[1].answer = starting
     rig = watched(streams, unit_side, 300.0)
-    assert asked[:9] == [Run(16, 5), *[Run(16, 1), Run(20, 1)] * 4]
-    assert set(asked[-100:]) == {Run(16, 5)}
+    assert asked[:9] == [RegisterRun(16, 5), *[RegisterRun(16, 1), RegisterRun(20, 1)] * 4]
+    assert set(asked[-100:]) == {RegisterRun(16, 5)}
     for name in streams:
         assert rig.counters(name).samples_received == pytest.approx(297, abs=2)
 
@@ -182,10 +189,10 @@ def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(cap
 
 
 def test_a_refusal_that_says_nothing_of_the_registers_leaves_them_together():
-    busy = iter([Answer(), Answer("exception")])
+    busy = iter([PlannedReply(), PlannedReply("exception")])
     streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
-    rig, asked = polled(streams, 2.0, lambda *_: next(busy, Answer()))
-    assert set(asked) == {(1, 3, Run(16, 5))}
+    rig, asked = polled(streams, 2.0, lambda *_: next(busy, PlannedReply()))
+    assert set(asked) == {(1, 3, RegisterRun(16, 5))}
     assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 1
 
 
@@ -193,7 +200,7 @@ limits = st.builds(
     RunLimits,
     st.integers(0, 20),
     st.integers(60, 125),
-    st.lists(st.builds(Run, st.integers(0, 310), st.integers(1, 6)), max_size=3).map(tuple),
+    st.lists(st.builds(RegisterRun, st.integers(0, 310), st.integers(1, 6)), max_size=3).map(tuple),
 )
 
 

@@ -13,9 +13,9 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from drivers.modbus.layouts import Count, Fifo, Ring, Trend, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
-from sim_hw.nodes.modbus_node import Answer
+from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 
 SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
@@ -53,7 +53,9 @@ def waveforms(poll_ns, most_late_ns, seed, every_s, samples=200, rate_hz=2000.0,
         store = store_for(units[1], layout)
 
         def plan(*_):
-            return Answer(rng.choice(faults) if most_late_ns else "none", rng.randrange(most_late_ns + 1))
+            return PlannedReply(
+                rng.choice(faults) if most_late_ns else "none", rng.randrange(most_late_ns + 1)
+            )
 
         async with responding(units, plan, serial=False), rig.running():
             while now_ns() < (1000 + seconds) * NS_PER_S:
@@ -97,7 +99,7 @@ def test_of_a_block_that_was_there_before_anybody_looked_nothing_is_known():
     async def main():
         units = {1: ModbusUnit()}
         store_for(units[1], layout).put(0, encode(SAMPLE, ramp(200)))
-        async with responding(units, lambda *_: Answer(), serial=False), rig.running():
+        async with responding(units, lambda *_: PlannedReply(), serial=False), rig.running():
             await asyncio.sleep(1.0)
 
     simulate(main)
@@ -137,7 +139,9 @@ def trend_beside(rate_hz, neighbour_hz, neighbour_ns, *, serial, seconds=60.0):
     """A trend whose neighbour on the line takes so long to answer, and when each of its samples was taken."""
     rng = random.Random(4)
     layouts = {
-        name: Trend(unit, "holding", RegisterRecord((RegisterField("n", 0, "uint16"),), (Run(0, 1),)))
+        name: TrendLayout(
+            unit, "holding", RegisterRecord((RegisterField("n", 0, "uint16"),), (RegisterRun(0, 1),))
+        )
         for name, unit in (("trend", 1), ("neighbour", 2))
     }
     streams = {"trend": (layouts["trend"], rate_hz), "neighbour": (layouts["neighbour"], neighbour_hz)}
@@ -147,10 +151,10 @@ def trend_beside(rate_hz, neighbour_hz, neighbour_ns, *, serial, seconds=60.0):
 
     def plan(unit, _pdu):
         if unit == 2:
-            return Answer(delay_ns=rng.randrange(*neighbour_ns))
+            return PlannedReply(delay_ns=rng.randrange(*neighbour_ns))
         units[1].put("holding", 0, len(taken_ns).to_bytes(2, "big"))
         taken_ns.append(now_ns())
-        return Answer(delay_ns=rng.randrange(LEAST_NS, MOST_NS))
+        return PlannedReply(delay_ns=rng.randrange(LEAST_NS, MOST_NS))
 
     async def main():
         async with responding(units, plan, serial=serial), rig.running():
@@ -220,7 +224,7 @@ def test_samples_that_the_device_counts_are_as_sure_as_is_told(layout):
     async def main():
         units = {1: ModbusUnit()}
         store = store_for(units[1], layout)
-        plan = lambda *_: Answer(delay_ns=rng.randrange(LEAST_NS, MOST_NS))  # noqa: E731
+        plan = lambda *_: PlannedReply(delay_ns=rng.randrange(LEAST_NS, MOST_NS))  # noqa: E731
         async with responding(units, plan, serial=False), rig.running():
             for k in itertools.count():
                 await asyncio.sleep(

@@ -11,9 +11,9 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate,
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality
-from drivers.modbus.layouts import Count, Fifo, Page, Ring, Trend, Trigger, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
-from sim_hw.nodes.modbus_node import Answer, ModbusTcpServer
+from drivers.modbus.layouts import Count, Fifo, Page, Ring, TrendLayout, Trigger, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 
 SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
@@ -36,8 +36,8 @@ class Faults:
         if self.meanwhile is not None and self.meanwhile(pdu) is None:
             self.meanwhile = None
         if self.refuse(pdu):
-            return Answer("exception")
-        return self.coming.pop(0) if self.coming else Answer()
+            return PlannedReply("exception")
+        return self.coming.pop(0) if self.coming else PlannedReply()
 
 
 @contextlib.asynccontextmanager
@@ -56,13 +56,14 @@ async def serving(layout, rate_hz, **options):
 
 async def test_a_trend_is_polled_on_schedule_and_a_failed_poll_is_a_lost_sample():
     record = RegisterRecord(
-        (RegisterField("x", 10, "int16"), RegisterField("y", 40, "int16")), (Run(10, 1), Run(40, 1))
+        (RegisterField("x", 10, "int16"), RegisterField("y", 40, "int16")),
+        (RegisterRun(10, 1), RegisterRun(40, 1)),
     )
-    async with serving(Trend(1, "input", record), 50.0) as (rig, faults, put):
+    async with serving(TrendLayout(1, "input", record), 50.0) as (rig, faults, put):
         put(7, 1)
         async with rig.running():
             await until(lambda: rig.counters("s").samples_received >= 5)
-            faults.coming = [Answer(), Answer("exception")]
+            faults.coming = [PlannedReply(), PlannedReply("exception")]
             await until(lambda: not faults.coming)
             seen = rig.counters("s").samples_received
             await until(lambda: rig.counters("s").samples_received >= seen + 5)
@@ -97,7 +98,7 @@ async def test_a_lost_fifo_reply_costs_what_was_in_it_unless_the_device_waits_to
         async with serving(layout, 1000.0, writes=writes) as (rig, faults, put), rig.running():
             put(0, 10)
             await until(lambda: rig.counters("s").samples_received == 10)
-            faults.coming = [Answer("wrong transaction")]
+            faults.coming = [PlannedReply("wrong transaction")]
             put(10, 10)
             await until(lambda: not faults.coming)
             await until(lambda: rig.driver.counters.timeouts == 1)
@@ -157,7 +158,7 @@ async def test_a_ring_is_followed_without_loss_or_repeat_through_failed_requests
         base = rig.counters("s").frames_received
         for _ in range(30):
             n = int(rng.integers(1, 200))
-            faults.coming = [Answer("exception")] * int(rng.integers(0, 3))
+            faults.coming = [PlannedReply("exception")] * int(rng.integers(0, 3))
             put(sent + 1, n)
             sent += n
             await until(lambda sent=sent, base=base: rig.counters("s").frames_received - base == sent - first)
@@ -229,10 +230,10 @@ def test_a_block_is_triggered_as_often_as_is_asked_for_and_no_more(unheard):
 
     def plan(_unit, pdu):
         if pdu[0] != 16:
-            return Answer()
+            return PlannedReply()
         written_s.append(asyncio.get_running_loop().time())
         # A reply that is cut off: the device has heard the request.
-        return Answer("truncated" if unheard and len(written_s) % 3 == 2 else "none")
+        return PlannedReply("truncated" if unheard and len(written_s) % 3 == 2 else "none")
 
     async def main():
         async with responding(units, plan, serial=False), rig.running():

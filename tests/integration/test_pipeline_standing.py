@@ -10,7 +10,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
-from daqsvc.acquisition.standing import Standing, StreamStanding
+from daqsvc.acquisition.standing import StreamStanding, StreamState
 from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
@@ -66,11 +66,11 @@ async def test_nothing_is_judged_by_a_stream_in_doubt() -> None:
     running = asyncio.create_task(pipeline.run())
     await write(ring, listener)
     await until(said, 1)
-    pipeline.stand("s", Standing(DOUBT, proven=True))
+    pipeline.stand("s", StreamState(DOUBT, proven=True))
     assert [(d.quality, d.reason, d.decision) for d in said[1:]] == [("missing", DOUBT, "N")]
     await write(ring)
     await write(ring)
-    pipeline.stand("s", Standing())
+    pipeline.stand("s", StreamState())
     await write(ring)  # may have begun before the doubt was over
     await write(ring, listener)
     await until(said, 3)
@@ -85,12 +85,12 @@ async def test_what_is_said_before_the_rate_is_known_waits_for_it() -> None:
     ring, listener, said = SampleRing("s", ("a",), 1000), Listener(), []
     pipeline = Pipeline({"s": ring}, [listener], said.append, SystemClock())
     running = asyncio.create_task(pipeline.run())
-    pipeline.stand("s", Standing("", proven=False))
+    pipeline.stand("s", StreamState("", proven=False))
     await write(ring, listener)
     await write(ring, listener)
     await asyncio.sleep(0.02)
     assert said == []
-    pipeline.stand("s", Standing())
+    pipeline.stand("s", StreamState())
     await until(said, 2)
     ring.close()
     await running
@@ -101,10 +101,10 @@ async def test_what_was_said_before_the_rate_was_found_wrong_is_never_told() -> 
     ring, listener, said = SampleRing("s", ("a",), 1000), Listener(), []
     pipeline = Pipeline({"s": ring}, [listener], said.append, SystemClock())
     running = asyncio.create_task(pipeline.run())
-    pipeline.stand("s", Standing("", proven=False))
+    pipeline.stand("s", StreamState("", proven=False))
     await write(ring, listener)
     await asyncio.sleep(0.02)
-    pipeline.stand("s", Standing(DOUBT, proven=True))
+    pipeline.stand("s", StreamState(DOUBT, proven=True))
     ring.close()
     await running
     assert [(d.quality, d.reason) for d in said] == [("missing", DOUBT)]
@@ -118,9 +118,9 @@ async def test_a_doubt_takes_over_the_quality_alarm_of_a_stream_that_was_silent(
     async with asyncio.timeout(20):
         while not told:
             await asyncio.sleep(0.01)  # it is silent
-    pipeline.stand("s", Standing(DOUBT, proven=True))
+    pipeline.stand("s", StreamState(DOUBT, proven=True))
     other = "the counter makes no sense"
-    pipeline.stand("s", Standing(other, proven=True))
+    pipeline.stand("s", StreamState(other, proven=True))
     assert [event.kind.value for event in told] == ["raised", "changed"]
     assert told[1].message.endswith(DOUBT)
     ring.close()

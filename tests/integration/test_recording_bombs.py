@@ -17,14 +17,14 @@ from orbit_files import OPTIONS, Orbit
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
-from daqsvc.confined.limits import Limits
+from daqsvc.confined.limits import ResourceLimits
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, set_limits, shared, stop_reading
 from drivers.base import BusPort, StreamSpec
 from drivers.replay.can_log import CanLog
 from drivers.replay.driver import ReplayDriver
 from drivers.replay.files import ColumnLayout, SampleTable
-from drivers.replay.files import RecordingError as ReplayError
+from drivers.replay.files import RecordedLogError as ReplayError
 
 MOST_MB = 400
 """Of the process that reads, with NumPy, SciPy or Arrow in it."""
@@ -36,7 +36,7 @@ def _fresh_process():
     stop_reading()
     yield
     stop_reading()
-    set_limits(Limits())
+    set_limits(ResourceLimits())
 
 
 def largest_mb():
@@ -66,12 +66,12 @@ def test_a_header_that_lies_takes_no_memory(tmp_path):
 def test_memory_is_bounded_where_nothing_says_how_much_is_needed(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("x,y\n" + "1,2\n" * 600_000)
-    set_limits(Limits(12_000_000))
+    set_limits(ResourceLimits(12_000_000))
     with pytest.raises(
         RecordingError, match=r"more memory than it may; allow more \(--max-memory; it is 0.012 GB"
     ):
         load_recording(path, rate_hz=1000)
-    set_limits(Limits())
+    set_limits(ResourceLimits())
     assert load_recording(path, rate_hz=1000).samples.shape == (600_000, 2)
 
 
@@ -137,8 +137,8 @@ def test_a_replayed_table_may_take_what_the_bus_says(tmp_path):
     np.savez(path, x=np.zeros(10_000_000))
     spec = [StreamSpec("s", COLUMNS, 1000.0)]
     with pytest.raises(ReplayError, match="may be read; allow more memory"):
-        SampleTable(path, spec, {}, Limits(100_000_000))
-    SampleTable(path, spec, {}, Limits(400_000_000)).close()
+        SampleTable(path, spec, {}, ResourceLimits(100_000_000))
+    SampleTable(path, spec, {}, ResourceLimits(400_000_000)).close()
 
 
 def blf_of_containers(path, unpacked_bytes, count):

@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from daqsvc import cli
 from sim_hw.reproduce import registry, results
 from sim_hw.reproduce.registry import Study
-from sim_hw.reproduce.results import Findings, Row
+from sim_hw.reproduce.results import Findings, ResultRow
 from sim_hw.reproduce.rotor.detection import delays_rev, wrong_changes
 
 if TYPE_CHECKING:
@@ -207,8 +207,10 @@ def test_wrong_changes_excuse_the_mode_before_for_three_revolutions_only() -> No
 @pytest.fixture
 def small_study(monkeypatch: pytest.MonkeyPatch) -> None:
     """One figure and two rows at once instead of the paper's."""
-    found = Row(name="a", figure="1", paper="a | b", obtained="2 clearances", agrees=True, values={"b": 2.0})
-    silent = Row(name="b", figure="2", paper="", obtained="a point " * 30, agrees=None, remark="why")
+    found = ResultRow(
+        name="a", figure="1", paper="a | b", obtained="2 clearances", agrees=True, values={"b": 2.0}
+    )
+    silent = ResultRow(name="b", figure="2", paper="", obtained="a point " * 30, agrees=None, remark="why")
     findings = Findings((found, silent), {"fig1": lambda figure: figure.subplots().plot([0.0, 1.0])})
     monkeypatch.setattr(registry, "STUDIES", (Study("a study", lambda _seed, _snr_db: findings),))
 
@@ -229,7 +231,9 @@ def test_a_study_needs_only_a_place_in_the_registry(
 
 @pytest.mark.parametrize("width", [80, 110, 200])
 def test_table_fits_the_terminal(width: int) -> None:
-    row = Row(name="a", figure="6, 7", paper="p " * 99, obtained="o " * 99, agrees=False, remark="r " * 99)
+    row = ResultRow(
+        name="a", figure="6, 7", paper="p " * 99, obtained="o " * 99, agrees=False, remark="r " * 99
+    )
     lines = results.as_text([row], width).splitlines()
     assert max(map(len, lines)) <= width
     assert sum(line.count("o") for line in lines[2:]) == 99 + 1  # and the verdict, no

@@ -13,7 +13,7 @@ from machine_files import MACHINES
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.session import Script, Session
+from sim_hw.demo.session import DemoSession, Script
 from sim_hw.link_faults import LinkFaults
 from sim_hw.scenario import Scenario
 
@@ -72,7 +72,7 @@ async def test_a_change_is_one_alarm_refined_from_departure_to_name(rebalanced) 
         rate_hz=rebalanced.rate_hz,
         faults=LinkFaults(drop=0.01, seed=1),
     )
-    outcome = await Session(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
     assert outcome.complete
     alarms = [m.payload for m in heard if m.kind == "alarm" and m.payload["alarm"] == "rotor-changed"]
     assert [(p["kind"], p["cause"]["decision"]) for p in alarms] == [

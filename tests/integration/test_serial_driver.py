@@ -21,8 +21,8 @@ from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.serial import reader as serial_reader
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineLayout
-from drivers.serial.reader import Batch
+from drivers.serial.lines import TextLayout
+from drivers.serial.reader import ReceivedBytes
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 PROBES = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"
 CASING = "/dev/serial/by-id/usb-Raspberry_Pi_Pico_E66118604B826C2A-if00"
-LINE = LineLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
 
 
 class QuickClock(SystemClock):
@@ -269,7 +269,7 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
 
 
 def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: Path) -> None:
-    stamped = LineLayout(("t", "x"), ("x",), np.ones(1), np.zeros(1), time="t", time_unit="ms")
+    stamped = TextLayout(("t", "x"), ("x",), np.ones(1), np.zeros(1), time="t", time_unit="ms")
     specs = [StreamSpec("x", stamped, 100.0)]
     options = {"port": str(tmp_path), "framing": "lines"}
     blocks: list[SampleBlock] = []
@@ -280,7 +280,7 @@ def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: 
     framing = framing_of(options, specs)
     for k, line in enumerate(lines):
         found = framing.cut(line)
-        driver.take(Batch(len(line), found, {"x": np.full(len(found.frames), 10_000_000 * k)}))
+        driver.take(ReceivedBytes(len(line), found, {"x": np.full(len(found.frames), 10_000_000 * k)}))
     driver._assemblers["x"].flush()
     values = np.concatenate([block.samples[:, 0] for block in blocks])
     expected = np.arange(1, 800, dtype=np.float32)

@@ -10,8 +10,8 @@ import pytest
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from drivers.base import BusPort, StreamSpec
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineFraming, LineLayout
-from drivers.serial.reader import Batch
+from drivers.serial.lines import LineFraming, TextLayout
+from drivers.serial.reader import ReceivedBytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.data
 
 COLUMNS = ("mean-x", "mean-y", "mean-z", "x", "y", "z", "t")
 START_OF_FILE, END_OF_FILE = 999.0, 111.0
-MOTOR = LineLayout(COLUMNS, ("x", "y", "z"), np.ones(3), np.zeros(3), time="t", time_unit="ms")
+MOTOR = TextLayout(COLUMNS, ("x", "y", "z"), np.ones(3), np.zeros(3), time="t", time_unit="ms")
 RATE_HZ = 100.0
 
 
@@ -66,7 +66,7 @@ def test_every_record_of_every_motor_comes_through_the_driver_in_its_place(data:
             chunk = b"".join(lines[at : at + 3])
             found = framing.cut(chunk)
             arrivals_ns = {name: stamps_ns[at : at + 3][-len(f.ends) :] for name, f in found.frames.items()}
-            driver.take(Batch(len(chunk), found, arrivals_ns))
+            driver.take(ReceivedBytes(len(chunk), found, arrivals_ns))
         driver._assemblers["motor"].flush()
         got = np.concatenate([block.samples for block in blocks])
         np.testing.assert_array_equal(got, taken[:, 3:6].astype(np.float32), err_msg=file.name)

@@ -15,7 +15,7 @@ from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
-from sim_hw.demo.session import Script, Session
+from sim_hw.demo.session import DemoSession, Script
 from sim_hw.scenario import load_scenario
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -
         rate_hz=machine.rate_hz,
         samples_per_rev=64,
     )
-    outcome = await Session(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
     assert outcome.complete
     alarms = [(m.payload["alarm"], m.payload["kind"]) for m in heard if m.kind == "alarm"]
     assert ("sensor-ok/probe-x", "raised") in alarms

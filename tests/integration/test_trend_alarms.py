@@ -17,7 +17,7 @@ from machine_files import MACHINES, changed
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.alarms.status import AlarmStatus
 from daqsvc.settings import load_machine_file
-from sim_hw.nodes.modbus_node import Answer, ModbusRtuServer
+from sim_hw.nodes.modbus_node import ModbusRtuServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 PUMP = MACHINES / "modbus-vibration-temperature.toml"
@@ -53,7 +53,7 @@ class Sensor:
         self._server = ModbusRtuServer({1: self.unit}, link, self._plan)
 
     def _plan(self, unit, pdu):
-        return Answer("silent") if self.silent else Answer()
+        return PlannedReply("silent") if self.silent else PlannedReply()
 
     def set(self, address, value, scale):
         self.unit.put("holding", address, struct.pack(">h", round(value / scale)))

@@ -23,15 +23,17 @@ from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import Patience
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.layouts import Trend
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
-from sim_hw.nodes.modbus_node import Answer
+from drivers.modbus.layouts import TrendLayout
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 RATE_HZ = 1 / 60
 MINUTE_NS = 60 * NS_PER_S
 HOT = LevelRule("hot", "oil", "value", Setpoint(alert=80.0, deadband=2.0, on_delay_ns=5 * NS_PER_S))
-REGISTERS = Trend(1, "holding", RegisterRecord((RegisterField("oil", 0, "int16"),), (Run(0, 1),)))
+REGISTERS = TrendLayout(
+    1, "holding", RegisterRecord((RegisterField("oil", 0, "int16"),), (RegisterRun(0, 1),))
+)
 
 
 class AtOnce:
@@ -84,7 +86,7 @@ class Oil:
     @contextlib.asynccontextmanager
     async def running(self):
         self._begin_ns = LoopClock().monotonic_ns()
-        plan = lambda _unit, _pdu: Answer("silent" if self.silent else "none")  # noqa: E731
+        plan = lambda _unit, _pdu: PlannedReply("silent" if self.silent else "none")  # noqa: E731
         async with responding({1: self.unit}, plan, serial=True):
             tasks = [asyncio.create_task(self._driver.run()), asyncio.create_task(self._pipeline.run())]
             yield

@@ -14,17 +14,17 @@ from modbus_lines import Rig, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus.layouts import Trend
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.layouts import TrendLayout
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import LineLayout
+from drivers.serial.lines import TextLayout
 from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
 from sim_hw.nodes.modbus_node import ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
-TREND = Trend(1, "input", RegisterRecord((RegisterField("x", 0, "int16"),), (Run(0, 1),)))
-LINE = LineLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+TREND = TrendLayout(1, "input", RegisterRecord((RegisterField("x", 0, "int16"),), (RegisterRun(0, 1),)))
+LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
 
 
 class HastyClock(SystemClock):

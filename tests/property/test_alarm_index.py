@@ -21,7 +21,7 @@ from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.quality import Doubts, Touched, quality_alarm
 from daqsvc.alarms.rules import Circumstances
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_event, alarm_payload
@@ -191,7 +191,7 @@ class Twins:
             try:
                 asked = AlarmCommand(verb=verb, alarm=alarm, by="ann", duration_s=duration_s)
                 said.append(manager.obey(asked))
-            except RefusedError as refusal:
+            except CommandNotAllowedError as refusal:
                 said.append([])
                 reason = f"{refusal}"
         if not any(said):

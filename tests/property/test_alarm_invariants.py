@@ -22,7 +22,7 @@ from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.start_up import StartUp
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_event, alarm_payload
@@ -214,7 +214,7 @@ class Alarms(RuleBasedStateMachine):
         )
         try:
             events = self.manager.obey(asked)
-        except RefusedError:
+        except CommandNotAllowedError:
             assert dict(self.manager.alarms) == before
             return
         assert not stale

@@ -14,7 +14,7 @@ from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_event, alarm_payload
 
@@ -70,7 +70,7 @@ class Box:
                 Diagnosis("m", what, t_ns, "s", 0, 1, quality=quality, sensors=sensors, **said)
             )
         else:
-            with contextlib.suppress(RefusedError):
+            with contextlib.suppress(CommandNotAllowedError):
                 events = self.manager.obey(AlarmCommand(verb=what, alarm=which, by="ann"))
         for event in events:
             self.journal.pop(event.alarm, None)

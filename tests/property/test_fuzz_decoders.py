@@ -24,12 +24,12 @@ from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter
 from drivers.can.driver import CanDriver
 from drivers.frames import Field, FrameLayout
 from drivers.modbus.registers import RegisterField, RegisterRecord, plan_runs
-from drivers.modbus.replies import MAX_TCP_BYTES, Expected, judge_rtu, judge_tcp, register_bytes
+from drivers.modbus.replies import MAX_TCP_BYTES, ExpectedReply, judge_rtu, judge_tcp, register_bytes
 from drivers.replay.driver import ReplayDriver
 from drivers.replay.files import ColumnLayout
 from drivers.replay.growing import candump_log
 from drivers.serial.driver import framing_of
-from drivers.serial.lines import LineLayout
+from drivers.serial.lines import TextLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -160,7 +160,7 @@ def modbus_replies(rng: np.random.Generator) -> int:
             16: struct.pack(">BHH", 16, 0, registers),
             24: struct.pack(">BHH", 24, 2 + 2 * registers, registers) + rng.bytes(2 * registers),
         }.get(function, struct.pack(">BB", function, 2 * registers) + rng.bytes(2 * registers))
-        expected = Expected(
+        expected = ExpectedReply(
             7, function, 2 * registers if function in {3, 4} else None, transaction=int(rng.integers(3))
         )
         tcp = mutated(rng, struct.pack(">HHHB", expected.transaction, 0, 1 + len(body), 7) + body)
@@ -195,7 +195,7 @@ def _crc(data: bytes) -> int:
     return crc >> 8 | (crc & 0xFF) << 8
 
 
-LINES = LineLayout(
+LINES = TextLayout(
     columns=("seq", "x", "y"),
     channels=("x", "y"),
     scale=np.ones(2),

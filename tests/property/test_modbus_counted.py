@@ -16,7 +16,7 @@ from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 from daqsvc.acquisition import supervisor
 from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
 from drivers.modbus.registers import RegisterField
-from sim_hw.nodes.modbus_node import Answer
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, WaveformStore, store_for
 
 RATE_HZ = 500.0
@@ -142,11 +142,11 @@ def play(layout, seed, *, count, restarts, serial, damaged, stale, seconds=12.0,
     def plan(_unit, pdu):
         now_s = asyncio.get_running_loop().time()
         if not device.on or now_s < quiet_until_s:
-            return Answer("silent")
+            return PlannedReply("silent")
         if rng.random() < 0.04:
             # What is wrong with a whole reply befalls it after the unit has done what it was asked to.
-            return Answer(rng.choice(lost))
-        return Answer(delay_ns=rng.randrange(3_000_000))
+            return PlannedReply(rng.choice(lost))
+        return PlannedReply(delay_ns=rng.randrange(3_000_000))
 
     async def main():
         nonlocal device, quiet_until_s

@@ -13,13 +13,13 @@ from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.client import ModbusClient
-from drivers.modbus.layouts import Count, Ring, Trend, sample_record
+from drivers.modbus.layouts import Count, Ring, TrendLayout, sample_record
 from drivers.modbus.line import ModbusLine
-from drivers.modbus.outcomes import ModbusCounters, NoReplyError, RefusedError
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
-from drivers.modbus.silence import Patience, UnitSetAsideError
+from drivers.modbus.outcomes import ModbusCounters, NoReplyError, RequestRefusedError
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from drivers.modbus.silence import RetryPolicy, UnitSetAsideError
 from drivers.modbus.wire import LineOptions
-from sim_hw.nodes.modbus_node import Answer
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 
 TIMEOUT_NS = 100_000_000
@@ -55,7 +55,7 @@ def test_no_late_reply_ever_becomes_the_value_of_another_register(seed, requests
 
     # Replies come up to twice the time-out late: some in time, some in the quiet time after it.
     def plan(_unit, _pdu):
-        return Answer(
+        return PlannedReply(
             rng.choice(["none", "none", "none", "silent"]), rng.randrange(0, 2 * TIMEOUT_NS - 5_000_000)
         )
 
@@ -69,12 +69,12 @@ def test_no_late_reply_ever_becomes_the_value_of_another_register(seed, requests
         client = ModbusClient(options, LoopClock(), counters)
         async with responding(marked_units(range(1, 5)), plan, serial=True):
             await client.connect()
-            patience = Patience(TIMEOUT_NS, options.gap_ns, demote_after=10_000)
+            patience = RetryPolicy(TIMEOUT_NS, options.gap_ns, demote_after=10_000)
             line = ModbusLine(client, LoopClock(), counters, patience, units=[1, 2, 3, 4])
 
             async def ask(unit, function, address, count):
                 try:
-                    raw = await line.read(unit, function, Run(address, count))
+                    raw = await line.read(unit, function, RegisterRun(address, count))
                 except NoReplyError:
                     return
                 answered.append(((unit, function, address, count), np.frombuffer(raw, ">u2").tolist()))
@@ -98,17 +98,17 @@ def test_late_replies_happen_and_are_counted():
             "rtu", serial_port=options_of(serial=True)["serial_port"], timeout_ns=TIMEOUT_NS
         )
         client = ModbusClient(options, LoopClock(), counters)
-        late = iter([Answer(delay_ns=150_000_000)])
-        async with responding(marked_units([1, 2]), lambda *_: next(late, Answer()), serial=True):
+        late = iter([PlannedReply(delay_ns=150_000_000)])
+        async with responding(marked_units([1, 2]), lambda *_: next(late, PlannedReply()), serial=True):
             await client.connect()
             line = ModbusLine(
-                client, LoopClock(), counters, Patience(TIMEOUT_NS, options.gap_ns), units=[1, 2]
+                client, LoopClock(), counters, RetryPolicy(TIMEOUT_NS, options.gap_ns), units=[1, 2]
             )
             with pytest.raises(NoReplyError, match=r"unit 1 at .* has not answered within 100 ms"):
-                await line.read(1, 3, Run(5, 1))
+                await line.read(1, 3, RegisterRun(5, 1))
             asked_ns = LoopClock().monotonic_ns()
             # The same function and length: without the quiet time the late reply would pass for this one.
-            assert await line.read(1, 3, Run(6, 1)) == register_of(1, 3, 6).to_bytes(2, "big")
+            assert await line.read(1, 3, RegisterRun(6, 1)) == register_of(1, 3, 6).to_bytes(2, "big")
             assert LoopClock().monotonic_ns() - asked_ns >= TIMEOUT_NS
             await client.close()
 
@@ -125,7 +125,9 @@ def test_every_request_has_its_whole_time_out_whenever_it_is_made():
     async def main():
         options = LineOptions(**options_of(serial=False), timeout_ns=TIMEOUT_NS)
         client = ModbusClient(options, LoopClock(), counters)
-        async with responding(marked_units([1]), lambda *_: Answer(delay_ns=next(delays_ns)), serial=False):
+        async with responding(
+            marked_units([1]), lambda *_: PlannedReply(delay_ns=next(delays_ns)), serial=False
+        ):
             await client.connect()
             for late in (False, False, False, True, False):
                 begun_ns = LoopClock().monotonic_ns()
@@ -169,15 +171,15 @@ def test_what_is_no_reply_is_counted_by_kind_and_the_next_request_is_answered(fa
         where = options_of(serial=serial)
         options = LineOptions(**where, timeout_ns=TIMEOUT_NS)
         client = ModbusClient(options, LoopClock(), counters)
-        plan = iter([Answer(fault)])
-        async with responding(marked_units([1]), lambda *_: next(plan, Answer()), serial=serial):
+        plan = iter([PlannedReply(fault)])
+        async with responding(marked_units([1]), lambda *_: next(plan, PlannedReply()), serial=serial):
             await client.connect()
             quiet_ns = TIMEOUT_NS if serial else 0
-            line = ModbusLine(client, LoopClock(), counters, Patience(quiet_ns, options.gap_ns), units=[1])
+            line = ModbusLine(client, LoopClock(), counters, RetryPolicy(quiet_ns, options.gap_ns), units=[1])
             with pytest.raises(NoReplyError):
-                await line.read(1, 3, Run(5, 4))
+                await line.read(1, 3, RegisterRun(5, 4))
             words = [register_of(1, 3, 5 + k) for k in range(4)]
-            assert await line.read(1, 3, Run(5, 4)) == np.array(words, ">u2").tobytes()
+            assert await line.read(1, 3, RegisterRun(5, 4)) == np.array(words, ">u2").tobytes()
             await client.close()
 
     simulate(main)
@@ -187,13 +189,15 @@ def test_what_is_no_reply_is_counted_by_kind_and_the_next_request_is_answered(fa
 
 @pytest.mark.parametrize("fault", ["wrong protocol", "cut off"])
 def test_a_tcp_stream_that_lost_its_frames_is_opened_again(fault):
-    layout = Trend(1, "holding", RegisterRecord((RegisterField("x", 5, "uint16"),), (Run(5, 1),)))
-    plan = iter([Answer(), Answer(fault)])
+    layout = TrendLayout(
+        1, "holding", RegisterRecord((RegisterField("x", 5, "uint16"),), (RegisterRun(5, 1),))
+    )
+    plan = iter([PlannedReply(), PlannedReply(fault)])
     rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, 10.0)}, clock=LoopClock())
 
     async def main():
         async with (
-            responding(marked_units([1]), lambda *_: next(plan, Answer()), serial=False),
+            responding(marked_units([1]), lambda *_: next(plan, PlannedReply()), serial=False),
             rig.running() as driver,
         ):
             await asyncio.sleep(60)
@@ -212,13 +216,13 @@ def test_a_refusal_is_told_from_silence(serial):
     async def main():
         options = LineOptions(**options_of(serial=serial), timeout_ns=TIMEOUT_NS)
         client = ModbusClient(options, LoopClock(), counters)
-        async with responding(marked_units([1]), lambda *_: Answer(), serial=serial):
+        async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=serial):
             await client.connect()
-            line = ModbusLine(client, LoopClock(), counters, Patience(TIMEOUT_NS, 0), units=[1])
-            with pytest.raises(RefusedError, match="unit 1 refuses function 24: illegal data address"):
+            line = ModbusLine(client, LoopClock(), counters, RetryPolicy(TIMEOUT_NS, 0), units=[1])
+            with pytest.raises(RequestRefusedError, match="unit 1 refuses function 24: illegal data address"):
                 await line.read_fifo(1, 7)
-            with pytest.raises(RefusedError, match="illegal data address"):
-                await line.read(1, 3, Run(65_530, 10))
+            with pytest.raises(RequestRefusedError, match="illegal data address"):
+                await line.read(1, 3, RegisterRun(65_530, 10))
             await client.close()
 
     simulate(main)
@@ -227,7 +231,9 @@ def test_a_refusal_is_told_from_silence(serial):
 
 
 def trend_of(unit):
-    return Trend(unit, "holding", RegisterRecord((RegisterField("x", unit, "uint16"),), (Run(unit, 1),)))
+    return TrendLayout(
+        unit, "holding", RegisterRecord((RegisterField("x", unit, "uint16"),), (RegisterRun(unit, 1),))
+    )
 
 
 @pytest.mark.parametrize("serial", [True, False])
@@ -235,7 +241,7 @@ def test_a_dead_unit_is_set_aside_and_does_not_slow_its_neighbours(serial):
     # Unit 2 is silent from 60 s to 180 s.
     def plan(unit, _pdu):
         dead = unit == 2 and 1060 <= LoopClock().monotonic_ns() / NS_PER_S < 1180
-        return Answer("silent" if dead else "none")
+        return PlannedReply("silent" if dead else "none")
 
     streams = {f"unit-{unit}": (trend_of(unit), 5.0) for unit in (1, 2, 3)}
     options = options_of(serial=serial, timeout_ms=100.0, demote_after=3, demotion_s=10.0)
@@ -275,20 +281,20 @@ def test_a_unit_set_aside_is_not_asked_until_its_time_has_come():
     async def main():
         options = LineOptions(**options_of(serial=True), timeout_ns=TIMEOUT_NS)
         client = ModbusClient(options, LoopClock(), counters)
-        patience = Patience(TIMEOUT_NS, options.gap_ns, demote_after=2, demotion_ns=NS_PER_S)
-        async with responding(marked_units([1]), lambda *_: Answer(), serial=True):
+        patience = RetryPolicy(TIMEOUT_NS, options.gap_ns, demote_after=2, demotion_ns=NS_PER_S)
+        async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=True):
             await client.connect()
             line = ModbusLine(client, LoopClock(), counters, patience, units=[1, 9])
             for _ in range(2):
                 with pytest.raises(NoReplyError, match="unit 9"):
-                    await line.read(9, 3, Run(0, 1))
+                    await line.read(9, 3, RegisterRun(0, 1))
             for _ in range(5):
                 with pytest.raises(UnitSetAsideError, match=r"unit 9 is set aside: .* has not answered"):
-                    await line.read(9, 3, Run(0, 1))
+                    await line.read(9, 3, RegisterRun(0, 1))
             assert counters.requests == 2
             await asyncio.sleep(1)
             with pytest.raises(NoReplyError):
-                await line.read(9, 3, Run(0, 1))
+                await line.read(9, 3, RegisterRun(0, 1))
             assert (counters.requests, counters.probes) == (3, 1)
             assert not line.lost.done(), "unit 1 has not been asked yet"
             await client.close()
@@ -302,7 +308,7 @@ def test_a_line_on_which_nobody_answers_is_lost_and_opened_again():
 
     def plan(_unit, _pdu):
         now_s = LoopClock().monotonic_ns() / NS_PER_S
-        return Answer("silent" if 1020 <= now_s < silent_until_s else "none")
+        return PlannedReply("silent" if 1020 <= now_s < silent_until_s else "none")
 
     async def main():
         async with responding(marked_units([1]), plan, serial=False), rig.running() as driver:
@@ -332,7 +338,7 @@ def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, ser
     faults = ["none"] * 60 + ["silent", "exception", "truncated", "oversized", "wrong unit"]
 
     def plan(_unit, _pdu):
-        return Answer(rng.choice(faults), rng.randrange(30_000_000))
+        return PlannedReply(rng.choice(faults), rng.randrange(30_000_000))
 
     options = options_of(serial=serial, timeout_ms=40.0, quiet_ms=40.0, demote_after=30)
     rig = Rig(options, {"s": (layout, rate_hz)}, clock=LoopClock())
@@ -370,7 +376,7 @@ def test_a_ring_that_overruns_loses_exactly_what_the_counter_says():
     async def main():
         units = {1: ModbusUnit()}
         store = store_for(units[1], layout)
-        plan = lambda *_: Answer("silent" if silent[0] else "none")  # noqa: E731
+        plan = lambda *_: PlannedReply("silent" if silent[0] else "none")  # noqa: E731
         async with responding(units, plan, serial=False), rig.running():
             for k in range(600):
                 silent[0] = 200 <= k < 380
@@ -394,7 +400,7 @@ def test_a_ring_that_begins_again_is_followed_without_what_is_left_from_before()
     async def main():
         units = {1: ModbusUnit()}
         store = store_for(units[1], layout)
-        async with responding(units, lambda *_: Answer(), serial=False), rig.running():
+        async with responding(units, lambda *_: PlannedReply(), serial=False), rig.running():
             for k in [*range(5000, 5400), *range(400)]:
                 store.put(k, encode(layout.record, ramp(1, first=k)))
                 await asyncio.sleep(0.01)
@@ -420,7 +426,7 @@ def test_a_schedule_finer_than_the_event_loop_sleeps_is_kept_without_loss():
     rig = Rig(options_of(serial=False), {"s": (trend_of(1), 1500.0)}, clock=DrowsyClock())
 
     async def main():
-        async with responding(marked_units([1]), lambda *_: Answer(), serial=False), rig.running():
+        async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=False), rig.running():
             await asyncio.sleep(2)
 
     simulate(main)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.frames import LayoutError
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run, RunLimits, plan_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
 
 FORMATS = {
     "int16": "h",
@@ -38,7 +38,7 @@ def reordered(big_endian: bytes, order: str) -> bytes:
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_letters_are_the_places_of_the_bytes_of_a_32_bit_number(order):
-    record = RegisterRecord((RegisterField("x", 0, "uint32", order),), (Run(0, 2),))
+    record = RegisterRecord((RegisterField("x", 0, "uint32", order),), (RegisterRun(0, 2),))
     on_wire = dict(zip("ABCD", b"\x12\x34\x56\x78", strict=True))
     raw = np.frombuffer(bytes(on_wire[letter] for letter in order), np.uint8)
     assert record.decode(raw[None])[0, 0] == np.float32(0x12345678)
@@ -65,7 +65,7 @@ def test_any_mix_decodes_as_struct_packs_it(numbers, rows):
         fields.append(RegisterField(f"c{k}", 100 + len(raw) // 2, kind, order))
         raw += reordered(packed, order)
         expected.append(np.float32(struct.unpack(f">{FORMATS[kind]}", packed)[0]))
-    record = RegisterRecord(tuple(fields), (Run(100, len(raw) // 2),))
+    record = RegisterRecord(tuple(fields), (RegisterRun(100, len(raw) // 2),))
     data = np.frombuffer(raw * rows, np.uint8).reshape(rows, -1)
     np.testing.assert_array_equal(record.decode(data), np.tile(expected, (rows, 1)))
 
@@ -78,7 +78,7 @@ def test_what_is_encoded_decodes_to_the_same(kinds):
     for k, (kind, order) in enumerate(kinds):
         fields.append(RegisterField(f"c{k}", place, kind, order, scale=0.5, offset=-3.0))
         place = fields[-1].run.end + k % 2  # a hole behind every second one
-    record = RegisterRecord(tuple(fields), (Run(0, place),))
+    record = RegisterRecord(tuple(fields), (RegisterRun(0, place),))
     # Halves that every type holds: unsigned ones nothing below the offset.
     samples = np.linspace(-3.0, 2000.0, 5 * len(fields)).reshape(5, -1).round()
     np.testing.assert_array_equal(record.decode(record.encode(samples)), samples.astype(np.float32))
@@ -88,7 +88,7 @@ def test_what_is_encoded_decodes_to_the_same(kinds):
 def test_bits_of_a_register_share_it(word, lowest, width):
     width = min(width, 16 - lowest)
     fields = (RegisterField("part", 7, "uint16", bits=(lowest, width)), RegisterField("all", 7, "uint16"))
-    record = RegisterRecord(fields, (Run(7, 1),))
+    record = RegisterRecord(fields, (RegisterRun(7, 1),))
     raw = np.frombuffer(word.to_bytes(2, "big"), np.uint8)[None]
     assert record.decode(raw).tolist() == [[(word >> lowest) & (2**width - 1), word]]
 
@@ -98,7 +98,7 @@ def test_parts_of_one_register_are_put_together():
         RegisterField("low", 0, "uint16", bits=(0, 4)),
         RegisterField("high", 0, "uint16", bits=(12, 4)),
     )
-    record = RegisterRecord(fields, (Run(0, 1),))
+    record = RegisterRecord(fields, (RegisterRun(0, 1),))
     assert record.encode(np.array([[5.0, 10.0]])).tobytes() == b"\xa0\x05"
 
 
@@ -106,7 +106,7 @@ def test_parts_of_one_register_are_put_together():
     ("kind", "value"), [("int16", 32768.0), ("uint16", -1.0), ("int64", 2.0**63), ("float32", 1e39)]
 )
 def test_what_does_not_fit_is_refused_or_clipped(kind, value):
-    record = RegisterRecord((RegisterField("x", 0, kind),), (Run(0, 4),))
+    record = RegisterRecord((RegisterField("x", 0, kind),), (RegisterRun(0, 4),))
     with pytest.raises(LayoutError, match=f"channel 'x': .* does not fit {kind}"):
         record.encode(np.array([[value]]))
     assert abs(record.decode(record.encode(np.array([[value]]), clip=True))[0, 0]) <= abs(np.float64(value))
@@ -115,7 +115,9 @@ def test_what_does_not_fit_is_refused_or_clipped(kind, value):
 
 
 def test_units_of_the_sensor_are_put_into_scale_and_offset():
-    record = RegisterRecord((RegisterField("x", 0, "int16", scale=0.001, offset=-12.0),), (Run(0, 1),))
+    record = RegisterRecord(
+        (RegisterField("x", 0, "int16", scale=0.001, offset=-12.0),), (RegisterRun(0, 1),)
+    )
     turned = record.in_units({"x": (1000.0 / 7.87, 10_000 / 7.87)})
     raw = np.frombuffer(struct.pack(">h", 2000), np.uint8)[None]
     assert turned.decode(raw)[0, 0] == pytest.approx(0.0, abs=1e-3)
@@ -123,22 +125,22 @@ def test_units_of_the_sensor_are_put_into_scale_and_offset():
 
 def test_a_field_outside_the_runs_is_refused():
     with pytest.raises(LayoutError, match=r"channel 'x': registers 4 to 5 are not among .*\(0 to 4\)"):
-        RegisterRecord((RegisterField("x", 4, "int32"),), (Run(0, 5),))
+        RegisterRecord((RegisterField("x", 4, "int32"),), (RegisterRun(0, 5),))
 
 
 @pytest.mark.parametrize("bits", [(0, 17), (-1, 2), (3, 0)])
 def test_bits_that_the_number_has_not_are_refused(bits):
     with pytest.raises(LayoutError, match="are no part of uint16"):
-        RegisterRecord((RegisterField("x", 0, "uint16", bits=bits),), (Run(0, 1),))
+        RegisterRecord((RegisterField("x", 0, "uint16", bits=bits),), (RegisterRun(0, 1),))
 
 
 @st.composite
 def wish(draw):
     """Wanted fields and forbidden ranges that do not contradict each other, and limits."""
     widths = st.sampled_from([1, 1, 1, 2, 4])
-    wanted = draw(st.lists(st.builds(Run, st.integers(0, 300), widths), min_size=1, max_size=40))
+    wanted = draw(st.lists(st.builds(RegisterRun, st.integers(0, 300), widths), min_size=1, max_size=40))
     taken = {a for run in wanted for a in range(run.address, run.end)}
-    banned = draw(st.lists(st.builds(Run, st.integers(0, 310), st.integers(1, 6)), max_size=6))
+    banned = draw(st.lists(st.builds(RegisterRun, st.integers(0, 310), st.integers(1, 6)), max_size=6))
     forbidden = [run for run in banned if not taken & set(range(run.address, run.end))]
     return wanted, forbidden, draw(st.integers(0, 20)), draw(st.integers(60, 125))
 
@@ -166,11 +168,11 @@ def test_a_plan_reads_what_is_wanted_once_and_nothing_forbidden(given_wish):
     for field in wanted:
         assert any(run.address <= field.address and field.end <= run.end for run in runs), "a number is cut"
     for one, other in itertools.pairwise(runs):
-        gap = Run(one.end, other.address - one.end)
+        gap = RegisterRun(one.end, other.address - one.end)
         barred = any(max(gap.address, f.address) < min(gap.end, f.end) for f in forbidden)
         assert gap.count > max_gap or barred or other.end - one.address > max_count, "these belong in one"
 
 
 def test_a_forbidden_register_that_is_wanted_is_refused():
     with pytest.raises(LayoutError, match="registers 5 to 6 are wanted, but 6 to 9 are forbidden"):
-        plan_runs([Run(5, 2)], RunLimits(forbidden=(Run(6, 4),)))
+        plan_runs([RegisterRun(5, 2)], RunLimits(forbidden=(RegisterRun(6, 4),)))

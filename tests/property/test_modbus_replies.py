@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.modbus.replies import (
     MAX_RTU_BYTES,
     MAX_TCP_BYTES,
-    Expected,
+    ExpectedReply,
     judge_rtu,
     judge_tcp,
     register_bytes,
@@ -37,12 +37,12 @@ def tcp(transaction, unit, pdu):
 
 
 expected_replies = st.builds(
-    Expected,
+    ExpectedReply,
     st.integers(1, 247),
     st.sampled_from([3, 4]),
     st.integers(1, 125).map(lambda n: 2 * n),
     st.just(77),
-) | st.builds(Expected, st.integers(1, 247), st.sampled_from([16, 24]), st.none(), st.just(77))
+) | st.builds(ExpectedReply, st.integers(1, 247), st.sampled_from([16, 24]), st.none(), st.just(77))
 heads = st.sampled_from([b"", b"\0\x4d\0\0\0\x05\1\3", b"\1\3\4", b"\1\x18\0\x06\0\2", b"\1\x83\2"])
 
 

@@ -16,12 +16,12 @@ from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import supervisor
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus.layouts import Count, Fifo, Trend, sample_record
+from drivers.modbus.layouts import Count, Fifo, TrendLayout, sample_record
 from drivers.modbus.outcomes import ModbusCounters
-from drivers.modbus.registers import RegisterField, RegisterRecord, Run
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS
-from drivers.modbus.silence import Enquiry, Patience, UnitSetAsideError, UnitSilence
-from sim_hw.nodes.modbus_node import Answer
+from drivers.modbus.silence import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
+from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 TIMEOUT_MS = 100.0
@@ -29,8 +29,8 @@ FIFO = Fifo(1, 7, Count(0, 16), sample_record([RegisterField("n", 0, "uint16")])
 
 
 def trend_of(unit, address):
-    return Trend(
-        unit, "holding", RegisterRecord((RegisterField("x", address, "uint16"),), (Run(address, 1),))
+    return TrendLayout(
+        unit, "holding", RegisterRecord((RegisterField("x", address, "uint16"),), (RegisterRun(address, 1),))
     )
 
 
@@ -58,7 +58,7 @@ def test_no_late_reply_becomes_the_value_of_another_stream_however_often_the_lin
     late_ns = 2 * round(TIMEOUT_MS * 1e6) - 5_000_000
 
     def plan(_unit, _pdu):
-        return Answer(delay_ns=rng.randrange(late_ns) if rng.random() < 0.3 else 0)
+        return PlannedReply(delay_ns=rng.randrange(late_ns) if rng.random() < 0.3 else 0)
 
     async def main():
         async with responding(units(), plan, serial=True):
@@ -79,7 +79,7 @@ def test_a_line_that_was_opened_is_quiet_as_if_somebody_had_just_asked():
 
     def plan(_unit, _pdu):
         asked_s.append(now_s())
-        return Answer()
+        return PlannedReply()
 
     for serial, least_s in ((True, 2 * TIMEOUT_MS / 1e3), (False, 0.0)):
         asked_s.clear()
@@ -106,7 +106,9 @@ def test_a_unit_lives_while_it_answers_anything(fault, demote_after, caplog):
         unit_side[1].answer = lambda pdu: bytes([0x98, 11]) if pdu[0] == READ_FIFO else answer(pdu)
 
     def plan(_unit, pdu):
-        return Answer(fault if pdu[0] == READ_FIFO and fault != "gateway" else "none", delay_ns=1_000_000)
+        return PlannedReply(
+            fault if pdu[0] == READ_FIFO and fault != "gateway" else "none", delay_ns=1_000_000
+        )
 
     streams = {"fifo": (FIFO, 100.0), "good": (trend_of(1, 7), 1.0)}
     options = options_of(serial=False, timeout_ms=TIMEOUT_MS, demote_after=demote_after)
@@ -140,7 +142,9 @@ def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order, dea
 
     async def main():
         def plan(unit, _pdu):
-            return Answer("silent" if unit == 3 and now_s() > dead_since_s else "none", delay_ns=3_000_000)
+            return PlannedReply(
+                "silent" if unit == 3 and now_s() > dead_since_s else "none", delay_ns=3_000_000
+            )
 
         async with responding(units(), plan, serial=True), rig.running():
             await asyncio.sleep(300.8)
@@ -161,7 +165,7 @@ def test_a_dead_unit_costs_those_that_are_polled_every_second_nothing(order, dea
 def test_a_unit_is_found_to_be_back_though_one_of_its_streams_never_is(serial):
     def plan(unit, pdu):
         silent = unit == 1 and (pdu[0] == READ_FIFO or 50 <= now_s() < 170)
-        return Answer("silent" if silent else "none")
+        return PlannedReply("silent" if silent else "none")
 
     streams = {"fifo": (FIFO, 100.0), "good": (trend_of(1, 7), 1.0), "second": (trend_of(2, 7), 1.0)}
     rig = Rig(options_of(serial=serial, timeout_ms=TIMEOUT_MS), streams, clock=LoopClock())
@@ -182,7 +186,7 @@ def test_a_unit_is_found_to_be_back_though_one_of_its_streams_never_is(serial):
 
 
 def test_all_that_a_dead_unit_was_asked_shares_its_probes():
-    patience = Patience(0, 0, demote_after=3)
+    patience = RetryPolicy(0, 0, demote_after=3)
     counters = ModbusCounters()
     unit = UnitSilence(9, patience, counters)
     enquiries = [unit.of(Enquiry(3, f"registers {k}")) for k in range(5)]
@@ -223,7 +227,7 @@ def test_each_refusal_is_told_once_with_what_to_do_about_it(caplog):
     )
 
     async def main():
-        async with responding(unit_side, lambda *_: Answer(), serial=False), rig.running():
+        async with responding(unit_side, lambda *_: PlannedReply(), serial=False), rig.running():
             await asyncio.sleep(10.0)
 
     with caplog.at_level(logging.WARNING):
@@ -254,7 +258,7 @@ def test_what_is_wrong_with_a_reply_is_told_in_words(fault, words, caplog):
     )
 
     async def main():
-        async with responding(units(), lambda *_: Answer(fault), serial=False), rig.running():
+        async with responding(units(), lambda *_: PlannedReply(fault), serial=False), rig.running():
             await asyncio.sleep(1.0)
 
     with caplog.at_level(logging.WARNING):
@@ -273,7 +277,7 @@ def test_what_no_register_holds_is_not_sent(values):
 
     def plan(_unit, pdu):
         written.append(pdu[0] == WRITE_REGISTERS)
-        return Answer()
+        return PlannedReply()
 
     async def main():
         async with responding(units(), plan, serial=False), rig.running() as driver:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.frames import FrameLayout
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import LineFraming, LineLayout
+from drivers.serial.lines import LineFraming, TextLayout
 
 if TYPE_CHECKING:
     from drivers.serial.framing import Found, Framing
@@ -33,8 +33,8 @@ def packed(stream_id: int, per_frame: int) -> FrameLayout:
     )
 
 
-def text(prefix: str) -> LineLayout:
-    return LineLayout(
+def text(prefix: str) -> TextLayout:
+    return TextLayout(
         ("seq", "x", "spare"), ("x",), np.ones(1), np.zeros(1), counter="seq", counter_bits=16, prefix=prefix
     )
 

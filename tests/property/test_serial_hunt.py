@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.serial.kernels import Step, hunt
+from drivers.serial.kernels import SyncSearch, hunt
 
 WORD = b"\xa5\x5a"
 LENGTHS = {1: 5, 2: 9}
 
 
 def by_search(
-    buffer: bytes, step: Step, *, checked: bool
-) -> tuple[list[tuple[int, int, bool]], Step, list[int]]:
+    buffer: bytes, step: SyncSearch, *, checked: bool
+) -> tuple[list[tuple[int, int, bool]], SyncSearch, list[int]]:
     """Bodies as (start, end, intact); where the hunt stands then; garbage, malformed and resyncs."""
     taken, at, fresh, astray = step
     resume, bodies, counts = at, [], [0, 0, 0]
@@ -59,12 +59,12 @@ def by_search(
     if at - taken > 2 * longest:
         garbage(at - taken)
         taken = at
-    return bodies, Step(taken, at, fresh, astray), counts
+    return bodies, SyncSearch(taken, at, fresh, astray), counts
 
 
 def compiled(
-    buffer: bytes, step: Step, *, checked: bool
-) -> tuple[list[tuple[int, int, bool]], Step, list[int]]:
+    buffer: bytes, step: SyncSearch, *, checked: bool
+) -> tuple[list[tuple[int, int, bool]], SyncSearch, list[int]]:
     """The same by the kernel."""
     lengths = np.full(256, -1)
     lengths[list(LENGTHS)] = list(LENGTHS.values())
@@ -104,11 +104,11 @@ PIECES = st.one_of(
 @pytest.mark.parametrize("checked", [True, False])
 @given(chunks=st.lists(st.lists(PIECES, max_size=6).map(b"".join), max_size=6))
 def test_whatever_comes_however_it_is_cut_both_find_the_same(checked, chunks) -> None:
-    rest, step = b"", Step()
+    rest, step = b"", SyncSearch()
     for chunk in chunks:
         buffer = rest + chunk
         found = compiled(buffer, step, checked=checked)
         assert found == by_search(buffer, step, checked=checked)
         taken, tried, *state = found[1]
         start = min(taken, tried)
-        rest, step = buffer[start:], Step(taken - start, tried - start, *state)
+        rest, step = buffer[start:], SyncSearch(taken - start, tried - start, *state)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.serial.framing import Pieces
 from drivers.serial.line_kernels import check_lines
-from drivers.serial.lines import DeviceTime, LineLayout
+from drivers.serial.lines import DeviceTime, TextLayout
 
 NUMBERS = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False).map(repr),
@@ -33,10 +33,10 @@ def pieces(lines: list[bytes]) -> Pieces:
     return Pieces(buffer, starts, stops, stops + 1)
 
 
-def layout(**changes) -> LineLayout:
+def layout(**changes) -> TextLayout:
     """A counter or a time, a value, and a column that nobody asked for between them."""
     given = {"columns": ("seq", "spare", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
-    return LineLayout(**(given | {"counter": "seq"} | changes))
+    return TextLayout(**(given | {"counter": "seq"} | changes))
 
 
 def number(text: str, kind: type) -> float | None:

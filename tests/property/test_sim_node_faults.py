@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from daqsvc.acquisition.assembler import StreamAssembler
 from drivers.frames import FrameLayout
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
-from sim_hw.node_faults import BABBLER, EVER, Babble, Delay, Drift, Mark, NodeFaults, Window
+from sim_hw.node_faults import BABBLER, EVER, Babble, CountRestart, Drift, FaultWindow, FrameDelay, NodeFaults
 
 RATE_HZ = 1000.0
 PER_FRAME = 5
@@ -38,8 +38,8 @@ def plan_of(faults: NodeFaults, samples: int = SAMPLES, first_index: int = 0):
 
 times_s = st.integers(0, 3000).map(lambda ms: ms / 1000)
 windows = (
-    st.tuples(times_s, times_s).filter(lambda w: w[0] < w[1]).map(lambda w: Window(*w))
-    | times_s.map(Window)
+    st.tuples(times_s, times_s).filter(lambda w: w[0] < w[1]).map(lambda w: FaultWindow(*w))
+    | times_s.map(FaultWindow)
     | st.just(EVER)
 )
 
@@ -48,7 +48,7 @@ windows = (
 def apart(draw, most: int = 3):
     """Windows that do not overlap."""
     marks = sorted(draw(st.sets(st.integers(0, 3000), min_size=0, max_size=2 * most)))
-    return [Window(a / 1000, b / 1000) for a, b in zip(marks[::2], marks[1::2], strict=False)]
+    return [FaultWindow(a / 1000, b / 1000) for a, b in zip(marks[::2], marks[1::2], strict=False)]
 
 
 rates = st.floats(0, 0.25)
@@ -68,7 +68,7 @@ node_faults = st.builds(
     counter_reset_s=st.lists(st.integers(1, 3000).map(lambda ms: ms / 1000), max_size=2),
     silence=st.lists(windows, max_size=2),
     link=apart().flatmap(lambda ws: st.tuples(*[st.tuples(st.just(w), links) for w in ws])),
-    delay=st.lists(st.builds(Delay, windows, st.floats(0, 0.02), st.floats(0, 0.02)), max_size=2),
+    delay=st.lists(st.builds(FrameDelay, windows, st.floats(0, 0.02), st.floats(0, 0.02)), max_size=2),
     babble=st.lists(
         st.builds(Babble, windows.filter(lambda w: w.end_s < math.inf), st.floats(1, 500)), max_size=2
     ),
@@ -101,8 +101,8 @@ def test_what_is_counted_is_what_happens(faults: NodeFaults, first_index: int) -
         + FaultCounts.of(
             plan.fault[half:],
             delayed=int(plan.late[half:].sum()),
-            brown_outs=int((plan.mark[half:] == Mark.BROWN_OUT).sum()),
-            counter_resets=int((plan.mark[half:] == Mark.COUNTER_RESET).sum()),
+            brown_outs=int((plan.mark[half:] == CountRestart.BROWN_OUT).sum()),
+            counter_resets=int((plan.mark[half:] == CountRestart.COUNTER_RESET).sum()),
         )
         == counts
     )
@@ -116,13 +116,13 @@ def test_samples_are_taken_once_in_order_and_only_with_power(faults: NodeFaults)
     assert np.all(np.diff(schedule.t_ns) > 0)
     for off in faults.brown_out:
         assert not off.holds(schedule.t_ns).any()
-    begins = schedule.mark != Mark.NONE
+    begins = schedule.mark != CountRestart.NONE
     assert np.all(schedule.count[begins] == 0)
     goes_on = ~begins[1:]
     assert np.all(np.diff(schedule.count)[goes_on] == PER_FRAME)
     assert np.all(np.diff(schedule.sample)[goes_on] == PER_FRAME)
     # A reset loses no sample, and a brown-out no more than lasts as long as it, and a frame that it cuts off.
-    assert np.all(np.diff(schedule.sample)[schedule.mark[1:] == Mark.COUNTER_RESET] == PER_FRAME)
+    assert np.all(np.diff(schedule.sample)[schedule.mark[1:] == CountRestart.COUNTER_RESET] == PER_FRAME)
     off_s = sum(max(min(w.end_s, 3.1) - w.start_s, 0) for w in faults.brown_out)
     most = PER_FRAME * (1 + len(faults.brown_out))
     assert SAMPLES - len(taken) <= off_s * RATE_HZ * 1.01 + most
@@ -177,7 +177,7 @@ def test_same_seed_same_faults(faults: NodeFaults) -> None:
 
 
 @given(st.floats(-5000, 5000), windows)
-def test_a_drifting_clock_takes_its_samples_early_or_late_by_as_much(ppm: float, window: Window) -> None:
+def test_a_drifting_clock_takes_its_samples_early_or_late_by_as_much(ppm: float, window: FaultWindow) -> None:
     t_s = plan_of(NodeFaults(drift=[Drift(window, ppm)])).schedule.t_ns / NS_PER_S
     # What the node's clock shows at these times is when it takes a sample.
     drifted = np.clip(t_s, window.start_s, window.end_s) - window.start_s
@@ -257,7 +257,7 @@ def test_a_receiver_follows_a_restart_at_the_cost_of_one_frame(at_ms: int, off_m
     faults = (
         NodeFaults(counter_reset_s=[start_s])
         if reset
-        else NodeFaults(brown_out=[Window(start_s, start_s + off_ms / 1000)])
+        else NodeFaults(brown_out=[FaultWindow(start_s, start_s + off_ms / 1000)])
     )
     plan = plan_of(faults)
     counts = plan.injected()
@@ -276,21 +276,21 @@ def test_a_receiver_follows_a_restart_at_the_cost_of_one_frame(at_ms: int, off_m
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Window(2.0, 1.0), "from 2 to 1 s; it must begin at 0 or later"),
-        (lambda: Window(-1.0), "from -1 to inf s"),
+        (lambda: FaultWindow(2.0, 1.0), "from 2 to 1 s; it must begin at 0 or later"),
+        (lambda: FaultWindow(-1.0), "from -1 to inf s"),
         (lambda: Drift(EVER, 20_000.0), "a drift of 20000 ppm"),
         (lambda: Drift(EVER, math.nan), "a drift of nan ppm"),
-        (lambda: Delay(EVER, -1.0), "a delay of -1 s"),
-        (lambda: Delay(EVER, 0.0, math.inf), "a jitter of inf s"),
+        (lambda: FrameDelay(EVER, -1.0), "a delay of -1 s"),
+        (lambda: FrameDelay(EVER, 0.0, math.inf), "a jitter of inf s"),
         (lambda: Babble(EVER, 100.0), "must stop some time"),
-        (lambda: Babble(Window(0, 1), 0.0), "babbles 0 frames a second"),
+        (lambda: Babble(FaultWindow(0, 1), 0.0), "babbles 0 frames a second"),
         (lambda: NodeFaults(counter_reset_s=[0.0]), "reset at 0 s; that must be after the start"),
         (
-            lambda: NodeFaults(brown_out=[Window(1, 3), Window(2, 4)]),
+            lambda: NodeFaults(brown_out=[FaultWindow(1, 3), FaultWindow(2, 4)]),
             "two brown-outs at once, from 1 and from 2 s",
         ),
         (
-            lambda: NodeFaults(link=[(EVER, LinkFaults()), (Window(2, 4), LinkFaults())]),
+            lambda: NodeFaults(link=[(EVER, LinkFaults()), (FaultWindow(2, 4), LinkFaults())]),
             "two link faults at once, from 0 and from 2 s",
         ),
     ],

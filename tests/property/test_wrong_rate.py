@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.standing import Standing
+from daqsvc.acquisition.standing import StreamState
 
 PER_FRAME = 10
 START_NS = 3_000_000_000
@@ -24,7 +24,7 @@ class Stream:
     """A stream of 1000 Hz as the machine file says it, and what is reported about it."""
 
     def __init__(self, bits: int | None = 32, *, stamped: bool = False) -> None:
-        self.told: list[tuple[int, Standing]] = []
+        self.told: list[tuple[int, StreamState]] = []
         self.now_ns = 0
         self.unit = StreamAssembler(
             "s",
@@ -95,7 +95,7 @@ def test_it_is_over_when_the_device_has_the_rate_again() -> None:
     slow, right = sent(500.0, 10.0, 1), sent(1000.0, 30.0, 2, since_s=10.02)
     stream.play(np.arange(len(slow) + len(right)), np.concatenate([slow, right]))
     assert stream.doubts == [sentence(500)]
-    assert stream.told[-1][1] == Standing("", proven=True)
+    assert stream.told[-1][1] == StreamState("", proven=True)
     assert stream.unit.counters.samples_lost == 0
 
 
@@ -147,8 +147,8 @@ def test_a_stream_that_fits_is_proven_within_a_second() -> None:
     arrival_ns = sent(1000.0, 1.0, 3)
     stream.play(np.arange(len(arrival_ns)), arrival_ns)
     assert [standing for _, standing in stream.told] == [
-        Standing("", proven=False),
-        Standing("", proven=True),
+        StreamState("", proven=False),
+        StreamState("", proven=True),
     ]
     assert stream.told[-1][0] - START_NS < 0.7e9
 
@@ -158,4 +158,4 @@ def test_what_ends_too_soon_to_be_measured_is_judged_as_it_is() -> None:
     arrival_ns = sent(1000.0, 0.2, 3)
     stream.play(np.arange(len(arrival_ns)), arrival_ns)
     stream.unit.flush()
-    assert stream.told[-1][1] == Standing("", proven=True)
+    assert stream.told[-1][1] == StreamState("", proven=True)

@@ -57,7 +57,7 @@ def noise_at(snr_db):
 def machine(name):
     """The simulator's rotor in a mode, contact and all."""
     rotor = MODES[name].rotor
-    return plant.RotorParameters(
+    return plant.PlantParameters(
         damping_ratio=rotor.zeta,
         stiffness=rotor.k,
         eccentricity=rotor.e,

@@ -155,8 +155,8 @@ def rotor_synchronous():
 @pytest.mark.parametrize("faulty", [True, False], ids=["damping lost", "healthy"])
 @pytest.mark.parametrize(("make", "noise_um"), [(rotor_bank, 19.6), (rotor_synchronous, 2.0)])
 def test_a_rotor_s_decision_neither_comes_nor_goes_with_the_samples(make, noise_um, faulty, share, frame):
-    change = [plant.Change(55.0, plant.RotorParameters(damping_ratio=0.10))] if faulty else []
-    motion = plant.simulate(plant.RotorParameters(), change, revolutions=130.0, samples_per_rev=PER_REV)
+    change = [plant.Change(55.0, plant.PlantParameters(damping_ratio=0.10))] if faulty else []
+    motion = plant.simulate(plant.PlantParameters(), change, revolutions=130.0, samples_per_rev=PER_REV)
     begin = 85 * PER_REV
     samples = without(np.random.default_rng(4), channels_of(motion, noise_um), share, frame, begin)
     said = feed(make(), samples, 640.0, block=PER_REV, first_index=0)

@@ -39,7 +39,7 @@ MOTIONS = 4
 
 @functools.cache
 def error_run(error, onset):
-    healthy = plant.RotorParameters(**ERRORS[error])
+    healthy = plant.PlantParameters(**ERRORS[error])
     change = {"damping_ratio": healthy.damping_ratio * DAMPING_LOSS}
     revolutions = CALIBRATION_REV + HEALTHY_REV
     return runs.run([(revolutions + 0.5, change)], revolutions + FAULT_REV + 1.0, onset, healthy=healthy)

@@ -10,7 +10,7 @@ from daqsvc.alarms.flood import FloodLimit
 from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.alarms.start_up import StartUp
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 
 SPEAKERS = {"levels/probe-x": ("probe-x",), "rotor-bank": ("probe-x", "probe-y")}
 CONDITIONS = ("store/disk", "certificate/broker")
@@ -71,7 +71,7 @@ def test_a_sensor_that_dies_behind_the_cover_is_told_of_as_covered(rig):
 
 def test_a_command_that_is_refused_brings_no_alarm_into_being(rig):
     for verb, duration_s in ((Verb.ACKNOWLEDGE, None), (Verb.SHELVE, 1e9), (Verb.UNBYPASS, None)):
-        with pytest.raises(RefusedError):
+        with pytest.raises(CommandNotAllowedError):
             obey(rig, verb, "store/disk", duration_s)
     assert set(rig.manager.alarms) == {"rotor-fault"}
     assert not rig.manager.conditions
@@ -79,12 +79,12 @@ def test_a_command_that_is_refused_brings_no_alarm_into_being(rig):
 
 def test_what_cannot_come_is_no_alarm_and_the_refusal_names_those_that_can(rig):
     with pytest.raises(
-        RefusedError, match=r"no alarm is named 'sensor-ok/probe-z'; there are: alarm-flood, "
+        CommandNotAllowedError, match=r"no alarm is named 'sensor-ok/probe-z'; there are: alarm-flood, "
     ):
         obey(rig, Verb.BYPASS, "sensor-ok/probe-z")
     calm = AlarmRig(DiagnosisRule("rotor-fault", "rotor-bank"))
     for name in ("alarm-flood", "trip-multiply"):
-        with pytest.raises(RefusedError, match="there are: rotor-fault"):
+        with pytest.raises(CommandNotAllowedError, match="there are: rotor-fault"):
             obey(calm, Verb.BYPASS, name)
 
 

@@ -11,7 +11,7 @@ from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 
 LEVEL = LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0, danger=60.0, deadband=2.0))
 SPEAKERS = {"levels/probe-x": ("probe-x",)}
@@ -65,7 +65,7 @@ def test_shelving_again_sets_the_time_anew():
 @pytest.mark.parametrize("seconds", [None, 0.0, -1.0, math.nan, math.inf, 100.5])
 def test_shelving_needs_a_time_that_is_allowed(seconds):
     rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=100.0))
-    with pytest.raises(RefusedError, match="state a time above 0 and up to 1m40s"):
+    with pytest.raises(CommandNotAllowedError, match="state a time above 0 and up to 1m40s"):
         rig.shelve("vibration-x", seconds)
     assert rig.status("vibration-x").state is S.NORMAL
     assert (rig.manager.counters.refused, rig.manager.counters.commands) == (1, 0)
@@ -85,7 +85,7 @@ def test_shelving_needs_a_time_that_is_allowed(seconds):
 )
 def test_a_refusal_says_times_as_people_write_them(asked_s, longest_s, words):
     rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=longest_s))
-    with pytest.raises(RefusedError) as refused:
+    with pytest.raises(CommandNotAllowedError) as refused:
         rig.shelve("vibration-x", asked_s)
     assert f"{refused.value}" == f"cannot shelve vibration-x {words}"
 
@@ -127,7 +127,7 @@ def test_what_does_not_apply_is_refused(verb, reason):
     rig.rms(50.0)
     rig.acknowledge("vibration-x")
     rig.rms(0.0)
-    with pytest.raises(RefusedError, match=f"cannot {verb.value} vibration-x: {reason}"):
+    with pytest.raises(CommandNotAllowedError, match=f"cannot {verb.value} vibration-x: {reason}"):
         rig.ask(verb, "vibration-x")
 
 
@@ -136,9 +136,9 @@ def test_what_is_covered_is_neither_acknowledged_nor_reset(verb):
     rig = AlarmRig(LEVEL)
     rig.rms(50.0)
     rig.ask(Verb.BYPASS, "vibration-x")
-    with pytest.raises(RefusedError, match="it is out of service"):
+    with pytest.raises(CommandNotAllowedError, match="it is out of service"):
         rig.ask(verb, "vibration-x")
-    with pytest.raises(RefusedError, match="it is out of service already"):
+    with pytest.raises(CommandNotAllowedError, match="it is out of service already"):
         rig.ask(Verb.BYPASS, "vibration-x")
 
 
@@ -147,10 +147,10 @@ def test_a_command_about_an_occurrence_that_is_over_changes_nothing():
     first = rig.rms(50.0)[0].occurrence
     rig.acknowledge("vibration-x", occurrence=first)
     rig.rms(0.0)
-    with pytest.raises(RefusedError, match=f"occurrence {first} is over, it is normal"):
+    with pytest.raises(CommandNotAllowedError, match=f"occurrence {first} is over, it is normal"):
         rig.shelve("vibration-x", 60.0, occurrence=first)
     second = rig.rms(50.0)[0].occurrence
-    with pytest.raises(RefusedError, match=f"occurrence {first} is over, now {second} stands"):
+    with pytest.raises(CommandNotAllowedError, match=f"occurrence {first} is over, now {second} stands"):
         rig.acknowledge("vibration-x", occurrence=first)
     assert rig.status("vibration-x").state is S.ACTIVE_UNACKNOWLEDGED
 

@@ -11,7 +11,7 @@ from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import EventKind, Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.states import AlarmState, Level, RefusedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.diagnosis.record import Diagnosis
 
 MACHINE = Identity("lab", "edge-1", "rig")
@@ -114,7 +114,7 @@ def test_a_latched_alarm_keeps_its_worst_level_and_refuses_reset_while_it_stands
     desk = Desk(LATCHING)
     desk.rms(70.0)
     assert desk.rms(50.0) == []
-    with pytest.raises(RefusedError, match="cannot reset vibration-x: its condition still stands"):
+    with pytest.raises(CommandNotAllowedError, match="cannot reset vibration-x: its condition still stands"):
         desk.reset("vibration-x")
     [latched] = desk.rms(0.0)
     assert (latched.kind, latched.to_state) == (K.LATCHED, S.LATCHED_UNACKNOWLEDGED)
@@ -179,7 +179,7 @@ def test_a_sensor_that_is_not_ok_suppresses_what_rests_on_it_and_nothing_else():
     assert "gap voltage is -0.1 V" in events[1].message
     assert desk.manager.alarms["vibration-y"].state is S.NORMAL
     assert desk.mode("F1L3", "danger") == []
-    with pytest.raises(RefusedError, match="it is suppressed"):
+    with pytest.raises(CommandNotAllowedError, match="it is suppressed"):
         desk.acknowledge("vibration-x")
     events = desk.rms(30.0)
     assert kinds(events) == [
@@ -231,9 +231,11 @@ def test_wrong_wiring_is_refused():
     desk = Desk(LEVEL)
     with pytest.raises(ValueError, match="machine 'other'"):
         desk.take(machine="other", detector="levels/probe-x", decision="normal")
-    with pytest.raises(RefusedError, match="no alarm is named 'vibration-z'; there are: vibration-x"):
+    with pytest.raises(
+        CommandNotAllowedError, match="no alarm is named 'vibration-z'; there are: vibration-x"
+    ):
         desk.acknowledge("vibration-z")
-    with pytest.raises(RefusedError, match="never been raised"):
+    with pytest.raises(CommandNotAllowedError, match="never been raised"):
         desk.acknowledge("vibration-x")
 
 

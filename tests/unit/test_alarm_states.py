@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from daqsvc.alarms.states import AlarmState, Hold, Level, RefusedError, Stimulus, shown, transition
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level, Stimulus, shown, transition
 
 S = AlarmState
 OWN = [
@@ -61,19 +61,19 @@ def test_what_the_data_says_never_fails_and_clearing_never_activates():
 
 @pytest.mark.parametrize("state", [S.ACTIVE_UNACKNOWLEDGED, S.ACTIVE_ACKNOWLEDGED])
 def test_a_standing_condition_refuses_reset(state):
-    with pytest.raises(RefusedError, match="condition still stands"):
+    with pytest.raises(CommandNotAllowedError, match="condition still stands"):
         transition(state, Stimulus.RESET, latching=True)
 
 
 @pytest.mark.parametrize("state", [S.NORMAL, S.RETURNED_UNACKNOWLEDGED])
 def test_nothing_to_reset(state):
-    with pytest.raises(RefusedError, match="nothing to reset"):
+    with pytest.raises(CommandNotAllowedError, match="nothing to reset"):
         transition(state, Stimulus.RESET, latching=True)
 
 
 @pytest.mark.parametrize("state", [S.NORMAL, S.ACTIVE_ACKNOWLEDGED, S.LATCHED_ACKNOWLEDGED])
 def test_nothing_to_acknowledge(state):
-    with pytest.raises(RefusedError, match="nothing to acknowledge"):
+    with pytest.raises(CommandNotAllowedError, match="nothing to acknowledge"):
         transition(state, Stimulus.ACKNOWLEDGE, latching=True)
 
 

@@ -18,7 +18,7 @@ from orbit_files import AMPLITUDE_UM, RATE_HZ, SPEED_RPM, Orbit
 
 from daqsvc.analysis import progress, quality
 from daqsvc.analysis.many import Outcome, WorkerLostError, judge_all
-from daqsvc.analysis.progress import Patience
+from daqsvc.analysis.progress import ProgressInterval
 from daqsvc.analysis.result import finite
 from daqsvc.analysis.rotor import analyse, posterior
 from daqsvc.analysis.setup import RefusedError, RotorSetup
@@ -142,7 +142,7 @@ def test_a_bar_is_shown_to_a_person_who_waits(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     monkeypatch.setitem(progress.__dict__, "_RichBar", _without_rich)
     terminal, pipe = Terminal(), io.StringIO()
-    bars = [Patience("file", terminal), Patience("file", pipe)]
+    bars = [ProgressInterval("file", terminal), ProgressInterval("file", pipe)]
     for bar in bars:
         bar.update(1, 4)
     assert terminal.getvalue() == ""
@@ -163,7 +163,7 @@ def _without_rich(_label: str, _stream: io.StringIO) -> None:
 def test_the_bar_of_rich_is_taken_where_there_is_one() -> None:
     pytest.importorskip("rich")
     terminal = Terminal()
-    bar = Patience("recordings", terminal, patience_s=0.0)
+    bar = ProgressInterval("recordings", terminal, patience_s=0.0)
     bar.update(1, 2)
     bar.close()
     assert "recordings" in terminal.getvalue()

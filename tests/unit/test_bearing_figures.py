@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from sim_hw.reproduce.bearing.experiment import RACES, Experiment, run
+from sim_hw.reproduce.bearing.experiment import RACES, BearingExperiment, run
 
 
 @pytest.fixture(scope="module")
-def experiment() -> Experiment:
+def experiment() -> BearingExperiment:
     return run(seed=1, snr_db=20.0)
 
 

@@ -32,9 +32,9 @@ def rig(*, clockwise):
 
 def samples(*, clockwise):
     """Float32 ``[n, 3]`` of a rotor that loses damping, or of its mirror image."""
-    lost = plant.RotorParameters(damping_ratio=0.10)
+    lost = plant.PlantParameters(damping_ratio=0.10)
     motion = plant.simulate(
-        plant.RotorParameters(),
+        plant.PlantParameters(),
         [plant.Change(ONSET_REV, lost)],
         revolutions=REVOLUTIONS,
         samples_per_rev=PER_REV,

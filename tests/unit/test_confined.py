@@ -12,7 +12,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from daqsvc.confined.limits import FREE_BYTES, Budget, Limits, TooLargeError
+from daqsvc.confined.limits import FREE_BYTES, Budget, ResourceLimits, TooLargeError
 from daqsvc.confined.process import ConfinedError, ConfinedProcess, RaisedThereError
 
 MEMORY = 300_000_000
@@ -138,13 +138,13 @@ def test_nothing_of_the_working_directory_is_run(tmp_path, monkeypatch):
 
 
 def test_a_budget_is_bounded_by_the_file_and_by_memory():
-    small = Budget(1_000, Limits(10**12).content_bytes)
+    small = Budget(1_000, ResourceLimits(10**12).content_bytes)
     small.check_declared(FREE_BYTES)
     with pytest.raises(TooLargeError, match="its 1 kB says that it unpacks to 64 MB, 200 times and more"):
         small.check_declared(FREE_BYTES + 1)
     small.take(FREE_BYTES)
     with pytest.raises(TooLargeError, match="its 1 kB unpacks to more than 64 MB"):
         small.take(1)
-    large = Budget(10**9, Limits(10**9).content_bytes)
+    large = Budget(10**9, ResourceLimits(10**9).content_bytes)
     with pytest.raises(TooLargeError, match=r"500 MB may be read; allow more memory \(--max-memory"):
         large.check_declared(0.6e9)

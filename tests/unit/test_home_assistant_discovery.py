@@ -105,7 +105,7 @@ def test_an_earlier_message_that_is_none_removes_nothing(earlier):
 def said():
     """What the detectors of the example rig say in the end, by the topic that it goes to."""
     rig = machine(LAVAL)
-    motion = plant.simulate(plant.RotorParameters(), [], revolutions=20.0, samples_per_rev=64.0)
+    motion = plant.simulate(plant.PlantParameters(), [], revolutions=20.0, samples_per_rev=64.0)
     rng = np.random.default_rng(0)
     x, y = (um + 2.0 * rng.standard_normal(len(um)) for um in motion.in_um(100.0))
     samples = np.column_stack((x, y, keyphasor_voltage(motion.revolution))).astype(np.float32)

@@ -56,8 +56,8 @@ def test_the_documented_status_has_the_figures_of_the_example_rig(tmp_path):
 def said():
     """What the detectors of the example rig say, by detector, as its rotor loses damping in the end."""
     motion = plant.simulate(
-        plant.RotorParameters(),
-        [plant.Change(15.0, plant.RotorParameters(damping_ratio=0.10))],
+        plant.PlantParameters(),
+        [plant.Change(15.0, plant.PlantParameters(damping_ratio=0.10))],
         revolutions=30.0,
         samples_per_rev=64.0,
     )

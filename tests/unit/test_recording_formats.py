@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat, wavfile
 
-from daqsvc.confined.limits import Budget, Limits
+from daqsvc.confined.limits import Budget, ResourceLimits
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats.parquet import read_parquet
 from daqsvc.recording.recording import list_channels, load_recording
@@ -158,7 +158,7 @@ def test_parquet_needs_its_extra(tmp_path, monkeypatch):
     with pytest.raises(
         RecordingError, match=r"needs pyarrow; install it with: pip install 'daqsvc\[parquet\]'"
     ):
-        read_parquet(path, Budget.of(path, Limits()))
+        read_parquet(path, Budget.of(path, ResourceLimits()))
 
 
 # Text tables.

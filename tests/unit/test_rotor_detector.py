@@ -50,9 +50,9 @@ def detector(*, angles=(0.0, 90.0), speed_rpm=600.0, **options):
 
 def channels(changes=(), *, revolutions=20.0, w=1.0, angles=(0.0, 90.0), seed=0, noise_um=NOISE_UM):
     """Float32 ``[n, 3]`` of a simulated rotor; ``changes`` are pairs of revolution and damping ratio."""
-    steps = [plant.Change(at, plant.RotorParameters(damping_ratio=z, speed_ratio=w)) for at, z in changes]
+    steps = [plant.Change(at, plant.PlantParameters(damping_ratio=z, speed_ratio=w)) for at, z in changes]
     motion = plant.simulate(
-        plant.RotorParameters(speed_ratio=w), steps, revolutions=revolutions, samples_per_rev=PER_REV / w
+        plant.PlantParameters(speed_ratio=w), steps, revolutions=revolutions, samples_per_rev=PER_REV / w
     )
     return channels_of(motion, noise_um, seed, angles)
 

@@ -162,7 +162,7 @@ def test_departure_is_said_before_its_cause():
 
 
 def test_calibration_puts_the_measured_machine_into_every_mode():
-    machine = plant.RotorParameters(eccentricity=0.125, heavy_spot_deg=70.0, gravity=0.04, side_load=0.05)
+    machine = plant.PlantParameters(eccentricity=0.125, heavy_spot_deg=70.0, gravity=0.04, side_load=0.05)
     run = runs.run([(45.0, {"damping_ratio": 0.10})], 70.0, 6, healthy=machine)
     samples = run.channels(0.0, 6)
     subject = detector(calibrate_revolutions=20)

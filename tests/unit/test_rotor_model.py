@@ -90,7 +90,7 @@ def test_impossible_contact_is_refused():
 
 @pytest.mark.parametrize("speed_ratio", [0.7, 1.0, 1.4])
 def test_orbit_is_where_the_plant_settles(speed_ratio):
-    parameters = plant.RotorParameters(
+    parameters = plant.PlantParameters(
         damping_ratio=0.18,
         stiffness=0.9,
         speed_ratio=speed_ratio,
@@ -136,9 +136,9 @@ def test_rub_model_follows_the_plant_with_its_own_integrator(monkeypatch):
     monkeypatch.setattr(discretise, "_MIN_SUBSTEPS_PER_REV", 1024)
     observers, rub = rub_observers()
     motion = plant.simulate(
-        plant.RotorParameters(damping_ratio=0.02),
+        plant.PlantParameters(damping_ratio=0.02),
         revolutions=8.0,
-        initial=plant.RotorParameters().steady_state(),
+        initial=plant.PlantParameters().steady_state(),
     )
     z = motion.x + 1j * motion.y
     assert np.abs(z).max() > 1.02, "the plant must touch its housing for this test to mean anything"
@@ -164,9 +164,9 @@ def test_matched_observer_stays_on_the_rubbing_plant(monkeypatch):
     observers, _ = rub_observers()
     assert observers["substeps"].tolist() == [0, 8]
     motion = plant.simulate(
-        plant.RotorParameters(damping_ratio=0.02),
+        plant.PlantParameters(damping_ratio=0.02),
         revolutions=100.0,
-        initial=plant.RotorParameters().steady_state(),
+        initial=plant.PlantParameters().steady_state(),
     )
     xy = np.column_stack((motion.x, motion.y))
     angle = 2 * math.pi * motion.revolution

@@ -43,9 +43,9 @@ def detector(*, angles=(0.0, 90.0), speed_rpm=RPM, reference=KEYPHASOR, rotor=RO
 
 def channels(*changes, revolutions=110.0, seed=0, noise_um=NOISE_UM, w=W, angles=(0.0, 90.0)):
     """Float32 ``[n, 3]`` of a simulated rotor; changes are pairs of revolution and parameters."""
-    steps = [plant.Change(at, plant.RotorParameters(**{**HEALTHY, **new})) for at, new in changes]
+    steps = [plant.Change(at, plant.PlantParameters(**{**HEALTHY, **new})) for at, new in changes]
     motion = plant.simulate(
-        plant.RotorParameters(**{**HEALTHY, "speed_ratio": w}),
+        plant.PlantParameters(**{**HEALTHY, "speed_ratio": w}),
         steps,
         revolutions=revolutions,
         samples_per_rev=PER_REV * W / w,
@@ -106,7 +106,7 @@ def test_a_change_is_told_at_once_and_named_when_it_has_settled(grown):
         assert d.first_index <= d.end_index
         assert d.t_ns == pytest.approx((d.end_index - 1) * PERIOD_NS, abs=1000)
     last = said[-1].statistics
-    orbit = abs(plant.RotorParameters(**HEALTHY, eccentricity=0.175).orbit_1x) * 100.0
+    orbit = abs(plant.PlantParameters(**HEALTHY, eccentricity=0.175).orbit_1x) * 100.0
     assert last["1x.amplitude"] == pytest.approx(orbit, rel=0.03)
     assert (last["mean.x"], last["mean.y"]) == pytest.approx((0.0, -10.0), abs=0.5)
     assert last["speed"] == pytest.approx(RPM, rel=1e-3)

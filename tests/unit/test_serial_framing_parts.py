@@ -9,7 +9,7 @@ import pytest
 
 from drivers.frames import FrameLayout, LayoutError
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import LATEST_S, DeviceTime, LineFraming, LineLayout
+from drivers.serial.lines import LATEST_S, DeviceTime, LineFraming, TextLayout
 
 
 def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:
@@ -24,9 +24,9 @@ def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:
     )
 
 
-def line(**changes) -> LineLayout:
+def line(**changes) -> TextLayout:
     values = {"columns": ("seq", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
-    return LineLayout(**(values | {"counter": "seq"} | changes))
+    return TextLayout(**(values | {"counter": "seq"} | changes))
 
 
 # The check values of the catalogue of parametrised CRC algorithms: the CRC of "123456789".
@@ -132,7 +132,7 @@ def test_what_cannot_work_is_refused(make, message):
 
 def test_a_sentence_of_a_gps_receiver_is_a_line():
     gll = line(columns=("lat", "ns", "lon", "ew", "utc", "status"), channels=("lat", "lon"), counter="utc")
-    gll = LineLayout(gll.columns, gll.channels, np.ones(2), np.zeros(2), counter="utc", prefix="$GPGLL")
+    gll = TextLayout(gll.columns, gll.channels, np.ones(2), np.zeros(2), counter="utc", prefix="$GPGLL")
     framing = LineFraming({"a": gll}, {"a": 1.0}, "xor")
     found = framing.cut(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*28\r\n")
     decoded = found.frames["a"].decoded
@@ -145,7 +145,7 @@ def test_a_sentence_of_a_gps_receiver_is_a_line():
 
 def test_records_with_another_delimiter_are_lines_too():
     # As a telephone's logger wrote them: three averages, three accelerations in m/s^2, ms.
-    layout = LineLayout(
+    layout = TextLayout(
         ("ax", "ay", "az", "x", "y", "z", "t"), ("x", "y", "z"), np.ones(3), np.zeros(3), time="t"
     )
     framing = LineFraming({"a": layout}, {"a": 30.0}, delimiter=b";")

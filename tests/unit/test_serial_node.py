@@ -11,7 +11,7 @@ import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.serial import reader as serial_reader
-from drivers.serial.lines import LineFraming, LineLayout
+from drivers.serial.lines import LineFraming, TextLayout
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
@@ -19,7 +19,7 @@ from sim_hw.nodes.serial_node import SerialNode
 if TYPE_CHECKING:
     from pathlib import Path
 
-LAYOUT = LineLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq", decimals=0)
+LAYOUT = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq", decimals=0)
 
 
 def node(cable: PseudoTerminal, samples: np.ndarray, **options) -> SerialNode:

@@ -10,7 +10,7 @@ from daqsvc import assembly_drivers
 from daqsvc.settings import load_machine_file, parse_machine_file
 from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialLayout
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import LineLayout as DriverLines
+from drivers.serial.lines import TextLayout as DriverLines
 
 SERIAL = MACHINES / "serial-probes.toml"
 COBS = 'framing = "cobs"                 # "cobs", "sync" (with sync_word = "a55a") or "lines"'

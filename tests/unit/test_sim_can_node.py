@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.frames import FrameLayout
 from sim_hw.link_faults import FaultCounts
-from sim_hw.node_faults import Babble, NodeFaults, Window
+from sim_hw.node_faults import Babble, FaultWindow, NodeFaults
 from sim_hw.nodes.can_node import CanNode
 
 LAYOUT = FrameLayout.plain(
@@ -110,7 +110,7 @@ async def test_a_bus_that_opens_after_its_node_has_left_is_shut_down() -> None:
 
 async def test_a_babbling_node_s_frames_lie_between_the_device_s_own() -> None:
     wire = Wire()
-    faults = NodeFaults(babble=[Babble(Window(0.5, 1.0), 100.0, 0x7)])
+    faults = NodeFaults(babble=[Babble(FaultWindow(0.5, 1.0), 100.0, 0x7)])
     node = CanNode(wire.open(), LAYOUT, SAMPLES, 640.0, faults=faults)
     await node.play(AtOnce())
     ids = [message.arbitration_id for message in wire.sent]

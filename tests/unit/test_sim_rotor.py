@@ -10,15 +10,15 @@ from scipy.integrate import odeint, solve_ivp
 from sim_hw.plants.rotor import (
     ESCAPE_RADIUS,
     Change,
+    PlantParameters,
     RotorEscapeError,
-    RotorParameters,
     contact_force,
     simulate,
     state_derivative,
 )
 from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
 
-N = RotorParameters()
+N = PlantParameters()
 F1 = replace(N, damping_ratio=0.10)
 F1L2 = replace(N, damping_ratio=0.06)
 F1L3 = replace(N, damping_ratio=0.02)
@@ -200,7 +200,7 @@ def test_a_schedule_that_cannot_be_is_refused(changes, options, message):
 def test_parameters_out_of_range_are_named(bad):
     (name,) = bad
     with pytest.raises(ValueError, match=name):
-        RotorParameters(**bad)
+        PlantParameters(**bad)
 
 
 def test_keyphasor_rises_through_its_middle_at_shaft_angle_zero():

@@ -6,7 +6,7 @@ import pytest
 from daqsvc.settings.sensors import Accelerometer
 from sim_hw.link_faults import LinkFaults
 from sim_hw.scenario import ScenarioError, builtin_scenarios, load_scenario
-from sim_hw.scenario_bearing import BearingScenario, Damage
+from sim_hw.scenario_bearing import BearingScenario, RaceDamage
 from sim_hw.sim_command_signals import BearingSignals
 
 ACCELEROMETER = Accelerometer(name="a", stream="s", channel="c", type="accelerometer", unit="m/s2")
@@ -179,7 +179,7 @@ def test_a_bearing_that_stays_healthy_and_one_whose_damage_lies_beyond_the_end()
     )
     run = healthy.accelerations(2000.0)
     assert len(run.rotor_m_s2) == len(run.housing_m_s2) == 1000
-    damaged = healthy.model_copy(update={"damage": (Damage(part="inner", at_s=0.3),)})
+    damaged = healthy.model_copy(update={"damage": (RaceDamage(part="inner", at_s=0.3),)})
     spalled = damaged.accelerations(2000.0)
     onset = 600
     assert np.array_equal(spalled.rotor_m_s2[:onset], run.rotor_m_s2[:onset])

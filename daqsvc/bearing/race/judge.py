@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.bearing.geometry import BearingOrders
-    from daqsvc.bearing.race.track import ShaftTrack
+    from daqsvc.bearing.race.track import SpeedTrack
 
 
 LOG_OFFSET = np.float32(1e-3)
@@ -217,7 +217,7 @@ def race_features(
     )
 
 
-def _wander_note(track: ShaftTrack) -> str:
+def _wander_note(track: SpeedTrack) -> str:
     return (
         f"the speed wanders by {track.wander:.1%} within the record: followed by the harmonics of the shaft; "
         "record at a steady speed for a surer word"

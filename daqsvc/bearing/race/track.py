@@ -54,7 +54,7 @@ LEAST_POWER = 1e-300
 
 
 @dataclass(frozen=True, slots=True)
-class ShaftTrack:
+class SpeedTrack:
     """How a shaft turned over a record.
 
     Attributes:
@@ -81,7 +81,7 @@ class ShaftTrack:
         return np.asarray(np.interp(time * n, np.arange(n), series), dtype=series.dtype)
 
 
-def shaft_track(signal: Series, envelope: Series, revolutions: float) -> ShaftTrack | None:
+def shaft_track(signal: Series, envelope: Series, revolutions: float) -> SpeedTrack | None:
     """Follow a shaft; None where its harmonics are no sharper for it, as if it turns evenly.
 
     Args:
@@ -89,7 +89,7 @@ def shaft_track(signal: Series, envelope: Series, revolutions: float) -> ShaftTr
         envelope: ``[m]``, the envelope of its band over the same time.
         revolutions: of the shaft in it, as stated.
     """
-    rows = _Rows.of((signal, envelope), revolutions)
+    rows = _HarmonicSeries.of((signal, envelope), revolutions)
     if not len(rows.harmonic):
         return None
     even = rows.votes(np.zeros(rows.points))
@@ -113,11 +113,11 @@ def shaft_track(signal: Series, envelope: Series, revolutions: float) -> ShaftTr
     wander = float(np.ptp(speed))
     if wander < LEAST_WANDER or speed.min() <= 0.0:
         return None
-    return ShaftTrack(turned, wander)
+    return SpeedTrack(turned, wander)
 
 
 @dataclass(frozen=True, slots=True)
-class _Rows:
+class _HarmonicSeries:
     """1X to 4X of several series about the stated speed, shifted to zero frequency.
 
     Attributes:
@@ -142,7 +142,7 @@ class _Rows:
         return int(self.waves.shape[1])
 
     @classmethod
-    def of(cls, series: tuple[Series, ...], revolutions: float) -> _Rows:
+    def of(cls, series: tuple[Series, ...], revolutions: float) -> _HarmonicSeries:
         """Cut the harmonics out of the spectra of some series."""
         widest = max(int(np.ceil(REACH * HARMONICS[-1] * revolutions)), LEAST_REACH_BINS)
         points = scipy.fft.next_fast_len(2 * widest + 1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from daqsvc.dsp.levels import Levels
+    from daqsvc.dsp.levels import SignalLevels
 
 Bounds: TypeAlias = "Mapping[str, tuple[float, float]]"
 
@@ -26,7 +26,7 @@ LEAST_KNOWN_ERROR = 0.5
 
 
 def level_bounds(
-    found: Levels, lowest: float, highest: float, share: float
+    found: SignalLevels, lowest: float, highest: float, share: float
 ) -> dict[str, tuple[float, float]]:
     """Between what the levels of a window surely lie; empty while so few samples are missing that they count.
 

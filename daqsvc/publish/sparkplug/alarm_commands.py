@@ -38,7 +38,7 @@ MOST_AT_A_TIME = 64
 """Metrics in one message, and commands that wait, at most."""
 
 
-class Wish(NamedTuple):
+class HostCommand(NamedTuple):
     """What a host has written.
 
     Attributes:
@@ -93,16 +93,18 @@ class AlarmCommands:
         """The metrics of ``alarms`` that hosts may write, as the device has them."""
         return [metric for alarm in alarms for metric in self._metrics(f"Alarms/{alarm}")]
 
-    def meant(self, topic: str, metric: Metric, sent_ms: int | None, *, of_node: bool) -> Wish | None:
+    def meant(self, topic: str, metric: Metric, sent_ms: int | None, *, of_node: bool) -> HostCommand | None:
         """What a written metric asks for; None if hosts may not write it, or not that value."""
         begin = f"Alarms/{self._machine}/" if of_node else "Alarms/"
         name, _, part = (metric.name or "").rpartition("/")
         alarm, verb = name.removeprefix(begin), self._parts.get(part)
         if verb is None or not name.startswith(begin) or metric.value is not True or metric.historical:
             return None
-        return Wish(topic, verb, alarm, metric.timestamp_ms if metric.timestamp_ms is not None else sent_ms)
+        return HostCommand(
+            topic, verb, alarm, metric.timestamp_ms if metric.timestamp_ms is not None else sent_ms
+        )
 
-    async def carry_out(self, wish: Wish) -> bool:
+    async def carry_out(self, wish: HostCommand) -> bool:
         """Have a wish carried out, one at a time; whether it was."""
         if wish.sent_ms is None:
             log.warning("%s is refused: it does not say when it was sent", wish.topic)

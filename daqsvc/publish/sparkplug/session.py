@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.connection import Connection, Incoming
-    from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands, Wish
+    from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands, HostCommand
     from daqsvc.publish.sparkplug.codec import Metric
     from daqsvc.publish.sparkplug.memory import Memory
     from daqsvc.publish.sparkplug.metrics import Board
@@ -136,7 +136,7 @@ class EdgeSession:
         self._clock = clock
         self._counters = counters
         self._commands = commands
-        self._wishes: asyncio.Queue[Wish] = asyncio.Queue(MOST_AT_A_TIME)
+        self._wishes: asyncio.Queue[HostCommand] = asyncio.Queue(MOST_AT_A_TIME)
         self._ungranted: list[str] = []
         self._told: dict[str, Any] = {}
         self._there: Callable[[], bool] = lambda: True

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from daqsvc.confined.limits import Limits
+    from daqsvc.confined.limits import ResourceLimits
     from daqsvc.recording.contents import Contents
 
 READERS: Mapping[str, Callable[[Path, Budget], Contents]] = {
@@ -64,7 +64,7 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     return reader, status.st_size
 
 
-def read(path: Path, limits: Limits) -> Contents:
+def read(path: Path, limits: ResourceLimits) -> Contents:
     """Everything in a file.
 
     Raises:

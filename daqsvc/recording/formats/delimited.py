@@ -37,13 +37,13 @@ def read_csv(path: Path, budget: Budget) -> Contents:
     """All columns by header or number from 0; numbers stated in comments and a preamble are scalars."""
     file = TextFile(path, budget)
     try:
-        return _Table(path, file).read()
+        return _DelimitedTable(path, file).read()
     except UnicodeDecodeError:
         file.take_for_latin_1()
-        return _Table(path, file).read()
+        return _DelimitedTable(path, file).read()
 
 
-class _Table:
+class _DelimitedTable:
     """A table in a text file, which is read line by line, as it may be large.
 
     Args:

@@ -47,7 +47,7 @@ _GROWN = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Delay:
+class DetectionDelay:
     """How soon a change is seen.
 
     Attributes:
@@ -76,7 +76,7 @@ class VisibleFault:
     healthy: float
     smallest: float | None
     change_um: float | None
-    delays: tuple[Delay, ...]
+    delays: tuple[DetectionDelay, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ def vector_detectability(
     def evidence(change: Complexes, variance: Floats) -> float:
         return float(np.sum(np.abs(change) ** 2 / variance))
 
-    def visible(kind: _Kind) -> VisibleFault:
+    def visible(kind: _VectorFaultKind) -> VisibleFault:
         if ac_coupled and kind.fault == "static_load":
             return VisibleFault(kind.fault, 0.0, None, None, ())
         severity = _first(lambda x: evidence(kind.change(calibration, x), last) / threshold_nats)
@@ -198,7 +198,7 @@ def vector_detectability(
                 for m in WINDOWS
                 if evidence(change, spread.of_means(float(m), reference, 0.0)) >= threshold_nats
             )
-            delays.append(Delay(kind.quantity(calibration, one), next(windows, None)))
+            delays.append(DetectionDelay(kind.quantity(calibration, one), next(windows, None)))
         return VisibleFault(
             kind.fault,
             kind.quantity(calibration, 0.0),
@@ -219,7 +219,7 @@ def vector_detectability(
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
+class _VectorFaultKind:
     """A kind of fault by severity from 0: its quantity, what it does to the vector, and what is shown."""
 
     fault: VectorFault
@@ -267,10 +267,12 @@ def _only(component: int, value: complex) -> Complexes:
 
 
 _KINDS = (
-    _Kind("unbalance", lambda _, x: 1.0 + x, _unbalance, (0.05, 0.2, 0.5)),
-    _Kind("damping_loss", lambda c, x: c.rotor.damping_ratio * (1.0 - x), _damping, (0.1, 0.25, 0.5)),
-    _Kind("stiffness_loss", lambda _, x: 1.0 - x, _stiffness, (0.02, 0.1, 0.3)),
-    _Kind("static_load", lambda c, x: x * _load_um(c), _load, (0.05, 0.2, 0.5)),
+    _VectorFaultKind("unbalance", lambda _, x: 1.0 + x, _unbalance, (0.05, 0.2, 0.5)),
+    _VectorFaultKind(
+        "damping_loss", lambda c, x: c.rotor.damping_ratio * (1.0 - x), _damping, (0.1, 0.25, 0.5)
+    ),
+    _VectorFaultKind("stiffness_loss", lambda _, x: 1.0 - x, _stiffness, (0.02, 0.1, 0.3)),
+    _VectorFaultKind("static_load", lambda c, x: x * _load_um(c), _load, (0.05, 0.2, 0.5)),
 )
 
 

@@ -163,7 +163,7 @@ def compare_orders(
     level = _length(was.mean * _VELOCITY, was.variance * _VELOCITY**2)
     severity = _excess(change * _VELOCITY, variance * _VELOCITY**2) / level
     growth, growth_uncertainty, grown = _growth(was, now, rules)
-    residual = _Residual.of(baseline, present, rules)
+    residual = _ResidualChange.of(baseline, present, rules)
     evidence = cause_evidence(
         change * _VELOCITY, variance * _VELOCITY**2, freedom, level, growing=growth > 1.0
     )
@@ -299,7 +299,7 @@ def _growth(was: _Mean, now: _Mean, rules: OrderRules) -> tuple[float, float, bo
 
 
 @dataclass(frozen=True, slots=True)
-class _Residual:
+class _ResidualChange:
     """What is left beside the orders.
 
     Attributes:
@@ -313,7 +313,7 @@ class _Residual:
     excess: float
 
     @classmethod
-    def of(cls, baseline: OrderVectors, present: OrderVectors, rules: OrderRules) -> _Residual:
+    def of(cls, baseline: OrderVectors, present: OrderVectors, rules: OrderRules) -> _ResidualChange:
         from scipy.special import stdtrit  # noqa: PLC0415 - scipy takes long to import
 
         tiny = np.finfo(np.float64).tiny

@@ -103,7 +103,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class DepartureEvidence:
     """What the departure test says after a revolution.
 
     Attributes:
@@ -141,7 +141,7 @@ class DepartureTest:
         self._frozen: NDArray[np.complex128] | None = None
         self.count = 0
 
-    def add(self, vector: Complexes, noise: float, speed: float) -> Evidence:
+    def add(self, vector: Complexes, noise: float, speed: float) -> DepartureEvidence:
         """Take in a revolution.
 
         Args:
@@ -157,7 +157,7 @@ class DepartureTest:
             self._frozen = self._sums[last].copy()
         windows = WINDOWS[self.count - self._least >= WINDOWS]
         if not len(windows):
-            return Evidence(0.0, 0.0, 0, departed=False)
+            return DepartureEvidence(0.0, 0.0, 0, departed=False)
         before = self._sums[(self.count - windows) % (_LONGEST + 1)]
         recent = (self._sums[last] - before) / windows[:, np.newaxis]
         length = (self.count - windows).astype(np.float64)
@@ -170,7 +170,7 @@ class DepartureTest:
 
     def _judge(
         self, windows: NDArray[np.int64], recent: Complexes, length: Floats, reference: Complexes
-    ) -> Evidence:
+    ) -> DepartureEvidence:
         change = recent[:, :5] - reference[:, :5]
         speed = (recent[:, 6] - reference[:, 6]).real
         apart = self.count - (windows + length) / 2.0
@@ -183,7 +183,7 @@ class DepartureTest:
         by_vector = bool(nats[best] > self.threshold_nats)
         by_energy = bool(energy[loudest] > self.energy_threshold_nats)
         window = windows[best] if by_vector or not by_energy else windows[loudest]
-        return Evidence(
+        return DepartureEvidence(
             float(nats[best]), float(energy[loudest]), int(window), departed=by_vector or by_energy
         )
 

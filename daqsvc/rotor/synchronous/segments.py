@@ -25,7 +25,7 @@ _LASTING = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class JudgedRevolution:
     """A revolution as the watch keeps it.
 
     Attributes:
@@ -41,7 +41,7 @@ class Row:
     speed: float
 
 
-def scatter(rows: Sequence[Row]) -> Floats:
+def scatter(rows: Sequence[JudgedRevolution]) -> Floats:
     """Variance of the vectors, float64 ``[5]``; zero of too few to tell."""
     if len(rows) < _LEAST_ROWS:
         return np.zeros(5)
@@ -50,21 +50,21 @@ def scatter(rows: Sequence[Row]) -> Floats:
     return np.asarray(squares.sum(axis=0) / (len(rows) - 1))
 
 
-def noise_scatter(rows: Sequence[Row]) -> float:
+def noise_scatter(rows: Sequence[JudgedRevolution]) -> float:
     """Relative variance of the energy."""
     noise = np.array([row.noise for row in rows])
     mean = float(noise.mean())
     return float(noise.var(ddof=1)) / mean**2 if mean > 0.0 else 0.0
 
 
-def lasting_energy(rows: Sequence[Row], healthy: Calibration) -> Energy | None:
+def lasting_energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy | None:
     """The energy of the later half against the healthy one; None while it dies away."""
     half = len(rows) // 2
     earlier, later = _energy(rows[:half], healthy), _energy(rows[half:], healthy)
     return later if later.excess >= _LASTING * earlier.excess else None
 
 
-def _energy(rows: Sequence[Row], healthy: Calibration) -> Energy:
+def _energy(rows: Sequence[JudgedRevolution], healthy: Calibration) -> Energy:
     if not rows:
         return Energy()
     noise = float(np.mean([row.noise for row in rows]))

@@ -22,9 +22,9 @@ from daqsvc.rotor.synchronous.baseline import (
     compensated,
     with_more,
 )
-from daqsvc.rotor.synchronous.departure import DepartureTest, Evidence, Spread, threshold_for
+from daqsvc.rotor.synchronous.departure import DepartureEvidence, DepartureTest, Spread, threshold_for
 from daqsvc.rotor.synchronous.identify import Identification, NamingRules, identify
-from daqsvc.rotor.synchronous.segments import Row, lasting_energy, noise_scatter, scatter
+from daqsvc.rotor.synchronous.segments import JudgedRevolution, lasting_energy, noise_scatter, scatter
 from daqsvc.rotor.synchronous.steadiness import unrest
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
@@ -101,7 +101,7 @@ class WatchReport:
     revolution: int
     end_index: int
     state: State
-    evidence: Evidence | None = None
+    evidence: DepartureEvidence | None = None
     departed: bool = False
     onset_revolution: int | None = None
     identification: Identification | None = None
@@ -135,8 +135,8 @@ class RotorWatch:
         self.revolutions = 0
         self._waiting: list[SynchronousVectors] = []
         self._previous: Complexes = np.empty((0, 5), dtype=np.complex128)
-        self._rows: deque[Row] = deque(maxlen=_KEPT)
-        self._segment: list[Row] = []
+        self._rows: deque[JudgedRevolution] = deque(maxlen=_KEPT)
+        self._segment: list[JudgedRevolution] = []
         self._test: DepartureTest | None = None
         self._healthy: Calibration | None = None
         self._begun, self._middle = 0, 0.0
@@ -183,7 +183,9 @@ class RotorWatch:
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
         restless = float(unrest(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0])
         self._previous = np.vstack((self._previous[-1:], moved))
-        row = Row(self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0]))
+        row = JudgedRevolution(
+            self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0])
+        )
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration
         evidence = (
@@ -256,7 +258,7 @@ class RotorWatch:
         turn_rad = 2.0 * math.pi * self.rules.speed_uncertainty
         return replace(healthy.spread, drift=self.rules.probe_drift_um**2, turn_rad=turn_rad)
 
-    def _tests(self, row: Row) -> bool:
+    def _tests(self, row: JudgedRevolution) -> bool:
         """Whether a revolution goes into a departure test: not while a new segment settles."""
         if self._onset is None:
             return True
@@ -354,7 +356,7 @@ class RotorWatch:
         return max(noise, 1e-6 * self.calibration.amplitude_um**2)
 
     def _report(
-        self, one: SynchronousVectors, evidence: Evidence | None, *, departed: bool, looked: bool
+        self, one: SynchronousVectors, evidence: DepartureEvidence | None, *, departed: bool, looked: bool
     ) -> WatchReport:
         return WatchReport(
             revolution=self.revolutions,

@@ -44,7 +44,7 @@ BAND_HZ = np.geomspace(30.0, 10_000.0, 200)
 
 
 @dataclass(frozen=True, slots=True)
-class Experiment:
+class BearingExperiment:
     """What came out.
 
     Attributes:
@@ -88,7 +88,7 @@ def distance(race: str, path: Floats) -> Floats:
     return np.asarray(detection_unit(race).distance(path) / np.hypot(SLOPES[race], 1.0))
 
 
-def run(seed: int, snr_db: float) -> Experiment:
+def run(seed: int, snr_db: float) -> BearingExperiment:
     """Do it.
 
     Args:
@@ -111,7 +111,7 @@ def run(seed: int, snr_db: float) -> Experiment:
         model, paper_gain(model, (S2_EIGENVALUE, 2.0 * S2_EIGENVALUE)), BAND_HZ[BAND_HZ < 1000.0]
     )
     exact = residual_transfer(model, separating_gain(model, (-100.0, -200.0)), BAND_HZ)
-    return Experiment(
+    return BearingExperiment(
         time=time,
         free={race: detection_unit(race).run(quiet, STEP, start=START, implicit=False) for race in RACES},
         driven=driven,

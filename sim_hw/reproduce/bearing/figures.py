@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from sim_hw.reproduce.bearing.experiment import Experiment
+    from sim_hw.reproduce.bearing.experiment import BearingExperiment
 
     Floats = NDArray[np.float64]
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 PATH, SURFACE = {"outer": "#0072B2", "inner": "#D55E00"}, "#222222"
 
 
-def free(figure: Figure, experiment: Experiment) -> None:
+def free(figure: Figure, experiment: BearingExperiment) -> None:
     """Figure 8: the units of a healthy machine, from a start off their surfaces."""
     _draw(figure, experiment, experiment.free, "healthy case")
 
 
-def driven(figure: Figure, experiment: Experiment, fault: str) -> None:
+def driven(figure: Figure, experiment: BearingExperiment, fault: str) -> None:
     """Figures 9 and 10: both units under a fault of one race.
 
     Args:
@@ -40,7 +40,7 @@ def driven(figure: Figure, experiment: Experiment, fault: str) -> None:
     _draw(figure, experiment, paths, f"excited by {fault} raceway fault")
 
 
-def _draw(figure: Figure, experiment: Experiment, paths: Mapping[str, Floats], title: str) -> None:
+def _draw(figure: Figure, experiment: BearingExperiment, paths: Mapping[str, Floats], title: str) -> None:
     figure.set_size_inches(12.0, 9.0)
     planes, distances = figure.subplots(2, 2, height_ratios=(2.0, 1.0))
     figure.suptitle(f"Sliding-mode units, {title}", fontsize=14)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sim_hw.reproduce.bearing.experiment import RACES
-from sim_hw.reproduce.results import Row
+from sim_hw.reproduce.results import ResultRow
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sim_hw.reproduce.bearing.experiment import Experiment
+    from sim_hw.reproduce.bearing.experiment import BearingExperiment
 
 _FIGURES = {"outer": "9", "inner": "10"}
 _CHATTER = 1e-3
@@ -18,7 +18,7 @@ _APART = 100.0
 _ALIKE_DEG = 5.0
 
 
-def rows(experiment: Experiment) -> tuple[Row, ...]:
+def rows(experiment: BearingExperiment) -> tuple[ResultRow, ...]:
     """The table, in the order of the paper."""
     return (
         _directions(experiment),
@@ -31,9 +31,9 @@ def rows(experiment: Experiment) -> tuple[Row, ...]:
     )
 
 
-def _directions(experiment: Experiment) -> Row:
+def _directions(experiment: BearingExperiment) -> ResultRow:
     inner, outer = experiment.slopes["inner"], experiment.slopes["outer"]
-    return Row(
+    return ResultRow(
         name="bearing-directions",
         figure="IV",
         paper="after scaling, the fault directions are (1, 6) for the outer and (1, 2) for the inner raceway",
@@ -45,8 +45,8 @@ def _directions(experiment: Experiment) -> Row:
     )
 
 
-def _separation(experiment: Experiment) -> Row:
-    return Row(
+def _separation(experiment: BearingExperiment) -> ResultRow:
+    return ResultRow(
         name="bearing-filter-literal",
         figure="IV",
         paper="the detection filter keeps the residuals of the two faults in independent directions",
@@ -57,8 +57,8 @@ def _separation(experiment: Experiment) -> Row:
     )
 
 
-def _cure(experiment: Experiment) -> Row:
-    return Row(
+def _cure(experiment: BearingExperiment) -> ResultRow:
+    return ResultRow(
         name="bearing-filter-exact",
         figure="IV",
         paper="",
@@ -70,10 +70,10 @@ def _cure(experiment: Experiment) -> Row:
     )
 
 
-def _free(experiment: Experiment) -> Iterator[Row]:
+def _free(experiment: BearingExperiment) -> Iterator[ResultRow]:
     for letter, race in zip("ab", RACES, strict=True):
         chatter = experiment.healthy(race)
-        yield Row(
+        yield ResultRow(
             name=f"bearing-free-{race}",
             figure=f"8({letter})",
             paper="the trajectory reaches the sliding surface and chatters to the origin along it",
@@ -84,11 +84,11 @@ def _free(experiment: Experiment) -> Iterator[Row]:
         )
 
 
-def _driven(experiment: Experiment) -> Iterator[Row]:
+def _driven(experiment: BearingExperiment) -> Iterator[ResultRow]:
     for fault in RACES:
         other = RACES[1 - RACES.index(fault)]
         stays, leaves = experiment.leaving(fault, fault), experiment.leaving(fault, other)
-        yield Row(
+        yield ResultRow(
             name=f"bearing-driven-{fault}",
             figure=_FIGURES[fault],
             paper=f"under an {fault} raceway fault the {fault} unit stays along its surface, the {other} "
@@ -107,9 +107,9 @@ def _driven(experiment: Experiment) -> Iterator[Row]:
         )
 
 
-def _ball(experiment: Experiment) -> Row:
+def _ball(experiment: BearingExperiment) -> ResultRow:
     ball, both = experiment.verdicts["ball"], experiment.verdicts["inner_and_outer"]
-    return Row(
+    return ResultRow(
         name="bearing-ball",
         figure="V",
         paper="a ball fault is detected too, but not told from inner and outer raceway faults together",
@@ -121,10 +121,10 @@ def _ball(experiment: Experiment) -> Row:
     )
 
 
-def _service(experiment: Experiment) -> Row:
+def _service(experiment: BearingExperiment) -> ResultRow:
     said = {fault: experiment.verdicts[fault] for fault in ("healthy", "inner", "outer")}
     right = sum(said[f] == expected for f, expected in zip(said, ("normal", "inner", "outer"), strict=True))
-    return Row(
+    return ResultRow(
         name="bearing-service",
         figure="V",
         paper="detects and diagnoses inner and outer raceway faults",

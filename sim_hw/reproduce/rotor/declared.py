@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.decision import DecisionRules
-from sim_hw.reproduce.results import Row
+from sim_hw.reproduce.results import ResultRow
 from sim_hw.reproduce.rotor.detection import delays_rev, wrong_changes
 from sim_hw.reproduce.rotor.setup import MODES, SNR_DB, in_decibels, spoken
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from daqsvc.rotor.decision import Rule
-    from sim_hw.reproduce.rotor.experiment import Experiment
+    from sim_hw.reproduce.rotor.experiment import RotorExperiment
 
 THRESHOLD = DecisionRules().probability_threshold
 _NONE_SEEN = 3.0
 """Events that may be expected where none is seen, with 95 % confidence."""
 
 
-def rows(experiment: Experiment) -> Iterable[Row]:
+def rows(experiment: RotorExperiment) -> Iterable[ResultRow]:
     """This part of the table."""
     yield from _declarations(experiment)
     yield from _order(experiment)
@@ -31,12 +31,12 @@ def rows(experiment: Experiment) -> Iterable[Row]:
     yield from _wrong(experiment)
 
 
-def _declarations(experiment: Experiment) -> Iterable[Row]:
+def _declarations(experiment: RotorExperiment) -> Iterable[ResultRow]:
     declared = experiment.trace.declared
     at = np.flatnonzero(declared >= 0)
     per_rev = len(at) / experiment.end_rev
     reset = 1.0 / len(MODES)
-    yield Row(
+    yield ResultRow(
         name="saw-tooth",
         figure="6, 7",
         paper=f"at a declaration all probabilities are reset to {reset:g}",
@@ -49,7 +49,7 @@ def _declarations(experiment: Experiment) -> Iterable[Row]:
     for i, mode in enumerate(MODES):
         inside = declared[experiment.samples_of(mode)]
         shares[mode] = float((inside[inside >= 0] == i).mean()) if (inside >= 0).any() else 0.0
-    yield Row(
+    yield ResultRow(
         name="declared-rightly",
         figure="6, 7",
         paper=f"a mode is detected when its probability exceeds {THRESHOLD:g}",
@@ -68,7 +68,7 @@ _SPOKEN_RULES: dict[Rule, str] = {
 }
 
 
-def _order(experiment: Experiment) -> Iterable[Row]:
+def _order(experiment: RotorExperiment) -> Iterable[ResultRow]:
     """When each mode was first declared rightly in the run that is shown."""
     for rule, spoken_rule in _SPOKEN_RULES.items():
         changes = experiment.shown[rule].changes
@@ -80,7 +80,7 @@ def _order(experiment: Experiment) -> Iterable[Row]:
             + (f"{2.0 * math.pi * (begin + delay):.0f} s" if math.isfinite(delay) else "never")
             for mode, begin, delay in zip(MODES, experiment.begins_rev, delays.tolist(), strict=True)
         ]
-        yield Row(
+        yield ResultRow(
             name=f"order-{rule}",
             figure="6, 7",
             paper="N, F1, F1 L2 and F1 L3 are detected one after the other" if rule == "paper" else "",
@@ -99,7 +99,7 @@ def _order(experiment: Experiment) -> Iterable[Row]:
         )
 
 
-def _delays(experiment: Experiment) -> Iterable[Row]:
+def _delays(experiment: RotorExperiment) -> Iterable[ResultRow]:
     for rule, spoken_rule in _SPOKEN_RULES.items():
         medians, reached = {}, []
         for snr_db in SNR_DB:
@@ -108,7 +108,7 @@ def _delays(experiment: Experiment) -> Iterable[Row]:
             medians[snr_db] = np.median(delays, axis=0).tolist()
             reached.append(float(np.isfinite(delays).mean()))
         draws = len(experiment.statistics[rule, SNR_DB[0]])
-        yield Row(
+        yield ResultRow(
             name=f"delays-{rule}",
             figure="6, 7",
             paper="the signal has -5 to 5 dB" if rule == "paper" else "",
@@ -130,7 +130,7 @@ def _delays(experiment: Experiment) -> Iterable[Row]:
         )
 
 
-def _wrong(experiment: Experiment) -> Iterable[Row]:
+def _wrong(experiment: RotorExperiment) -> Iterable[ResultRow]:
     for rule, spoken_rule in _SPOKEN_RULES.items():
         per_1000_rev = {}
         for snr_db in SNR_DB:
@@ -138,7 +138,7 @@ def _wrong(experiment: Experiment) -> Iterable[Row]:
             total = sum(wrong_changes(run.changes, experiment.begins_rev) for run in runs)
             watched = len(runs) * experiment.end_rev
             per_1000_rev[snr_db] = 1000.0 * total / watched
-        yield Row(
+        yield ResultRow(
             name=f"wrong-{rule}",
             figure="6, 7",
             paper="",

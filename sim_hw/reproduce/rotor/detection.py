@@ -27,7 +27,7 @@ _EXCUSED_REV = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class Trace:
+class DetectionTrace:
     """The paper's rule, sample by sample.
 
     Attributes:
@@ -40,7 +40,7 @@ class Trace:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class DetectionRun:
     """One run of the bank over the whole schedule.
 
     Attributes:
@@ -62,7 +62,7 @@ def new_bank(rule: Rule, noise: float) -> ModelBank:
     return ModelBank(hypotheses(rule), noise=noise, duration=SAMPLE, rules=DecisionRules(rule=rule))
 
 
-def trace(xy: Floats, angle_rad: Floats, noise: float) -> Trace:
+def trace(xy: Floats, angle_rad: Floats, noise: float) -> DetectionTrace:
     """Follow the paper's rule through a measurement, sample by sample.
 
     Args:
@@ -80,10 +80,10 @@ def trace(xy: Floats, angle_rad: Floats, noise: float) -> Trace:
         probabilities[k] = report.probabilities
         if report.paper_declarations:
             declared[k] = report.decision
-    return Trace(probabilities, declared)
+    return DetectionTrace(probabilities, declared)
 
 
-def run(bank: ModelBank, xy: Floats, angle_rad: Floats) -> Run:
+def run(bank: ModelBank, xy: Floats, angle_rad: Floats) -> DetectionRun:
     """A bank over a whole measurement at once.
 
     Args:
@@ -93,7 +93,7 @@ def run(bank: ModelBank, xy: Floats, angle_rad: Floats) -> Run:
     """
     report = copy.deepcopy(bank).process(xy, np.cos(angle_rad), np.sin(angle_rad))
     changes = tuple((change.sample, change.mode) for change in report.declarations)
-    return Run(changes, report.paper_declarations)
+    return DetectionRun(changes, report.paper_declarations)
 
 
 def delays_rev(changes: Sequence[tuple[int, int]], begins_rev: Sequence[float], end_rev: float) -> Floats:
@@ -103,7 +103,7 @@ def delays_rev(changes: Sequence[tuple[int, int]], begins_rev: Sequence[float], 
     declared before the next began has an infinite one.
 
     Args:
-        changes: as in `Run`.
+        changes: as in `DetectionRun`.
         begins_rev: revolution at which each of the modes begins, the healthy one first.
         end_rev: end of the run.
 
@@ -128,7 +128,7 @@ def wrong_changes(changes: Sequence[tuple[int, int]], begins_rev: Sequence[float
     The mode before a change is excused for three revolutions; a mode that is passed on the way counts.
 
     Args:
-        changes: as in `Run`.
+        changes: as in `DetectionRun`.
         begins_rev: revolution at which each of the modes begins, the healthy one first.
     """
     wrong = 0

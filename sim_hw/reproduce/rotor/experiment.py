@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.decision import Rule
-    from sim_hw.reproduce.rotor.detection import Run, Trace
+    from sim_hw.reproduce.rotor.detection import DetectionRun, DetectionTrace
     from sim_hw.reproduce.rotor.observers import Estimates
 
     Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ _FINER = 8
 
 
 @dataclass(frozen=True)
-class Experiment:
+class RotorExperiment:
     """What the plant did, and what observers and bank made of it.
 
     Attributes:
@@ -76,9 +76,9 @@ class Experiment:
     y: Floats
     measured: Floats
     estimates: Mapping[str, Estimates]
-    trace: Trace
-    shown: Mapping[Rule, Run]
-    statistics: Mapping[tuple[Rule, float], tuple[Run, ...]]
+    trace: DetectionTrace
+    shown: Mapping[Rule, DetectionRun]
+    statistics: Mapping[tuple[Rule, float], tuple[DetectionRun, ...]]
     settled: motion.SettledRub
     escape: motion.Escape
     whirl_of_observer: float
@@ -101,7 +101,7 @@ class Experiment:
         return np.column_stack((self.x - estimates.x, self.y - estimates.y))
 
 
-def run(seed: int, snr_db: float) -> Experiment:
+def run(seed: int, snr_db: float) -> RotorExperiment:
     """Do the experiment.
 
     Args:
@@ -124,7 +124,7 @@ def run(seed: int, snr_db: float) -> Experiment:
     measured = true + noise * np.random.default_rng(shown_draw).normal(size=true.shape)
 
     onset_of_rub = plant("F1L2").steady_state()
-    return Experiment(
+    return RotorExperiment(
         snr_db=snr_db,
         noise=noise,
         begins_rev=begins,
@@ -152,10 +152,10 @@ def run(seed: int, snr_db: float) -> Experiment:
 
 def _statistics(
     true: Floats, tau: Floats, amplitude: float, draws: np.random.SeedSequence
-) -> dict[tuple[Rule, float], tuple[Run, ...]]:
+) -> dict[tuple[Rule, float], tuple[DetectionRun, ...]]:
     """The bank on many draws of the noise: the same draws at every ratio and under both rules."""
     normal = [np.random.default_rng(draw).normal(size=true.shape) for draw in draws.spawn(NOISE_DRAWS)]
-    runs: dict[tuple[Rule, float], tuple[Run, ...]] = {}
+    runs: dict[tuple[Rule, float], tuple[DetectionRun, ...]] = {}
     for snr_db in SNR_DB:
         noise = noise_sigma(amplitude, snr_db)
         for rule in detection.RULES:

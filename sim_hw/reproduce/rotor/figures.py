@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.decision import Rule
-    from sim_hw.reproduce.rotor.experiment import Experiment
+    from sim_hw.reproduce.rotor.experiment import RotorExperiment
 
     Floats = NDArray[np.float64]
     Pair = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
@@ -41,7 +41,7 @@ _CLOSE_UP_REV = (-3.0, 7.0)
 """Span of a close-up about a change of the process."""
 
 
-def observer(figure: Figure, experiment: Experiment, mode: str) -> None:
+def observer(figure: Figure, experiment: RotorExperiment, mode: str) -> None:
     """Figures 4 and 5: a mode's observer against the process.
 
     Args:
@@ -108,7 +108,7 @@ def _housing(axes: Axes) -> None:
     axes.plot(np.cos(angle), np.sin(angle), "--", color="#888888", linewidth=1, label="housing")
 
 
-def _errors(axes: tuple[Axes, Axes], experiment: Experiment, mode: str) -> None:
+def _errors(axes: tuple[Axes, Axes], experiment: RotorExperiment, mode: str) -> None:
     """Error of the observer in both directions, and behind it the innovations that it sees."""
     part = experiment.samples_of("N")
     if mode == "F1L3":
@@ -140,7 +140,7 @@ def _mark(axes: Axes, tau: float, colour: str, label: str) -> None:
     axes.axvline(tau, color=colour, linewidth=1.2, linestyle="--", label=label)
 
 
-def probabilities(figure: Figure, experiment: Experiment, modes: tuple[str, str]) -> None:
+def probabilities(figure: Figure, experiment: RotorExperiment, modes: tuple[str, str]) -> None:
     """Figures 6 and 7: probabilities of two modes, over the whole run and about the change.
 
     Args:
@@ -174,7 +174,7 @@ def probabilities(figure: Figure, experiment: Experiment, modes: tuple[str, str]
         _declarations(close, experiment, change)
 
 
-def _saw_teeth(experiment: Experiment, mode: int) -> tuple[Floats, Floats]:
+def _saw_teeth(experiment: RotorExperiment, mode: int) -> tuple[Floats, Floats]:
     """Normalised time and probability of a mode, with a tooth's tip at the threshold where it is declared.
 
     The bank says a probability after its reset; just before it, that of the declared mode had
@@ -185,7 +185,7 @@ def _saw_teeth(experiment: Experiment, mode: int) -> tuple[Floats, Floats]:
     return tau, np.insert(experiment.trace.probabilities[:, mode], tips, THRESHOLD)
 
 
-def _periods(axes: Axes, experiment: Experiment) -> None:
+def _periods(axes: Axes, experiment: RotorExperiment) -> None:
     """Colours for the mode that the process is in."""
     marks = [2.0 * math.pi * rev for rev in (*experiment.begins_rev, experiment.end_rev)]
     for mode, (begin, end) in zip(MODES, itertools.pairwise(marks), strict=True):
@@ -197,7 +197,7 @@ def _periods(axes: Axes, experiment: Experiment) -> None:
             axes.text(sum(shown) / 2, 0.94, spoken(mode), color=MODE_COLOURS[mode], ha="center", va="bottom")
 
 
-def _declarations(axes: Axes, experiment: Experiment, change: int) -> None:
+def _declarations(axes: Axes, experiment: RotorExperiment, change: int) -> None:
     """Where either rule first declares the mode that has begun, and how many revolutions that took."""
     styles: dict[Rule, tuple[str, str]] = {"paper": ("^", "the paper's rule"), "cusum": ("v", "CUSUM")}
     for rule, (marker, name) in styles.items():

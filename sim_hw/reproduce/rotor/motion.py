@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from sim_hw.plants.rotor import RotorParameters, contact_force, simulate, state_derivative
+from sim_hw.plants.rotor import PlantParameters, contact_force, simulate, state_derivative
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,7 +79,7 @@ class SettledRub:
     growth_per_rev: float
 
 
-def settled_rub(rotor: RotorParameters, start: Floats, samples_per_rev: int) -> SettledRub:
+def settled_rub(rotor: PlantParameters, start: Floats, samples_per_rev: int) -> SettledRub:
     """Watch a rotor that rubs until it has settled, and from then on.
 
     Args:
@@ -116,7 +116,7 @@ def settled_rub(rotor: RotorParameters, start: Floats, samples_per_rev: int) -> 
     )
 
 
-def _positions(rotor: RotorParameters, start: Floats, revolutions: float, samples_per_rev: int) -> Complexes:
+def _positions(rotor: PlantParameters, start: Floats, revolutions: float, samples_per_rev: int) -> Complexes:
     motion = simulate(rotor, revolutions=revolutions, samples_per_rev=samples_per_rev, initial=start)
     return motion.x + 1j * motion.y
 
@@ -145,7 +145,7 @@ def _curve_residual(section: Complexes, rotation_per_rev: float) -> float:
     return float(np.sqrt(np.mean(np.abs(section[half:] - basis[half:] @ curve) ** 2)))
 
 
-def whirl_of_model(rotor: RotorParameters, start: Floats, samples_per_rev: int) -> float:
+def whirl_of_model(rotor: PlantParameters, start: Floats, samples_per_rev: int) -> float:
     """Whirl of a rotor that is left to itself, per revolution, once it has settled.
 
     Args:
@@ -170,7 +170,7 @@ class Escape:
     escape_rev: float
 
 
-def escape_with_printed_signs(rotor: RotorParameters, start: Floats) -> Escape:
+def escape_with_printed_signs(rotor: PlantParameters, start: Floats) -> Escape:
     """The state equation as printed, ``x' = Ax + Bu + gamma f(Cx)``: the housing pulls the disc outwards.
 
     Args:
@@ -209,7 +209,7 @@ def escape_with_printed_signs(rotor: RotorParameters, start: Floats) -> Escape:
     return Escape(contact / per_rev, (escape - contact) / per_rev)
 
 
-def rub_limit(rotor: RotorParameters) -> float:
+def rub_limit(rotor: PlantParameters) -> float:
     """Damping ratio below which the steady orbit about the sagging shaft reaches the housing.
 
     Args:

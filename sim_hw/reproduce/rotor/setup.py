@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.rotor.discretise import BankMode
 from daqsvc.rotor.model import NormalisedRotor
-from sim_hw.plants.rotor import RotorParameters
+from sim_hw.plants.rotor import PlantParameters
 
 if TYPE_CHECKING:
     from daqsvc.rotor.decision import Rule
@@ -43,9 +43,9 @@ transients.
 """
 
 
-def plant(mode: str) -> RotorParameters:
+def plant(mode: str) -> PlantParameters:
     """The process in a mode: w = 1, e = 0.1, k = 1, g = 0.1, K* = 30, alpha = 1.5, mu = 0.3."""
-    return replace(RotorParameters(), damping_ratio=DAMPING[mode])
+    return replace(PlantParameters(), damping_ratio=DAMPING[mode])
 
 
 def hypotheses(rule: Rule) -> tuple[BankMode, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_hw.reproduce.results import Row
+from sim_hw.reproduce.results import ResultRow
 from sim_hw.reproduce.rotor import declared, motion
 from sim_hw.reproduce.rotor.setup import (
     CONVERGENCE,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sim_hw.reproduce.rotor.experiment import Experiment
+    from sim_hw.reproduce.rotor.experiment import RotorExperiment
 
     Floats = NDArray[np.float64]
 
@@ -45,9 +45,9 @@ _PERIODIC = 1e-2
 _NOT_CHAOTIC_PER_REV = 5e-3
 
 
-def rows(experiment: Experiment) -> tuple[Row, ...]:
+def rows(experiment: RotorExperiment) -> tuple[ResultRow, ...]:
     """The table, in the order of the paper."""
-    makers: tuple[Callable[[Experiment], Iterable[Row]], ...] = (
+    makers: tuple[Callable[[RotorExperiment], Iterable[ResultRow]], ...] = (
         _model,
         _schedule,
         _linear_motion,
@@ -59,9 +59,9 @@ def rows(experiment: Experiment) -> tuple[Row, ...]:
     return tuple(itertools.chain.from_iterable(make(experiment) for make in makers))
 
 
-def _model(experiment: Experiment) -> Iterable[Row]:
+def _model(experiment: RotorExperiment) -> Iterable[ResultRow]:
     escape = experiment.escape
-    yield Row(
+    yield ResultRow(
         name="printed-sign",
         figure="II",
         paper="x' = Ax + Bu + gamma f(Cx): the contact force enters with a plus",
@@ -73,10 +73,10 @@ def _model(experiment: Experiment) -> Iterable[Row]:
     )
 
 
-def _schedule(experiment: Experiment) -> Iterable[Row]:
+def _schedule(experiment: RotorExperiment) -> Iterable[ResultRow]:
     per_rev = 2.0 * math.pi / plant("N").speed_ratio
     revolutions = MODE_DURATION / per_rev
-    yield Row(
+    yield ResultRow(
         name="schedule",
         figure="V",
         paper=f"N, F1 and F1 L2 last {MODE_DURATION:g} s, i.e. {PAPER_REVOLUTIONS} revolutions; "
@@ -90,7 +90,7 @@ def _schedule(experiment: Experiment) -> Iterable[Row]:
     )
 
 
-def _linear_motion(experiment: Experiment) -> Iterable[Row]:
+def _linear_motion(experiment: RotorExperiment) -> Iterable[ResultRow]:
     z = experiment.x + 1j * experiment.y
     for mode in MODES[:-1]:
         part = z[experiment.samples_of(mode, settled_rev=0.0 if mode == "N" else _SETTLED_REV)]
@@ -100,7 +100,7 @@ def _linear_motion(experiment: Experiment) -> Iterable[Row]:
         amplitude = float(np.abs(centred).mean())
         largest = float(experiment.radius[experiment.samples_of(mode)].max())
         whirl = motion.whirl_per_rev(centred, SAMPLES_PER_REV)
-        yield Row(
+        yield ResultRow(
             name=f"motion-{mode}",
             figure="4" if mode == "N" else "V",
             paper="small-amplitude linear orbital motion" if mode == "N" else "no rub before F1 L3",
@@ -118,14 +118,14 @@ def _linear_motion(experiment: Experiment) -> Iterable[Row]:
         )
 
 
-def _rub(experiment: Experiment) -> Iterable[Row]:
+def _rub(experiment: RotorExperiment) -> Iterable[ResultRow]:
     part = experiment.samples_of("F1L3")
     onset = experiment.begins_rev[-1]
     first = int(np.flatnonzero(experiment.radius > 1.0)[0])
     contact, contact_tau = first / SAMPLES_PER_REV - onset, float(experiment.tau[first])
     limit = motion.rub_limit(plant("N"))
     largest = float(experiment.radius[part].max())
-    yield Row(
+    yield ResultRow(
         name="rub-begins",
         figure="5",
         paper=f"when the damping falls to {DAMPING['F1L3']:g}, rubbing begins",
@@ -143,7 +143,7 @@ def _rub(experiment: Experiment) -> Iterable[Row]:
     )
     settled = experiment.settled
     drifts = settled.drift > 0.5 * settled.periods
-    yield Row(
+    yield ResultRow(
         name="quasi-periodic",
         figure="5",
         paper="quasi-periodic motion ensues",
@@ -162,7 +162,7 @@ def _rub(experiment: Experiment) -> Iterable[Row]:
         },
     )
     loop_rev = 1.0 / abs(settled.rotation_per_rev)
-    yield Row(
+    yield ResultRow(
         name="poincare-rub",
         figure="5",
         paper="(Poincare map: a picture)",
@@ -172,7 +172,7 @@ def _rub(experiment: Experiment) -> Iterable[Row]:
         remark="a point for a periodic motion, a curve for two frequencies, a cloud for chaos.",
         values={"loop_rev": loop_rev, "curve_residual": settled.curve_residual},
     )
-    yield Row(
+    yield ResultRow(
         name="whirl-rub",
         figure="5",
         paper="",
@@ -197,13 +197,13 @@ def _rms_over_rev(error: Floats) -> Floats:
     return np.sqrt(mean / np.minimum(np.arange(1, len(total) + 1), SAMPLES_PER_REV))
 
 
-def _observers(experiment: Experiment) -> Iterable[Row]:
+def _observers(experiment: RotorExperiment) -> Iterable[ResultRow]:
     noise = math.sqrt(2.0) * experiment.noise
     error = experiment.error("N")
     settled = _rms(error[experiment.samples_of("N", settled_rev=_SETTLED_REV)])
     over_rev = _rms_over_rev(error[experiment.samples_of("N")])
     late = float(np.flatnonzero(over_rev > 0.1 * abs(plant("N").orbit_1x))[-1] + 1) / SAMPLES_PER_REV
-    yield Row(
+    yield ResultRow(
         name="observer-N",
         figure="4",
         paper="the performance of the Kalman filters in the linear regime is evident",
@@ -218,7 +218,7 @@ def _observers(experiment: Experiment) -> Iterable[Row]:
     size = _rms(np.column_stack((experiment.x, experiment.y))[part])
     whirl = experiment.whirl_of_observer
     inwards = _inwards_in_contact(experiment, part)
-    yield Row(
+    yield ResultRow(
         name="observer-F1L3",
         figure="5",
         paper="the nonlinear observers accurately reconstruct orbit, Poincare map and phase plot in spite of "
@@ -243,7 +243,7 @@ def _observers(experiment: Experiment) -> Iterable[Row]:
     )
 
 
-def _inwards_in_contact(experiment: Experiment, part: slice) -> float:
+def _inwards_in_contact(experiment: RotorExperiment, part: slice) -> float:
     """How much less than the true radius the F1 L3 observer expects while the disc touches, on average."""
     estimates = experiment.estimates["F1L3"]
     true, expected = experiment.radius[part], np.hypot(estimates.x, estimates.y)[part]
@@ -269,7 +269,7 @@ class Convergence:
     over_rev: Floats
 
 
-def convergence(experiment: Experiment) -> Convergence:
+def convergence(experiment: RotorExperiment) -> Convergence:
     """When the error of the F1 L3 observer begins to converge; infinite if it does not."""
     error = experiment.error("F1L3")
     over_rev = _rms_over_rev(error)
@@ -286,10 +286,10 @@ def convergence(experiment: Experiment) -> Convergence:
     )
 
 
-def _convergence(experiment: Experiment) -> Iterable[Row]:
+def _convergence(experiment: RotorExperiment) -> Iterable[ResultRow]:
     found = convergence(experiment)
     converges = math.isfinite(found.begins)
-    yield Row(
+    yield ResultRow(
         name="convergence",
         figure="5",
         paper=f"the F1 L3 observer error begins to converge at t = {CONVERGENCE:g} s",
