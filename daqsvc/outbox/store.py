@@ -165,12 +165,12 @@ class Outbox:
         self.counters.waiting += 1
         return done
 
-    def mark_sent(self, sequence: int) -> None:
-        """The broker has acknowledged this message; on disk within the next 50 ms or commit, if it works.
+    def mark_sent(self, *sequences: int) -> None:
+        """The broker has acknowledged these messages; on disk within the next 50 ms or commit, if it works.
 
-        A crash in between only sends the message again, with the same number.
+        A crash in between only sends them again, with the same numbers.
         """
-        self._put(Batch(sent=[sequence]))
+        self._put(Batch(sent=list(sequences)))
 
     async def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that the broker has not acknowledged, in order, at most ``limit``."""

@@ -8,7 +8,7 @@ import math
 import threading
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
 # paho tells about every broken connection; the publisher says once, in its own words, what matters of it.
+# Left without a log unless somebody has asked for it: paho calls it twice for each message.
 _LIBRARY_LOG = logging.getLogger(f"{__name__}.library")
 _LIBRARY_LOG.setLevel(logging.CRITICAL)
 
@@ -105,6 +106,14 @@ class Incoming:
     correlation: bytes | None = None
 
 
+class _Expected(NamedTuple):
+    """A PUBACK that is expected: for which topic, by when (the loop's clock), and None if none came."""
+
+    topic: str
+    by_s: float
+    answer: asyncio.Future[ReasonCode | None]
+
+
 class Connection:
     """One connection to a broker, made once.
 
@@ -169,7 +178,9 @@ class Connection:
         self._latest_answered = 0
         self._unanswered = 0
         self._largest_packet: int | None = None
-        self._acknowledgements: dict[int, tuple[str, asyncio.Future[ReasonCode]]] = {}
+        self._acknowledgements: dict[int, _Expected] = {}
+        """By packet id, in the order in which they were handed over."""
+        self._overdue: asyncio.TimerHandle | None = None
         self._grants: dict[int, asyncio.Future[list[ReasonCode]]] = {}
         self._queue: asyncio.Queue[Incoming] = asyncio.Queue(INCOMING)
         # Futures hold what went wrong as a result: one that nobody asks for is no complaint of asyncio's.
@@ -188,7 +199,7 @@ class Connection:
         self._client = Client(
             CallbackAPIVersion.VERSION2, identifier, protocol=protocol, reconnect_on_failure=False
         )
-        self._client.enable_logger(_LIBRARY_LOG)
+        self._client.logger = _LIBRARY_LOG if _LIBRARY_LOG.isEnabledFor(logging.ERROR) else None
         self._client.max_inflight_messages = 0  # the window is kept here
         self._client.tls_set_context(cast("ssl.SSLContext", WireContext(tls_context, mqtt5=mqtt5)))
         if username is not None:
@@ -266,17 +277,18 @@ class Connection:
                 raise PublishRefusedError(f"nothing can be sent on {topic[:200]!r}: {error}") from error
             if info.rc != 0:
                 raise MqttCodeError(info.rc, "could not publish")
-            acknowledged: asyncio.Future[ReasonCode] = self._loop.create_future()
-            self._acknowledgements[info.mid] = topic, acknowledged
             self._handed_over += 1
             number = self._handed_over
+            expected = _Expected(topic, self._loop.time() + PUBACK_S, self._loop.create_future())
+            self._acknowledgements[info.mid] = expected
+            if self._overdue is None:
+                self._overdue = self._loop.call_at(expected.by_s, self._look_for_overdue)
             try:
-                async with asyncio.timeout(PUBACK_S):
-                    answer = await acknowledged
-            except TimeoutError:
-                raise self._silence(number) from None
+                answer = await expected.answer
             finally:
                 self._acknowledgements.pop(info.mid, None)
+            if answer is None:
+                raise self._silence(number)
             self._latest_answered = max(self._latest_answered, number)
         if answer.is_failure:
             raise PublishRefusedError(f"the broker refuses messages: {answer}")
@@ -293,6 +305,17 @@ class Connection:
                 f"the message on {topic} needs {size} bytes and the broker takes {self._largest_packet}; "
                 "raise the largest packet there (Mosquitto: max_packet_size)"
             )
+
+    def _look_for_overdue(self) -> None:
+        """Wait no longer for what should have been acknowledged by now; one timer for all under way."""
+        self._overdue = None
+        for expected in self._acknowledgements.values():
+            if expected.answer.done():
+                continue
+            if expected.by_s > self._loop.time():
+                self._overdue = self._loop.call_at(expected.by_s, self._look_for_overdue)
+                return
+            expected.answer.set_result(None)
 
     def _silence(self, number: int) -> MqttError:
         """No PUBACK came: for none, or for one only, which is a refusal without a word."""
@@ -574,10 +597,10 @@ class Connection:
             self._on_overlooked()
 
     def _acknowledged(self, mid: int, code: ReasonCode) -> None:
-        _, waiting = self._acknowledgements.get(mid, ("", None))
-        if waiting is not None and not waiting.done():
+        expected = self._acknowledgements.get(mid)
+        if expected is not None and not expected.answer.done():
             self._asked_for += 1
-            waiting.set_result(code)
+            expected.answer.set_result(code)
 
     def _granted(self, mid: int, codes: list[ReasonCode]) -> None:
         waiting = self._grants.get(mid)
@@ -627,14 +650,16 @@ class Connection:
             error = MqttError(violation)
         self._ended.set_result(error)
         self.unacknowledged = tuple(
-            topic for topic, waiting in self._acknowledgements.values() if not waiting.done()
+            expected.topic for expected in self._acknowledgements.values() if not expected.answer.done()
         )
         if not self._consent.done():
             closed = NoConsentError("the broker closed the connection at once")
             self._consent.set_result(error if violation else closed)
-        for _, waiting in self._acknowledgements.values():
-            if not waiting.done():
-                waiting.set_exception(self._loss())
+        for expected in self._acknowledgements.values():
+            if not expected.answer.done():
+                expected.answer.set_exception(self._loss())
+        if self._overdue is not None:
+            self._overdue.cancel()
 
     def _loss(self) -> MqttError:
         """Why the connection has ended."""

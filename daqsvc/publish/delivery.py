@@ -184,11 +184,16 @@ class Delivery:
                 self._ready.extend(self._arriving.result())
                 self._read_to = self._ready[-1].sequence
             self._arriving = None
-        while self._under_way and self._under_way[0][1].done():
-            message, task = self._under_way[0]
-            outcome = task.result()
-            self._under_way.popleft()
-            if outcome != "left":
-                self._outbox.mark_sent(message.sequence)
-            if outcome == "taken":
-                self._on_acknowledged(message)
+        settled: list[int] = []
+        try:
+            while self._under_way and self._under_way[0][1].done():
+                message, task = self._under_way[0]
+                outcome = task.result()
+                self._under_way.popleft()
+                if outcome != "left":
+                    settled.append(message.sequence)
+                if outcome == "taken":
+                    self._on_acknowledged(message)
+        finally:
+            if settled:
+                self._outbox.mark_sent(*settled)

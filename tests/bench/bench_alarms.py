@@ -114,11 +114,12 @@ class Timed(Decider):
         committed.add_done_callback(on_disk)
         return committed
 
-    def _timed_mark(self, sequence: int) -> None:
-        begun_s = self._decided_s.pop(sequence, None)
-        if begun_s is not None:
-            self.to_puback_ms.append(1e3 * (time.perf_counter() - begun_s))
-        self._mark_sent(sequence)
+    def _timed_mark(self, *sequences: int) -> None:
+        for sequence in sequences:
+            begun_s = self._decided_s.pop(sequence, None)
+            if begun_s is not None:
+                self.to_puback_ms.append(1e3 * (time.perf_counter() - begun_s))
+        self._mark_sent(*sequences)
 
 
 @contextlib.asynccontextmanager

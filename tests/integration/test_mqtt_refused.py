@@ -16,6 +16,8 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
+from daqsvc.publish.connection import Connection
+from daqsvc.publish.errors import MqttError
 from daqsvc.publish.settings import MqttSettings
 
 BASE = "daqsvc/lab/edge-1"
@@ -175,6 +177,30 @@ async def test_a_broker_that_says_nothing_about_one_topic_loses_nothing_else(out
             assert broker.sequences(GOOD) == good
             assert "not acknowledged it within 0.3 s" in publisher.refused[BAD]
             assert broker.connections == 1
+
+
+async def test_each_message_has_the_whole_time_for_its_own_acknowledgement(monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 0.6)
+    async with PickyBroker(lambda topic, _size: None if topic == BAD else True) as broker:
+        connection = Connection("127.0.0.1", broker.port, in_flight=20, mqtt5=False, identifier="box")
+        await connection.open()
+        loop = asyncio.get_running_loop()
+
+        async def waited_s() -> float:
+            begun_s = loop.time()
+            with pytest.raises(MqttError):
+                await connection.deliver(BAD, b"{}", retain=False)
+            return loop.time() - begun_s
+
+        unheard = []
+        for _ in range(3):
+            unheard.append(asyncio.create_task(waited_s()))
+            await asyncio.sleep(0.1)
+            await connection.deliver(GOOD, b"{}", retain=False)
+        async with asyncio.timeout(10):
+            assert min(await asyncio.gather(*unheard)) > 0.55
+        await connection.deliver(GOOD, b"{}", retain=False)
+        await connection.close(1.0)
 
 
 async def test_a_message_overtaken_while_it_was_refused_does_not_become_the_latest(outbox):
