@@ -7,6 +7,8 @@
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
+# make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
+# make hooks  have git check every commit
 # make proto  the module of the Sparkplug payload, anew from its schema
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
@@ -23,7 +25,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost proto lock clean
+.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -59,14 +61,27 @@ bench: $(READY)
 	@missed=; for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || missed="$$missed $$bench"; done; \
 	if [ -n "$$missed" ]; then echo "make: targets were missed by$$missed"; exit 1; fi
 
-# Built with what requirements-dev.lock pins: nothing is fetched meanwhile.
+# Built with what requirements-dev.lock pins: nothing is fetched meanwhile. Times are those of the commit, so that
+# the same commit makes the same wheel.
 DIST := dist
 dist: $(READY)
 	@rm -rf $(DIST) && mkdir -p $(DIST)
-	@$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation --wheel-dir $(DIST) .
+	@SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct 2>/dev/null || echo 315532800) \
+		$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-index --no-deps --no-build-isolation --wheel-dir $(DIST) .
 	@$(BIN)/python -m cyclonedx_py requirements requirements.lock --pyproject pyproject.toml --output-reproducible \
 		--output-file $$(ls $(DIST)/*.whl | sed 's/-py3.*//').cdx.json
 	@ls $(DIST)
+
+# All that is tracked, but for the packages: what is tested is what the wheel has installed.
+test-wheel: dist
+	@$(PYTHON) -m venv $(DIST)/venv
+	@$(DIST)/venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
+	@$(DIST)/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-index $(DIST)/*.whl
+	@mkdir $(DIST)/tree && git archive HEAD | tar -x -C $(DIST)/tree --exclude=daqsvc --exclude=drivers --exclude=sim_hw
+	@cd $(DIST)/tree && ../venv/bin/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long and not sources" $(ARGS)
+
+hooks: $(READY)
+	@$(BIN)/pre-commit install
 
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)

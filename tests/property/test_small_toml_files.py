@@ -13,6 +13,7 @@ from fuzz_bytes import mutated
 from orbit_files import RATE_HZ, SPEED_RPM, Orbit
 from race_signals import BEARING, strikes
 
+import sim_hw.scenario
 from daqsvc.analysis.bearing_setup import BearingSetup
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RotorSetup
@@ -23,7 +24,7 @@ from daqsvc.rotor.calibration.reading import CalibrationFileError
 from daqsvc.rotor.laval import LavalRotor
 from sim_hw.scenario import ScenarioError, load_any_scenario
 
-SCENARIO = Path(__file__).parents[2] / "sim_hw" / "scenarios" / "paper.toml"
+SCENARIO = Path(sim_hw.scenario.__file__).parent / "scenarios" / "paper.toml"
 
 
 @pytest.fixture(scope="module")

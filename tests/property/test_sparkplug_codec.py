@@ -155,6 +155,7 @@ def test_infinity_fits_both_kinds_of_floats() -> None:
     assert decode(encode(Payload(0, 0, metrics))).metrics == metrics
 
 
+@pytest.mark.sources
 def test_the_compiled_schema_is_that_of_the_proto_file(tmp_path: Path) -> None:
     compiled = sorted(SCHEMA.parent.glob("sparkplug_b_pb2.py*"))
     assert [file.suffix for file in compiled] == [".py", ".pyi"]

@@ -52,6 +52,7 @@ def _raise_before_there_is_a_coroutine() -> None:
     raise KeyError("at once")
 
 
+@pytest.mark.sources  # says where an error is, from the folder that the package lies in
 async def test_whatever_ends_a_part_it_is_started_again(caplog: pytest.LogCaptureFixture) -> None:
     supervisor = Supervisor()
     work, starts = _sequence(_fail, _nothing, _raise_before_there_is_a_coroutine, _for_ever)
