@@ -510,7 +510,8 @@ def _address(path: Path) -> Iterator[str]:
 
 def _first_problem(error: ValidationError) -> str:
     problem = error.errors(include_url=False)[0]
-    return f"{'.'.join(map(str, problem['loc'])) or 'it'}: {problem['msg']}"
+    # What checks of our own find pydantic marks by their exception.
+    return f"{'.'.join(map(str, problem['loc'])) or 'it'}: {problem['msg'].removeprefix('Value error, ')}"
 
 
 def _in_short(error: Exception) -> str:

@@ -218,9 +218,8 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
-        raise BaselineFileError(
-            f"{path}: {key} = {_short(first['input'])}: {first['msg'].lower()}; {_REMEDY}"
-        ) from None
+        why = first["msg"].removeprefix("Value error, ").lower()
+        raise BaselineFileError(f"{path}: {key} = {_short(first['input'])}: {why}; {_REMEDY}") from None
     except (ValueError, RecursionError) as error:
         raise BaselineFileError(f"{path}: {error}; {_REMEDY}") from None
 

@@ -212,7 +212,10 @@ class CommandIntake:
             told = CommandPayload.model_validate_json(asked)
         except ValidationError as error:
             self.counters.malformed += 1
-            found = [f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg']}" for e in error.errors()]
+            found = [
+                f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg'].removeprefix('Value error, ')}"
+                for e in error.errors()
+            ]
             # The names of unknown keys are the sender's: nothing of them may write a line into a log.
             shown = re.sub(r"[^ -~]", "?", "; ".join(found[:5]))[:_SHOWN_FAULTS]
             raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error

@@ -145,6 +145,10 @@ class CanLog:
                 return None
             whole(message)
         except Exception as error:
+            if not self._frames:
+                raise RecordedLogError(
+                    f"{self._path} is damaged from its first frame on: {words(error)}; none can be read"
+                ) from error
             raise RecordedLogError(
                 f"{self._path} is damaged behind frame {self._frames}: {words(error)}; "
                 "the frames before that have been played"

@@ -57,6 +57,7 @@ def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str
                 "reordered": stream["frames_reordered"],
                 "corrupted": stream["frames_corrupt"],
             },
+            "not_sent": _not_sent(script),
             "late": stream["frames_late"],
             "rejected": stream["frames_rejected"],
         },
@@ -66,6 +67,17 @@ def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str
         "messages": outcome.messages,
         "complete": outcome.complete,
     }
+
+
+def _not_sent(script: Script) -> list[str]:
+    """When the device sends nothing, in words: frames that it would have sent count as lost, too."""
+    if script.faults is None:
+        return []
+    seconds = {
+        what: sum(min(window.end_s, script.duration_s) - window.start_s for window in windows)
+        for what, windows in (("silence", script.faults.silence), ("brown-out", script.faults.brown_out))
+    }
+    return [f"{length:g} s of {what}" for what, length in seconds.items() if length > 0.0]
 
 
 def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:

@@ -58,7 +58,7 @@ class View:
         self._console = console or _PipeConsole()
         self._levels: dict[str, dict[str, Any]] = {}
         self._bank: dict[str, Any] | None = None
-        self._alarms: deque[dict[str, Any]] = deque(maxlen=LAST_ALARMS)
+        self._alarms: deque[tuple[int, dict[str, Any]]] = deque(maxlen=LAST_ALARMS)
         self._status: dict[str, Any] | None = None
         self._start_ns: int | None = None
         self._now_ns = 0
@@ -97,9 +97,10 @@ class View:
                 played_s = payload["window"]["end_index"] / self._script.rate_hz
                 self._start_ns = payload["monotonic_ns"] - round(1e9 * played_s)
         elif message.kind == "alarm":
-            self._alarms.appendleft(payload)
+            # When it was heard: samples that show it end sooner, and windows of detectors differ.
+            self._alarms.appendleft((self._now_ns, payload))
             if not self._console.is_terminal:
-                self._console.print(self._alarm_line(payload), soft_wrap=True)
+                self._console.print(self._alarm_line(self._now_ns, payload), soft_wrap=True)
         elif message.kind == "status":
             self._status = payload["figures"]
 
@@ -115,7 +116,7 @@ class View:
             parts.append(Panel(self._modes(self._bank), title=title, title_align="left"))
         # The alarms come last, the newest first: a low terminal cuts off the oldest and nothing else.
         parts.append(Panel(self._health(), title="link and loop", title_align="left"))
-        alarms = [self._alarm_line(alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
+        alarms = [self._alarm_line(*alarm) for alarm in self._alarms] or [Text("none yet", style="dim")]
         title = "alarms, as they came from the broker, newest first"
         parts.append(Panel(Group(*alarms), title=title, title_align="left"))
         return Group(*parts)
@@ -167,8 +168,8 @@ class View:
             )
         return table
 
-    def _alarm_line(self, alarm: dict[str, Any]) -> Text:
-        at = f"{self._seconds(alarm['cause']['monotonic_ns']):8.2f} s  "
+    def _alarm_line(self, heard_ns: int, alarm: dict[str, Any]) -> Text:
+        at = f"{self._seconds(heard_ns):8.2f} s  "
         line = Text()
         line.append(at, style="dim")
         line.append(f"{alarm['level']:<7}", style=COLOURS[alarm["level"]])
@@ -236,6 +237,12 @@ class View:
             for what in ("injected", "counted"):
                 told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())
                 console.print(f"link faults {what}: {told}")
+            beyond = frames["counted"]["dropped"] - frames["injected"].get("dropped", 0)
+            if beyond > 0 and frames["not_sent"]:
+                console.print(
+                    f"{beyond} of the frames counted as dropped were never on the bus: the scenario has "
+                    f"{' and '.join(frames['not_sent'])}"
+                )
         console.print(
             f"event loop lag: p50 {lag['p50']:.2f} ms, p99 {lag['p99']:.2f} ms, max {lag['max']:.2f} ms"
         )

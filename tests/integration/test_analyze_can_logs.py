@@ -168,6 +168,20 @@ def test_a_log_that_is_cut_short_is_judged_as_far_as_it_goes(analyze, machine, t
     assert re.search(r"run.blf is damaged behind frame .* are taken", found["data_quality"]["problems"][0])
 
 
+def test_a_log_whose_first_frames_are_damaged_is_refused_without_a_word_of_others(analyze, machine, tmp_path):
+    sent, _ = frames(machine, "shaft", signals(Orbit(200)), channel="can0")
+    log = write(tmp_path / "flip.blf", sent)
+    raw = bytearray(log.read_bytes())
+    # The first container: its compressed data begin behind the file's header and its own.
+    raw[144 + 32 + 8 : 144 + 32 + 40] = bytes(32)
+    log.write_bytes(raw)
+    _, found, err = analyze(machine, log)
+    said = err + repr(found)
+    assert "is damaged from its first frame on" in said
+    assert "none can be read" in said
+    assert "before that" not in said
+
+
 def two_buses(tmp_path):
     machine = machine_file(tmp_path / "two.toml", "rotor-two-buses.toml", rate_hz=RATE_HZ)
     machine.write_text(machine.read_text().replace("rate_hz = 2000.0", f"rate_hz = {RATE_HZ}"))

@@ -18,7 +18,7 @@ from brokers import eventually
 
 from daqsvc import control
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.control import ControlError, ControlRequest, ControlServer, ask, events_waiting
+from daqsvc.control import ControlError, ControlRequest, ControlServer, ask, events_waiting, request_of
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -385,3 +385,9 @@ def test_a_service_that_does_not_answer_is_told(tmp_path: Path) -> None:
         mute.listen()
         with pytest.raises(ControlError, match=r"has not answered within 0\.05 s"):
             ask(tmp_path, RESET, timeout_s=0.05)
+
+
+def test_what_cannot_be_asked_is_said_in_our_words_only() -> None:
+    with pytest.raises(ControlError) as refused:
+        request_of(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="\udcff", by="Ada"), None)
+    assert f"{refused.value}".startswith("that cannot be asked, alarm: must be printable")
