@@ -9,7 +9,7 @@ import json
 import logging
 
 import pytest
-from brokers import Consumer, TcpProxy, eventually, free_port, running_mosquitto
+from brokers import PATIENCE_S, Consumer, TcpProxy, eventually, free_port, running_mosquitto
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.events import Identity
@@ -311,7 +311,7 @@ async def test_without_a_broker_it_stops_at_once_and_keeps_everything(outbox, ca
     async with publishing(outbox, free_port()) as publisher:
         await service.cycle()
         await eventually(lambda: "is away" in caplog.text, "it has noticed")
-        async with asyncio.timeout(1.0):
+        async with asyncio.timeout(PATIENCE_S):
             await publisher.stop()
     assert [m.sequence for m in await outbox.pending(0, 10)] == [
         int(one.removeprefix("series-")) for one in service.ids
@@ -319,22 +319,26 @@ async def test_without_a_broker_it_stops_at_once_and_keeps_everything(outbox, ca
     assert len(caplog.records) == 1
 
 
-async def test_a_silent_broker_does_not_hold_up_the_stop(outbox):
+async def test_a_silent_broker_does_not_hold_up_the_stop(outbox, monkeypatch):
+    # Whoever waited for it would do so for longer than anybody waits here, however slow the machine is.
+    monkeypatch.setattr("daqsvc.publish.connection.CONSENT_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("daqsvc.publish.spoken.CONSENT_S", 10 * PATIENCE_S)
     server = await silent_server()
     async with server, publishing(outbox, server.sockets[0].getsockname()[1]) as publisher:
         await asyncio.sleep(0.1)
-        async with asyncio.timeout(1.0):
+        async with asyncio.timeout(PATIENCE_S):
             await publisher.stop()
 
 
 @pytest.mark.mosquitto
-async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox):
+async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox, monkeypatch):
+    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 10 * PATIENCE_S)
     with running_mosquitto(tmp_path) as mosquitto:
         async with TcpProxy(mosquitto.port) as wire, publishing(outbox, wire.port) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
             wire.deaf = True
             await Service(outbox).cycle()
-            async with asyncio.timeout(3.0):
+            async with asyncio.timeout(PATIENCE_S):
                 await publisher.stop(deadline_s=0.5)
     assert len(await outbox.pending(0, 10)) == 4
 
