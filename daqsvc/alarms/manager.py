@@ -410,7 +410,8 @@ class AlarmManager:
             return True
         elif ours and name in self._expected.quality:
             self._resume_unruled(event)
-            self._doubts.resume(doubt for doubt in event.doubts if doubt.detector in speakers)
+            doubts = [doubt for doubt in event.doubts if doubt.detector in speakers]
+            self._doubts.resume(doubts, self._clock.monotonic_ns())
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
             self._resume_unruled(event)
             self._conditions.add(name)

@@ -59,9 +59,9 @@ class _Patience:
     quality alarm with each of them would be a flood that says nothing. It is raised when they prevail.
     """
 
-    def __init__(self) -> None:
-        self._weight = 0
-        self._lasts = False
+    def __init__(self, *, lasting: bool) -> None:
+        self._weight = LASTING if lasting else 0
+        self._lasts = lasting
 
     def lasts(self, *, partial: bool) -> bool:
         """Take in a statement; whether samples are missing for good."""
@@ -82,6 +82,10 @@ class _Shortage:
         self._shares: deque[tuple[int, float]] = deque()
         self._sum = 0.0
         self._blind_ns: int | None = None
+
+    def resume(self, t_ns: int) -> None:
+        """Go on from before a restart at ``t_ns``: samples were lacking then."""
+        self._blind_ns = t_ns
 
     def take(self, diagnosis: Diagnosis, share: float) -> None:
         """Take in a statement about samples, and what share of them is missing."""
@@ -115,6 +119,8 @@ class Doubts:
     def __init__(self) -> None:
         self._patience: dict[str, _Patience] = {}
         self._shortage: defaultdict[str, _Shortage] = defaultdict(_Shortage)
+        # When the restart was over which a detector lacked samples, until it says what share is missing.
+        self._lacked_at_restart: dict[str, int] = {}
         self._by_detector: dict[str, tuple[str, Doubt]] = {}
         # Why there are no samples by which to judge, by detector, until it says good.
         self._causes: dict[str, str] = {}
@@ -153,11 +159,13 @@ class Doubts:
         """What stands against the sensors after a statement."""
         detector, good = diagnosis.detector, diagnosis.quality == "good"
         if diagnosis.partial and detector not in self._patience:
-            self._patience[detector] = _Patience()
+            self._patience[detector] = _Patience(lasting=detector in self._lacked_at_restart)
         lacked, lasts = before is not None and before.quality == "missing", False
         if detector in self._patience and (good or diagnosis.partial):
             lasts = self._patience[detector].lasts(partial=diagnosis.partial)
         if diagnosis.missing_share is not None and diagnosis.end_index > diagnosis.first_index:
+            if (since_ns := self._lacked_at_restart.pop(detector, None)) is not None:
+                self._shortage[detector].resume(since_ns)
             self._shortage[detector].take(diagnosis, diagnosis.missing_share)
         if good:
             lasts = lasts or (detector in self._shortage and self._shortage[detector].lasts(diagnosis.t_ns))
@@ -170,9 +178,11 @@ class Doubts:
         )
         return Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
 
-    def resume(self, doubts: Iterable[Doubt]) -> None:
-        """Go on from before a restart."""
+    def resume(self, doubts: Iterable[Doubt], t_ns: int) -> None:
+        """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted."""
         for doubt in doubts:
+            if doubt.quality == "missing":
+                self._lacked_at_restart[doubt.detector] = t_ns
             self._forget(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
 

@@ -136,6 +136,23 @@ def test_a_revolution_that_could_not_be_judged_is_over_when_some_seconds_were_go
     assert 3.0 <= (rig.clock.t_ns - raised_ns) / SECOND_NS < 3.2
 
 
+@pytest.mark.parametrize("says_share", [True, False])
+def test_a_restart_does_not_cut_short_how_long_samples_must_be_good(says_share):
+    rig = AlarmRig(BEARING)
+    if says_share:
+        revolution(rig, np.zeros(6))
+        rig = rig.restarted({"bank": ("probe-x", "probe-y")})
+        restarted_ns = rig.clock.t_ns
+        while not (events := revolution(rig, np.ones(6))):
+            pass
+        assert 3.0 <= (rig.clock.t_ns - restarted_ns) / SECOND_NS < 3.2
+    else:
+        bearing(rig, "missing", ("accel-de", "accel-fe"))
+        rig = rig.restarted({"bearing": ("accel-de", "accel-fe")})
+        events = bearing(rig, "good", ("accel-de", "accel-fe"))
+    assert [kind for _, kind in kinds(events)] == ["returned"]
+
+
 def test_lost_frames_do_not_keep_a_sensor_not_ok_that_samples_show_to_be_ok():
     rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=40.0)))
     say = lambda quality, share: rig.take(  # noqa: E731
