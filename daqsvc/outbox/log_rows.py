@@ -1,8 +1,9 @@
-"""The messages that stand in a write-ahead log, whatever SQLite says of the log.
+"""The messages that stand in pages of a write-ahead log or a database, whatever SQLite says of it.
 
 For SQLite a log ends before its first wrong checksum: one flipped bit takes all that was committed behind it.
 But messages have checksums of their own. So the pages in the log are read one by one, and each message that
-is whole counts. Formats: https://www.sqlite.org/fileformat2.html, "The Write-Ahead Log" and "B-tree Pages".
+is whole counts; likewise the pages of a database whose first one, with the tables' definitions, is lost.
+Formats: https://www.sqlite.org/fileformat2.html, "The Write-Ahead Log" and "B-tree Pages".
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ import struct
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
-from daqsvc.outbox.salvage import sound_row
+from daqsvc.outbox.sound import sound_row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from mmap import mmap
 
-    from daqsvc.outbox.salvage import Row
+    from daqsvc.outbox.sound import Row
 
     Salts: TypeAlias = tuple[int, int]
     Frame: TypeAlias = tuple[int, bytes]
@@ -28,6 +30,7 @@ PAGE_BYTES = 4096
 _SIZES = {1 << power for power in range(9, 17)}
 _HEADER_BYTES, _FRAME_HEADER_BYTES, _PAGE_HEADER_BYTES = 32, 24, 8
 _FIRST_PAGE = b"SQLite format 3"
+_TABLE_LEAF = 13
 _COLUMNS = 7
 _INTEGER_BYTES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 _CONSTANTS: dict[int, int | None] = {0: None, 8: 0, 9: 1}
@@ -61,16 +64,34 @@ def _rows(log: bytes, size: int) -> Iterator[Row]:
         return frames[min(places[number], key=lambda place: abs(place - near))][1]
 
     for place, (_, page) in enumerate(frames):
-        if page.startswith(_FIRST_PAGE):
-            continue  # the tables' definitions
-        count = min(struct.unpack_from(">H", page, 3)[0], (size - _PAGE_HEADER_BYTES) // 2)
-        for start in struct.unpack_from(f">{count}H", page, _PAGE_HEADER_BYTES):
-            try:
-                row = _row(page, start, partial(overflow, near=place))
-            except (IndexError, KeyError, ValueError, struct.error):
-                continue  # no message, or a damaged one
-            if row is not None:
-                yield row
+        if not page.startswith(_FIRST_PAGE):  # the tables' definitions
+            yield from _rows_of(page, partial(overflow, near=place))
+
+
+def rows_in_pages(content: bytes | mmap) -> Iterator[Row]:
+    """The messages in a database, page by page; one may come twice, as it was before and after a change.
+
+    Args:
+        content: the file's content; any part of it may be damaged.
+    """
+
+    def page(number: int) -> bytes:
+        return content[(number - 1) * PAGE_BYTES : number * PAGE_BYTES]
+
+    for number in range(1, len(content) // PAGE_BYTES + 1):
+        if content[(number - 1) * PAGE_BYTES] == _TABLE_LEAF:
+            yield from _rows_of(page(number), page)
+
+
+def _rows_of(page: bytes, overflow: Callable[[int], bytes]) -> Iterator[Row]:
+    count = min(struct.unpack_from(">H", page, 3)[0], (len(page) - _PAGE_HEADER_BYTES) // 2)
+    for start in struct.unpack_from(f">{count}H", page, _PAGE_HEADER_BYTES):
+        try:
+            row = _row(page, start, overflow)
+        except (IndexError, KeyError, ValueError, struct.error):
+            continue  # no message, or a damaged one
+        if row is not None:
+            yield row
 
 
 def _frames(log: bytes, size: int) -> Iterator[Frame]:
@@ -111,6 +132,8 @@ def _row(page: bytes, start: int, overflow: Callable[[int], bytes]) -> Row | Non
         missing = size - local
         while missing > 0:
             more = overflow(following)
+            if len(more) <= 4:
+                return None
             following = struct.unpack_from(">I", more)[0]
             parts.append(more[4 : 4 + missing])
             missing -= len(parts[-1])

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import mmap
+import os
 import sqlite3
 from itertools import chain, islice
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from daqsvc.outbox.messages import is_sound
+from daqsvc.outbox.log_rows import rows_in_pages
+from daqsvc.outbox.sound import sound_row
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    Row: TypeAlias = tuple[int, str, bytes, int, int, int, int]
+    from daqsvc.outbox.sound import Row
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +42,8 @@ def readable(path: Path, below: int = LARGEST) -> Iterator[Row]:
 
     The table is read from both ends, and what lies between two bad pages number by number. No checksum covers
     whether a message is sent: one that the row or the index takes for unsent, or that says neither, is sent
-    again. One of which nobody knows whether it is retained, is.
+    again. One of which nobody knows whether it is retained, is. If SQLite finds nothing at all, since the
+    first page is lost or the table's own, the pages are read one by one.
 
     Args:
         path: the corrupt file.
@@ -74,6 +78,21 @@ def readable(path: Path, below: int = LARGEST) -> Iterator[Row]:
         for number in chain(named, islice(between, _PROBES)):
             if number not in seen:
                 yield from new(_up_to_a_point(broken, _ONE, 1, path, number))
+    if not seen:
+        yield from _page_by_page(path, below)
+
+
+def _page_by_page(path: Path, below: int) -> Iterator[Row]:
+    """What the pages hold. A message that stands in one as sent was marked after any other copy was made."""
+    with path.open("rb") as file:
+        if not os.fstat(file.fileno()).st_size:
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            rows: dict[int, Row] = {}
+            for row in rows_in_pages(content):
+                if row[0] < below and (row[0] not in rows or row[4]):
+                    rows[row[0]] = row
+    yield from (rows[number] for number in sorted(rows))
 
 
 def _numbers(broken: sqlite3.Connection, query: str, most: int, path: Path) -> set[int]:
@@ -87,24 +106,3 @@ def _up_to_a_point(
         yield from islice(broken.execute(query, parameters), most)
     except (sqlite3.Error, ValueError, OverflowError) as error:
         log.debug("corrupt outbox %s could be read up to a point: %s", path, error)
-
-
-def sound_row(raw: tuple[object, ...], unsent: set[int]) -> Row | None:
-    """What a row says; None if it has changed on the disk.
-
-    Args:
-        raw: its columns as they were read, text as bytes.
-        unsent: numbers of messages that another source takes for unsent.
-    """
-    sequence, name, payload, retain, sent, wall_ns, told = raw
-    try:
-        topic = name.decode() if isinstance(name, bytes) else None
-    except UnicodeDecodeError:
-        return None
-    if not (isinstance(sequence, int) and isinstance(topic, str) and isinstance(payload, bytes)):
-        return None
-    if not isinstance(told, int) or not is_sound(sequence, topic, payload, told):
-        return None
-    is_sent = sent == 1 and sequence not in unsent
-    written_ns = wall_ns if isinstance(wall_ns, int) else 0
-    return sequence, topic, payload, int(retain != 0), int(is_sent), written_ns, told

@@ -146,6 +146,21 @@ def test_one_bad_page_costs_the_messages_on_it_and_no_others(stores, tmp_path):
     assert len(saved) > COUNT // 3
 
 
+@pytest.mark.parametrize("lost", [slice(0, 100), slice(0, 4096), slice(0, 3 * 4096)], ids=str)
+def test_a_first_page_that_is_lost_costs_no_message(stores, tmp_path, lost):
+    """It has the file's header and the tables' definitions: SQLite finds nothing without."""
+    kept, numbers = stores
+    store = tmp_path / "store"
+    shutil.copytree(kept["closed"], store)
+    path = store / JOURNAL_NAME
+    content = bytearray(path.read_bytes())
+    content[lost] = bytes(lost.stop)
+    path.write_bytes(content)
+    pending, counters = asyncio.run(restarted(store, numbers))
+    assert counters.quarantined == 1
+    assert [m.sequence for m in pending[:-1]] == numbers[COUNT // 2 :], "and none that was sent comes again"
+
+
 def test_a_flipped_bit_in_a_payload_costs_that_message_only(stores, tmp_path):
     """SQLite's own check sees nothing of it."""
     kept, numbers = stores
