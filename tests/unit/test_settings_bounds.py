@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import typing
+from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -14,6 +16,8 @@ from pydantic.fields import FieldInfo
 from daqsvc.settings.models import MachineFile
 from daqsvc.settings.schema import field_type
 from daqsvc.settings.section import Kinds, Section
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 # Handed to a driver as they are, which checks them itself.
 FREE = {"CanBus.options", "OtherBus.options"}
@@ -154,3 +158,19 @@ def test_a_name_that_is_a_place_in_the_file_system_is_refused(name):
     problem, _ = only_problem(LAVAL, ('site = "lab" ', f'site = "{name}" '))
     assert problem.key == "site"
     assert changed(LAVAL, ('site = "lab" ', 'site = ".lab" '))
+
+
+def limit(marks, *kinds):
+    mark = next(mark for mark in marks if isinstance(mark, kinds))
+    return float(getattr(mark, type(mark).__name__.lower()))
+
+
+@pytest.mark.parametrize("page", ["drivers.md", "modbus.md", "machine-file.md"])
+def test_the_limits_that_the_pages_state_are_those_of_the_models(page):
+    bounds = {path: marks for kind, path, marks in EVERYTHING if kind in {int, float}}
+    text = (DOCS / page).read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| ([-\d._]+) \| ([-\d._]+) \|", text, re.MULTILINE)
+    assert len(rows) > 10
+    for key, section, lowest, highest in rows:
+        marks = bounds[f"{section}.{key}"]
+        assert (float(lowest), float(highest)) == (limit(marks, Ge, Gt), limit(marks, Le, Lt)), (section, key)
