@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
 from daqsvc.settings.buses import CanBus, DbcLayout, OtherBus, PlainLayout
 from daqsvc.settings.layout_checks import bus_share, frame_facts
+from daqsvc.settings.modbus import ModbusRtuBus
+from daqsvc.settings.modbus_load import line_load
 from daqsvc.settings.registry import configured
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
@@ -78,6 +80,10 @@ def _bus(machine: MachineFile, name: str) -> str:
     if isinstance(bus, OtherBus):
         options = f" with options {', '.join(sorted(bus.options))}" if bus.options else ""
         return f"driver {bus.driver}{options}; if absent at start: {bus.start}"
+    if isinstance(bus, ModbusRtuBus):
+        asked = line_load(machine, name, bus)
+        taken = _percent(asked.least, asked.usual)
+        return f"{bus.summary}, load about {taken} of the line; if absent at start: {bus.start}"
     if not isinstance(bus, CanBus):
         return f"{bus.summary}; if absent at start: {bus.start}"
     parts = [f"{'CAN FD' if bus.fd else 'classic CAN'}, {bus.interface} {bus.channel}"]
@@ -191,14 +197,15 @@ def _alarms(machine: MachineFile) -> Iterator[Sequence[str]]:
         unit = {"velocity_rms": "mm/s", "crest_factor": "", "gap_voltage": "V"}.get(
             alarm.measure, machine.sensor(alarm.watched[0]).unit
         )
-        watched = (
-            alarm.sensor if isinstance(alarm, LevelAlarm) else f"{alarm.vote} of {', '.join(alarm.sensors)}"
-        )
+        if isinstance(alarm, LevelAlarm):
+            watched = f"{alarm.measure} of {alarm.sensor}"
+        else:
+            watched = f"{alarm.measure}, {alarm.vote} of {', '.join(alarm.sensors)}"
         deadband = f"{alarm.deadband:g} {unit}".rstrip()
         multiplied = f", start-up x{alarm.trip_multiply:g}" if alarm.trip_multiply > 1 else ""
         yield (
             alarm.name,
-            f"{alarm.measure} of {watched}",
+            watched,
             _limits(alarm.alert_low, alarm.alert, unit),
             _limits(alarm.danger_low, alarm.danger, unit),
             f"{deadband}, on {alarm.on_delay_s:g} s, off {alarm.off_delay_s:g} s{multiplied}{latching}",

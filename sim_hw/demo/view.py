@@ -229,10 +229,12 @@ class View:
             f"samples: {samples['sent']:,} sent, {samples['received']:,} received, {samples['lost']:,} lost, "
             f"{samples['skipped_by_detectors']:,} skipped"
         )
-        if samples["left_over"]:
-            console.print(
-                f"{samples['left_over']} samples were not sent: they fill no frame, or the device was off"
-            )
+        if left := samples["left_over"]:
+            one = left == 1
+            why = "it fills no frame" if one else "they fill no frame"
+            if frames["not_sent"]:
+                why = f"the scenario has {' and '.join(frames['not_sent'])}; the last may fill no frame"
+            console.print(f"{left:,} {'sample was' if one else 'samples were'} not sent: {why}")
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):
                 told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())

@@ -74,5 +74,6 @@ def test_frames_that_were_never_sent_are_told_from_those_that_the_link_lost():
         "856 of the frames counted as dropped were never on the bus: the scenario has 2 s of silence and"
         in text
     )
-    summary["frames"]["not_sent"] = []
+    summary["frames"]["not_sent"], summary["samples"]["left_over"] = [], 1
+    assert "1 sample was not sent: it fills no frame\n" in shown(lambda view: view.show_summary(summary))
     assert "never on the bus" not in shown(lambda view: view.show_summary(summary))

@@ -48,7 +48,7 @@ def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
     assert isinstance(rule, VotingRule)
     assert (rule.sensors, rule.vote, rule.trip_multiply) == (("probe-x", "probe-y"), 2, 2.0)
     assert (rule.group, rule.setpoint.alert, rule.latching) == ("shaft", 45.0, False)
-    assert "rms of 2 of probe-x, probe-y" in describe(machine)
+    assert "rms, 2 of probe-x, probe-y" in describe(machine)
     assert "start-up x2" in " ".join(describe(machine).split())
     assert Limits("rms", 45.0, None) in levels_plugin._limits(machine, "probe-y")
 

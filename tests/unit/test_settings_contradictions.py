@@ -6,6 +6,7 @@ import pytest
 from machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
 from daqsvc.settings import MachineFileError, load_machine_file, parse_machine_file
+from daqsvc.settings.describe import describe
 
 DEVICE = MACHINES.parent / "devices" / "triaxial-accelerometer.dbc"
 MODBUS = """
@@ -588,3 +589,11 @@ def test_a_can_bus_that_is_nearly_or_more_than_full(rate_hz, figures, refused):
     problems, warnings = outcome(text, TRIAXIAL)
     found = (problems if refused else warnings).get("buses.can0.bitrate")
     assert (found is None) if figures is None else (figures in found.message)
+
+
+def test_what_polling_takes_of_a_line_is_described():
+    text = (MACHINES / "modbus-vibration-temperature.toml").read_text(encoding="utf-8")
+    machine = parse_machine_file(text, MACHINES / "modbus-vibration-temperature.toml")
+    # One request of 21 registers a second reads both streams: 55 characters and two silences at 19,200 bit/s.
+    described = " ".join(describe(machine).split())
+    assert "time-out 500 ms, load about 3.2 to 4 % of the line" in described
