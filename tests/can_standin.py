@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.base import BusPort
-    from drivers.can.batches import FrameSorter
+    from drivers.can.batches import FrameDemultiplexer
 
 
 def frame_bytes(
@@ -44,7 +44,7 @@ class StandInBus:
         self._ours: socket.socket | None = None
         self._lock = threading.Lock()
 
-    def open(self, port: BusPort, sorter: FrameSorter) -> SocketCan:
+    def open(self, port: BusPort, sorter: FrameDemultiplexer) -> SocketCan:
         """For ``CanDriver(port, open_source=bus.open)``."""
         with self._lock:
             if not self.present:

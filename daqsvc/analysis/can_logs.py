@@ -23,7 +23,7 @@ from daqsvc.recording.recording import Recording
 from daqsvc.settings.models import DbcLayout, PlainLayout
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
-from drivers.can.batches import FrameSorter, Sorted
+from drivers.can.batches import DecodedBatch, FrameDemultiplexer
 from drivers.replay.can_log import CanLog
 from drivers.replay.files import RecordedLogError as LogError
 
@@ -93,7 +93,7 @@ def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) 
 class _Bus:
     name: str
     channel: str
-    sorter: FrameSorter
+    sorter: FrameDemultiplexer
 
 
 class _Playing:
@@ -148,11 +148,15 @@ class _Playing:
 
     def _buses(self) -> list[_Bus]:
         return [
-            _Bus(name, str(getattr(self._machine.buses[name], "channel", None) or name), FrameSorter(specs))
+            _Bus(
+                name,
+                str(getattr(self._machine.buses[name], "channel", None) or name),
+                FrameDemultiplexer(specs),
+            )
             for name, specs in self._specs.items()
         ]
 
-    def _take(self, piece: Sorted) -> None:
+    def _take(self, piece: DecodedBatch) -> None:
         for name, count in piece.unknown.items():
             self.unknown[name] = self.unknown.get(name, 0) + count
         newest_ns = 0
@@ -223,7 +227,7 @@ class _Log:
         self._notes = notes
         self._chosen: dict[str, _Bus] = {}
 
-    def pieces(self) -> Iterator[Sorted]:
+    def pieces(self) -> Iterator[DecodedBatch]:
         """What it holds, piece by piece; ends at what is damaged.
 
         Raises:
@@ -248,8 +252,8 @@ class _Log:
                 f"{malformed} lines of {self.path.name} are no frames, first {log.first_malformed}"
             )
 
-    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
-        found = Sorted()
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> DecodedBatch:
+        found = DecodedBatch()
         channels = ["" if message.channel is None else str(message.channel) for message in messages]
         for channel in dict.fromkeys(channels):
             rows = [k for k, name in enumerate(channels) if name == channel]
@@ -265,7 +269,7 @@ class _Log:
                 found.unknown[name] = found.unknown.get(name, 0) + count
         return found
 
-    def _choose(self, channel: str, parts: Mapping[str, Sorted]) -> _Bus | None:
+    def _choose(self, channel: str, parts: Mapping[str, DecodedBatch]) -> _Bus | None:
         """The bus that a channel is; None while that does not show.
 
         Raises:
@@ -291,7 +295,7 @@ class _Log:
         return candidates[0] if candidates else None
 
 
-def _first_ns(piece: Sorted) -> int:
+def _first_ns(piece: DecodedBatch) -> int:
     return min((int(frames.arrival_ns[0]) for frames in piece.frames), default=0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusCounters, BusOptionError
-from drivers.keeping import Attempt, keep_up
+from drivers.reconnect import Attempt, run_with_reconnect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -67,7 +67,7 @@ class TcpFramesDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
-            await keep_up(self.link, self._port, self._attempt)
+            await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             self._stream.flush()

@@ -109,7 +109,7 @@ class StreamFrames:
 
 
 @dataclass(slots=True)
-class Sorted:
+class DecodedBatch:
     """What a batch held.
 
     Attributes:
@@ -159,7 +159,7 @@ class IdMatch:
         return frame_id & self.mask == self.id & self.mask
 
 
-class FrameSorter:
+class FrameDemultiplexer:
     """Sorts batches to streams and decodes them, each stream's frames at once.
 
     Args:
@@ -175,14 +175,14 @@ class FrameSorter:
         """Ids that some stream has."""
         return self._matches
 
-    def sort(self, batch: CanBatch, error_classes: int) -> Sorted:
+    def sort(self, batch: CanBatch, error_classes: int) -> DecodedBatch:
         """Sort and decode a batch; nothing in the result refers to the batch's memory.
 
         Args:
             batch: frames as they came.
             error_classes: see `CanSource`.
         """
-        found = Sorted(drained_ns=batch.drained_ns)
+        found = DecodedBatch(drained_ns=batch.drained_ns)
         found.note("frames_overrun", batch.overrun)
         found.note("frames_malformed", batch.malformed)
         chosen: dict[int, list[NDArray[np.intp]]] = {}
@@ -222,7 +222,7 @@ class FrameSorter:
         return len(left)
 
     def _decode(
-        self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], found: Sorted
+        self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], found: DecodedBatch
     ) -> None:
         lengths = batch.lengths[rows]
         right = lengths == spec.layout.length

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.can.adapter import open_adapter
-from drivers.can.batches import FrameSorter
+from drivers.can.batches import FrameDemultiplexer
 from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can.reader import SHUTDOWN_S, CanReader, close_quietly, words
 from drivers.can.record import recorder_of
 from drivers.can.socketcan import open_socketcan
-from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
+from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import BusPort, StreamSpec
-    from drivers.can.batches import CanSource, Sorted
+    from drivers.can.batches import CanSource, DecodedBatch
     from drivers.can.record import CanRecorder
     from drivers.frames import FrameLayout
 
@@ -51,13 +51,13 @@ class CanDriver:
     """
 
     def __init__(
-        self, port: BusPort, open_source: Callable[[BusPort, FrameSorter], CanSource] | None = None
+        self, port: BusPort, open_source: Callable[[BusPort, FrameDemultiplexer], CanSource] | None = None
     ) -> None:
         self.name = port.name
         self.link = Link(f"CAN bus {port.name!r} ({port.options['interface']} {port.options.get('channel')})")
         self.counters = CanCounters()
         self._port = port
-        self._sorter = FrameSorter(port.streams)
+        self._sorter = FrameDemultiplexer(port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._open_source = open_source or _open_source
         self._said: set[str] = set()
@@ -74,7 +74,7 @@ class CanDriver:
         if self._recorder is not None:
             self._recorder.start()
         try:
-            await keep_up(self.link, self._port, self._attempt)
+            await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
@@ -123,7 +123,7 @@ class CanDriver:
             finally:
                 reader.finish()
 
-    def take(self, found: Sorted) -> None:
+    def take(self, found: DecodedBatch) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""
         for name, count in found.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
@@ -226,7 +226,7 @@ def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
     )
 
 
-def _open_source(port: BusPort, sorter: FrameSorter) -> CanSource:
+def _open_source(port: BusPort, sorter: FrameDemultiplexer) -> CanSource:
     if port.options["interface"] == "socketcan":
         return open_socketcan(port.options, sorter.matches, port.clock)
     return open_adapter(port.options, port.clock)

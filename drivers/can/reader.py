@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 
-from drivers.can.batches import BusOffError, Sorted
+from drivers.can.batches import BusOffError, DecodedBatch
 from drivers.can.errors import BUS_OFF_REASON
 from drivers.hand_over import HandOver
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-    from drivers.can.batches import CanBatch, CanSource, FrameSorter
+    from drivers.can.batches import CanBatch, CanSource, FrameDemultiplexer
 
 logger = logging.getLogger(__name__)
 
@@ -46,8 +46,8 @@ class CanReader(threading.Thread):
         self,
         link_name: str,
         source: CanSource,
-        sorter: FrameSorter,
-        take: Callable[[Sorted], None],
+        sorter: FrameDemultiplexer,
+        take: Callable[[DecodedBatch], None],
         loop: asyncio.AbstractEventLoop,
         record: Callable[[CanBatch], None] | None = None,
     ) -> None:
@@ -74,7 +74,7 @@ class CanReader(threading.Thread):
             reason = words(error)
         except BaseException as error:
             logger.exception("the reader of %s failed", self._link_name)
-            self._post(self._take, Sorted(notes={"reader_failures": 1}))
+            self._post(self._take, DecodedBatch(notes={"reader_failures": 1}))
             reason = f"its reader failed: {words(error)}"
         self._post(self._end, reason)
 
@@ -100,7 +100,7 @@ class CanReader(threading.Thread):
         try:
             batch = self._source.read(POLL_S)
         except BusOffError:
-            self._hand_over(Sorted(notes={"bus_off": 1}))
+            self._hand_over(DecodedBatch(notes={"bus_off": 1}))
             raise
         if self._record is not None:
             self._record(batch)
@@ -112,13 +112,13 @@ class CanReader(threading.Thread):
             # Let a few frames gather: one turn of the event loop then serves them all.
             self._stopping.wait(self._source.gather_s)
 
-    def _hand_over(self, found: Sorted) -> None:
+    def _hand_over(self, found: DecodedBatch) -> None:
         while not self._under_way.acquire(timeout=POLL_S):
             if self._stopping.is_set():
                 return
         self._post(self._taken, found)
 
-    def _taken(self, found: Sorted) -> None:
+    def _taken(self, found: DecodedBatch) -> None:
         self._under_way.release()
         self._take(found)
 

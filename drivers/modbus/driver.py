@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Link
-from drivers.keeping import Attempt, CannotOpenError, keep_up
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.line import ModbusLine, WritableRun
 from drivers.modbus.outcomes import LineLostError, ModbusCounters
@@ -21,6 +20,7 @@ from drivers.modbus.registers import RegisterRun
 from drivers.modbus.sampling import readers_for
 from drivers.modbus.silence import RetryPolicy, SparingByEnquiry
 from drivers.modbus.wire import LineOptions
+from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
 from drivers.tty import Character, CharacterFormat
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class ModbusDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
-            await keep_up(self.link, self._port, self._attempt)
+            await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for reader in self._readers:

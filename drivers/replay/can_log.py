@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from can.io.generic import MessageReader
     from numpy.typing import NDArray
 
-    from drivers.can.batches import Sorted
+    from drivers.can.batches import DecodedBatch
 
-    Sort = Callable[[list[can.Message], NDArray[np.int64]], Sorted]
+    Sort = Callable[[list[can.Message], NDArray[np.int64]], DecodedBatch]
 
 PIECE_FRAMES = 512
 STEP_BACK_NS = 2 * NS_PER_S
@@ -109,7 +109,7 @@ class CanLog:
             return io.BufferedReader(CountedFile(cast("BinaryIO", unpacked), budget))
         return self._files.enter_context(self._path.open("rb"))
 
-    def read(self, span_ns: int) -> Sorted | None:
+    def read(self, span_ns: int) -> DecodedBatch | None:
         """See `drivers.replay.files.RecordedLog.read`."""
         messages: list[can.Message] = []
         t_ns: list[int] = []

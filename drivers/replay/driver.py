@@ -22,9 +22,9 @@ from daqsvc.confined.limits import GIGABYTE, ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
 from drivers.base import BusCounters, BusPort
 from drivers.can.adapter import batch_of
-from drivers.can.batches import FrameSorter
+from drivers.can.batches import FrameDemultiplexer
 from drivers.frames import FrameLayout
-from drivers.keeping import Attempt, CannotOpenError, in_thread, keep_up
+from drivers.reconnect import Attempt, CannotOpenError, in_thread, run_with_reconnect
 from drivers.replay.can_log import STEP_BACK_NS, CanLog
 from drivers.replay.channel import ChannelChoice
 from drivers.replay.files import (
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
-    from drivers.can.batches import Sorted
+    from drivers.can.batches import DecodedBatch
     from drivers.replay.files import RecordedLog
 
 logger = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class ReplayDriver:
         self._port = port
         self._assemblers = {spec.name: _assembler(spec, port) for spec in port.streams}
         frames = [spec for spec in port.streams if isinstance(spec.layout, FrameLayout)]
-        self._sorter = FrameSorter(frames)
+        self._sorter = FrameDemultiplexer(frames)
         self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
         self._place = Place()
         self._reader = ConfinedProcess()
@@ -143,7 +143,7 @@ class ReplayDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`; also ends at the end of a recording that is played once."""
         try:
-            await keep_up(self.link, self._port, self._attempt)
+            await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():
@@ -194,7 +194,7 @@ class ReplayDriver:
         except Exception as error:  # noqa: BLE001 - readers of formats raise what they like
             logger.info("closing %s: %s", self.link.name, words(error))
 
-    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+    def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> DecodedBatch:
         chosen = self._channel.of(messages)
         batch = batch_of([messages[k] for k in chosen], t_ns[chosen].tolist())
         found = self._sorter.sort(batch, 0)
@@ -243,7 +243,7 @@ class ReplayDriver:
         self._to_its_end = False
         self._shift_ns = None
 
-    async def _take(self, piece: Sorted) -> None:
+    async def _take(self, piece: DecodedBatch) -> None:
         clock = self._port.clock
         for name, count in piece.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
@@ -260,7 +260,7 @@ class ReplayDriver:
             for assembler in self._assemblers.values():
                 assembler.tick(clock.monotonic_ns())
 
-    async def _place_frames(self, piece: Sorted) -> None:
+    async def _place_frames(self, piece: DecodedBatch) -> None:
         """Deliver a piece, when its last frame is due."""
         clock = self._port.clock
         now_ns = clock.monotonic_ns()

@@ -13,7 +13,7 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import ResourceLimits
-from drivers.can.batches import Sorted, StreamFrames
+from drivers.can.batches import DecodedBatch, StreamFrames
 from drivers.frames import Decoded
 from drivers.replay.table import TableError, read_columns
 
@@ -44,7 +44,7 @@ class RecordedLog(Protocol):
         """The first line that was no frame, as a person should hear of it; empty while all are frames."""
         ...
 
-    def read(self, span_ns: int) -> Sorted | None:
+    def read(self, span_ns: int) -> DecodedBatch | None:
         """The next piece: what was recorded within ``span_ns``, its arrivals in time of the recording.
 
         Returns:
@@ -135,14 +135,14 @@ class SampleTable:
         self._t_ns = 0
         self.seamless = len({len(values) / spec.rate_hz for spec, values in self._streams}) == 1
 
-    def read(self, span_ns: int) -> Sorted | None:
+    def read(self, span_ns: int) -> DecodedBatch | None:
         """See `RecordedLog.read`; the recording begins at time 0."""
         rates = [spec.rate_hz for spec, _ in self._streams]
         # A short span may hold no sample of a slow stream, but must hold some of another.
         span_ns = max(span_ns, round(2 * NS_PER_S / max(rates)))
         span_ns = min(span_ns, round(PIECE_SAMPLES * NS_PER_S / max(rates)))
         end_ns = self._t_ns + span_ns
-        found = Sorted()
+        found = DecodedBatch()
         left = False
         for spec, values in self._streams:
             first, last = (min(round(t * spec.rate_hz / NS_PER_S), len(values)) for t in (self._t_ns, end_ns))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     import can
 
-    from drivers.can.batches import Sorted
+    from drivers.can.batches import DecodedBatch
     from drivers.replay.can_log import Sort
 
 CHUNK_BYTES = 1 << 20
@@ -63,7 +63,7 @@ class GrowingCandump:
             place.file, place.offset = (status.st_dev, status.st_ino), 0
         self._file.seek(place.offset)
 
-    def read(self, span_ns: int) -> Sorted | None:
+    def read(self, span_ns: int) -> DecodedBatch | None:
         """See `RecordedLog.read`; never at the end.
 
         Raises:

@@ -20,7 +20,7 @@ import serial
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.base import BusCounters, BusPort
-from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up, sparing_others
+from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
 from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming, TextLayout
 from drivers.serial.reader import SHUTDOWN_S, ReceivedBytes, SerialReader, close_port
@@ -105,7 +105,7 @@ class SerialDriver:
         """See `drivers.base.Driver.run`."""
         try:
             await in_thread(_warm, self._port.options, self._port.streams, patience_s=SHUTDOWN_S)
-            await keep_up(self.link, self._port, self._attempt)
+            await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
             for assembler in self._assemblers.values():

@@ -31,7 +31,7 @@ from targets import Targets
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from drivers.base import BusPort, StreamSpec
-from drivers.can.batches import LONGEST, CanBatch, FrameSorter
+from drivers.can.batches import LONGEST, CanBatch, FrameDemultiplexer
 from drivers.can.driver import CanDriver
 from drivers.can.record_files import LogFile
 from drivers.can.record_formats import ENDINGS, encoder_for
@@ -138,7 +138,7 @@ def full_socket(sent: list[bytes]) -> socket.socket:
     return theirs
 
 
-SORTER = FrameSorter([StreamSpec(f"{i:x}", layout(i), 1000.0) for i in IDS])
+SORTER = FrameDemultiplexer([StreamSpec(f"{i:x}", layout(i), 1000.0) for i in IDS])
 DATABASE = cantools.database.load_string(DBC, "dbc")
 """The first round compiles what either of them compiles; the median leaves that out."""
 

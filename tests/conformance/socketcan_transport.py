@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import BusPort, StartPolicy
-    from drivers.can.batches import FrameSorter
+    from drivers.can.batches import FrameDemultiplexer
     from drivers.can.socketcan import SocketCan
 
 NEEDS = "DAQSVC_HIL"
@@ -124,7 +124,7 @@ class Vcan:
         self.device.stop()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
-        def open_watched(port: BusPort, sorter: FrameSorter) -> SocketCan:
+        def open_watched(port: BusPort, sorter: FrameDemultiplexer) -> SocketCan:
             reader = open_socketcan(port.options, sorter.matches, port.clock)
             stamp_when_read(reader)
             self.device.watch(reader)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import BusPort, StartPolicy
-    from drivers.can.batches import FrameSorter
+    from drivers.can.batches import FrameDemultiplexer
     from drivers.can.socketcan import SocketCan
 
 
@@ -63,7 +63,7 @@ class StandInSocketCan:
         self._bus.unplug()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
-        def open_end(port: BusPort, sorter: FrameSorter) -> SocketCan:
+        def open_end(port: BusPort, sorter: FrameDemultiplexer) -> SocketCan:
             reader = self._bus.open(port, sorter)
             stamp_when_read(reader)
             return reader

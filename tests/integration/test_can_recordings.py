@@ -16,7 +16,7 @@ from daqsvc.assembly_drivers import drivers
 from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
-from drivers.can.batches import FrameSorter
+from drivers.can.batches import FrameDemultiplexer
 from drivers.can.dbc import layout_from_dbc
 from drivers.replay.can_log import CanLog
 from drivers.replay.driver import ReplayCounters
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.models import MachineFile
-    from drivers.can.batches import Sorted
+    from drivers.can.batches import DecodedBatch
     from drivers.frames import FrameLayout
 
 pytestmark = pytest.mark.data
@@ -62,11 +62,11 @@ def layout_of(dbc: Path, message: Message) -> FrameLayout:
     return layout_from_dbc(dbc, message.name, counter=first, counts="frames", channels=channels)
 
 
-def played(log: Path, specs: list[StreamSpec[FrameLayout]]) -> list[Sorted]:
+def played(log: Path, specs: list[StreamSpec[FrameLayout]]) -> list[DecodedBatch]:
     """The log as the replay driver reads it, piece by piece."""
-    sorter = FrameSorter(specs)
+    sorter = FrameDemultiplexer(specs)
 
-    def sort(messages: list[can.Message], t_ns: NDArray[np.int64]) -> Sorted:
+    def sort(messages: list[can.Message], t_ns: NDArray[np.int64]) -> DecodedBatch:
         return sorter.sort(batch_of(messages, t_ns.tolist()), 0)
 
     recording = CanLog(log, sort)

@@ -12,7 +12,7 @@ from running_drivers import CountingDevice, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can.batches import ERROR, Sorted
+from drivers.can.batches import ERROR, DecodedBatch
 from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
@@ -95,7 +95,7 @@ async def test_bus_off_and_restart_in_one_batch_are_one_loss() -> None:
     source_errors = np.array([ERROR | 0x40, ERROR | 0x100], np.uint32)
     from drivers.can.errors import ErrorCounts
 
-    driver.take(Sorted(errors=ErrorCounts.of(source_errors, np.zeros((2, 8), np.uint8))))
+    driver.take(DecodedBatch(errors=ErrorCounts.of(source_errors, np.zeros((2, 8), np.uint8))))
     assert (driver.link.state, driver.link.losses) == ("up", 1)
 
 
@@ -104,8 +104,8 @@ async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
 ) -> None:
     driver = driver_on(StandInBus(), [])
     with caplog.at_level(logging.WARNING):
-        driver.take(Sorted(notes={"frames_overrun": 3}))
-        driver.take(Sorted(notes={"frames_overrun": 4}))
+        driver.take(DecodedBatch(notes={"frames_overrun": 3}))
+        driver.take(DecodedBatch(notes={"frames_overrun": 4}))
     assert driver.counters.frames_overrun == 7
     assert [record.message for record in caplog.records if "receive_buffer_bytes" in record.message] == [
         caplog.records[0].message

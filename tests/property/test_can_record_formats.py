@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can.adapter import batch_of
-from drivers.can.batches import ERROR, Sorted
+from drivers.can.batches import ERROR, DecodedBatch
 from drivers.can.record_files import LogFile
 from drivers.can.record_formats import ENDINGS, encoder_for
 from drivers.replay.can_log import CanLog
@@ -79,9 +79,9 @@ def read_again(path: Path) -> list[can.Message]:
     """The frames of a log, as the replay driver gets them."""
     found: list[can.Message] = []
 
-    def keep(messages: list[can.Message], _t_ns: object) -> Sorted:
+    def keep(messages: list[can.Message], _t_ns: object) -> DecodedBatch:
         found.extend(messages)
-        return Sorted()
+        return DecodedBatch()
 
     log = CanLog(path, keep)
     while log.read(10**18) is not None:

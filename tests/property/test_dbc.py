@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from drivers.base import StreamSpec
-from drivers.can.batches import CanBatch, FrameSorter
+from drivers.can.batches import CanBatch, FrameDemultiplexer
 from drivers.can.dbc import layout_from_dbc, selecting_values
 from drivers.frames import LayoutError
 
@@ -135,7 +135,7 @@ def test_pages_go_to_their_streams_and_are_encoded_as_they_are_read(paged: Path)
     assert message.decode(sent[1].tobytes())["Nested"] == -5
     data = np.zeros((3, 64), np.uint8)
     data[:, :12] = sent
-    sorter = FrameSorter([StreamSpec(name, layout, 100.0) for name, layout in layouts.items()])
+    sorter = FrameDemultiplexer([StreamSpec(name, layout, 100.0) for name, layout in layouts.items()])
     ids = np.full(3, 2566844416, np.uint32)
     found = sorter.sort(CanBatch(ids, np.full(3, 12), data, np.arange(3)), 0)
     got = {part.stream: part.decoded.samples.ravel().tolist() for part in found.frames}

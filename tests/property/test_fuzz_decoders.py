@@ -20,7 +20,7 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.base import BusPort, StreamSpec
 from drivers.can.adapter import batch_of
-from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter
+from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameDemultiplexer
 from drivers.can.driver import CanDriver
 from drivers.frames import Field, FrameLayout
 from drivers.modbus.registers import RegisterField, RegisterRecord, plan_runs
@@ -126,7 +126,7 @@ def can_frames(rng: np.random.Generator) -> int:
     lengths = rng.choice([0, 1, 8, 8, 32, 32, 64], n)
     data = rng.integers(0, 256, (n, 64)).astype(np.uint8)
     batch = CanBatch(ids, lengths, data, np.arange(n))
-    found = FrameSorter(specs).sort(batch, int(rng.choice([0x1FFF_FFFF, 0x40, 0])))
+    found = FrameDemultiplexer(specs).sort(batch, int(rng.choice([0x1FFF_FFFF, 0x40, 0])))
     decoded = sum(len(frames.arrival_ns) for frames in found.frames)
     wrong = sum(count for count, _ in found.wrong_length.values())
     notes = found.notes
@@ -266,7 +266,7 @@ def candump_lines(rng: np.random.Generator) -> int:
     messages = list(log)
     assert len(messages) + log.malformed > 0
     batch = batch_of(messages, [0] * len(messages))
-    FrameSorter([StreamSpec("s", frame_layout(), 1000.0)]).sort(batch, 0)
+    FrameDemultiplexer([StreamSpec("s", frame_layout(), 1000.0)]).sort(batch, 0)
     return n
 
 

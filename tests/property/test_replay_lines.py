@@ -11,7 +11,7 @@ from can.io import TRCReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can.batches import Sorted
+from drivers.can.batches import DecodedBatch
 from drivers.replay.can_log import CanLog
 from drivers.replay.lines import TextLog
 
@@ -67,9 +67,9 @@ def test_a_damaged_line_costs_no_other_frame(ending: str, damages: list[tuple[in
     damaged = {number for number, *_ in damages}
     found: list[can.Message] = []
 
-    def keep(messages: list[can.Message], _t_ns: object) -> Sorted:
+    def keep(messages: list[can.Message], _t_ns: object) -> DecodedBatch:
         found.extend(messages)
-        return Sorted()
+        return DecodedBatch()
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"run{ending}"

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import serial
 
-from drivers.can.batches import Sorted
+from drivers.can.batches import DecodedBatch
 from drivers.can.reader import BATCHES_UNDER_WAY, CanReader
 from drivers.hand_over import HandOver
 from drivers.serial.reader import SerialReader
@@ -62,8 +62,8 @@ class Source:
         self.reads += 1
         return SimpleNamespace(ids=(), drained_ns=None)
 
-    def sort(self, _batch: object, _classes: object) -> Sorted:
-        return Sorted()
+    def sort(self, _batch: object, _classes: object) -> DecodedBatch:
+        return DecodedBatch()
 
     def close(self) -> None:
         """Nothing is open."""

@@ -15,7 +15,7 @@ from can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import StreamSpec
-from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameSorter, IdMatch
+from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameDemultiplexer, IdMatch
 from drivers.can.kernel_time import KernelTime
 from drivers.can.recvmmsg import DatagramBuffer
 from drivers.can.socketcan import BATCH_FRAMES, SocketCan, open_socketcan
@@ -258,7 +258,7 @@ def batch(frames: list[tuple[int, bytes]]) -> CanBatch:
 
 def test_frames_are_sorted_to_streams_in_their_order() -> None:
     layouts = {"a": layout(0x101), "b": layout(0x101, extended=True), "c": layout(0x205, length=64)}
-    sorter = FrameSorter([StreamSpec(name, each, 100.0) for name, each in layouts.items()])
+    sorter = FrameDemultiplexer([StreamSpec(name, each, 100.0) for name, each in layouts.items()])
     rng = np.random.default_rng(1)
     frames: list[tuple[int, bytes]] = []
     expected: dict[str, list[tuple[int, int]]] = {name: [] for name in layouts}
@@ -285,7 +285,7 @@ def test_frames_are_sorted_to_streams_in_their_order() -> None:
 
 
 def test_two_streams_may_share_an_id() -> None:
-    sorter = FrameSorter([StreamSpec("a", layout(), 100.0), StreamSpec("b", layout(), 100.0)])
+    sorter = FrameDemultiplexer([StreamSpec("a", layout(), 100.0), StreamSpec("b", layout(), 100.0)])
     found = sorter.sort(batch([(0x101, bytes(8))]), 0)
     assert sorted(part.stream for part in found.frames) == ["a", "b"]
 

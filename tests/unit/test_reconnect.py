@@ -16,7 +16,7 @@ import pytest
 from daqsvc.acquisition.supervisor import Link
 from drivers import keeping
 from drivers.base import BusPort, DeviceAbsentError
-from drivers.keeping import Attempt, CannotOpenError, ended, in_thread, keep_up
+from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,7 +61,7 @@ async def _kept(outcomes: list[Attempt | None], start: StartPolicy = "retry") ->
         return next(left)
 
     clock, link = _NotedWaits(), Link("CAN bus 'can0'")
-    await keep_up(link, _port(clock, start), attempt)
+    await run_with_reconnect(link, _port(clock, start), attempt)
     return link, clock.waits_ns, made
 
 
@@ -93,7 +93,7 @@ async def test_an_attempt_that_fails_unforeseen_is_said_once_and_tried_again(
         return None
 
     link = Link("CAN bus 'can0'")
-    await keep_up(link, _port(_NotedWaits(), "error"), attempt)
+    await run_with_reconnect(link, _port(_NotedWaits(), "error"), attempt)
     assert made == 4
     assert [record.levelname for record in caplog.records].count("ERROR") == 1
     assert link.reason == "its driver failed: 'a mistake'"
@@ -106,7 +106,7 @@ async def test_a_driver_that_is_started_again_tries_what_was_there_before() -> N
     async def attempt() -> Attempt | None:
         return next(left)
 
-    await keep_up(link, _port(_NotedWaits(), "error"), attempt)
+    await run_with_reconnect(link, _port(_NotedWaits(), "error"), attempt)
     assert next(left, "none") == "none", "it was not given up"
 
 
@@ -160,11 +160,11 @@ async def test_a_link_that_cannot_be_opened_is_absent() -> None:
             raise error
 
     clock, link = _NotedWaits(), Link("CAN bus 'can0'")
-    await keep_up(link, _port(clock), attempt)
+    await run_with_reconnect(link, _port(clock), attempt)
     assert (link.reason, len(clock.waits_ns)) == ("it cannot be opened: no such interface", 1)
     left = iter([CannotOpenError("it cannot be opened: no such interface")])
     with pytest.raises(DeviceAbsentError, match=r"^CAN bus 'can0': it cannot be opened: no such interface$"):
-        await keep_up(link, _port(clock, "error"), attempt)
+        await run_with_reconnect(link, _port(clock, "error"), attempt)
 
 
 def _call_that_waits(go_on: threading.Event) -> Callable[[], str]:
@@ -242,7 +242,7 @@ async def test_what_a_call_that_failed_has_opened_is_let_go_at_once(patience_s: 
 def test_a_process_does_not_wait_for_a_call_that_hangs() -> None:
     script = """
 import asyncio, threading
-from drivers.keeping import in_thread
+from drivers.reconnect import in_thread
 
 async def main():
     task = asyncio.create_task(in_thread(threading.Event().wait, patience_s=0.02))

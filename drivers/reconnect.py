@@ -46,7 +46,7 @@ class CannotOpenError(Exception):
     """The link cannot be opened; says why, and what to do about it."""
 
 
-async def keep_up(
+async def run_with_reconnect(
     link: Link,
     port: BusPort,
     attempt: Callable[[], Awaitable[Attempt | None]],
