@@ -11,10 +11,11 @@ import asyncio
 import contextlib
 import logging
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
-from daqsvc.outbox.files import FileError, connect, is_corrupt, set_aside
+from daqsvc.outbox.files import FileError, connect, is_corrupt
 from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum, is_sound
+from daqsvc.outbox.rescue import finish, rescue
 
 if TYPE_CHECKING:
     import sqlite3
@@ -150,6 +151,7 @@ class DeadLetters:
     def _with_file(
         self, work: Callable[Concatenate[sqlite3.Connection, _P], _T], *args: _P.args, **options: _P.kwargs
     ) -> _T:
+        finish(self._path, self._wall_ns())
         with contextlib.closing(connect(self._path, synchronous="FULL")) as connection:
             connection.execute("BEGIN IMMEDIATE")
             connection.execute(_TABLE)
@@ -164,13 +166,15 @@ class DeadLetters:
         return result
 
     def _set_aside(self, error: Exception) -> None:
-        self.dropped += self.waiting
-        aside = set_aside(self._path, self._wall_ns()) if self._path.exists() else None
+        aside, count = rescue(self._path, "letters", _make, _is_row_sound, self._wall_ns())
+        self.dropped += max(self.waiting - count, 0)
         log.error(
-            "%s is damaged (%s) and set aside as %s; it held messages that the broker had refused",
+            "%s is damaged (%s) and set aside as %s; of the messages in it that the broker had refused, %d "
+            "can be read and are kept",
             self._path,
             error,
             aside,
+            count,
         )
 
     def _insert(self, connection: sqlite3.Connection, message: OutboxMessage, reason: str) -> None:
@@ -213,6 +217,16 @@ class DeadLetters:
         if first is not None:
             self._insert(connection, message, first[0])
         return first is not None
+
+
+def _make(connection: sqlite3.Connection) -> None:
+    connection.execute(_TABLE)
+
+
+def _is_row_sound(row: tuple[Any, ...]) -> bool:
+    sequence, topic, payload, retain, reason, wall_ns, told = row
+    told_rightly = isinstance(told, int) and is_sound(sequence, topic, payload, told)
+    return told_rightly and isinstance(retain, int) and isinstance(reason, str) and isinstance(wall_ns, int)
 
 
 def _nothing(_connection: sqlite3.Connection) -> None:

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import sqlite3
 import time
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.outbox.files import (
     FileError,
@@ -21,10 +21,10 @@ from daqsvc.outbox.files import (
     free_bytes,
     is_corrupt,
     pragma,
-    set_aside,
     used_bytes,
 )
 from daqsvc.outbox.messages import TelemetryMessage, checksum, is_sound
+from daqsvc.outbox.rescue import finish, rescue
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -225,6 +225,7 @@ class TelemetryFile:
             raise sqlite3.OperationalError("the store cannot be used yet")
         if free_bytes(self._path.parent) < self._limits.reserve_bytes + SMALLEST_BYTES:
             raise sqlite3.OperationalError("the disk is nearly full")
+        finish(self._path, self._clock.wall_ns())
         try:
             self._connection = self._connect()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
@@ -259,21 +260,26 @@ class TelemetryFile:
         """Go on without the file as it is: with a new one if it is corrupt, else in memory."""
         if is_corrupt(error):
             self.close()
-            self._counters.dropped_disk += self._counters.depth
-            self._counters.depth = 0
+            before = self._counters.depth
             try:
                 self._set_aside(error)
                 self._open_file()
             except FileError as again:
                 self._into_memory(again)
+            else:
+                self._counters.dropped_disk += max(before - self._counters.depth, 0)
         else:
             self._into_memory(error)
 
     def _set_aside(self, error: Exception) -> None:
-        aside = set_aside(self._path, self._clock.wall_ns())
+        aside, count = rescue(self._path, "telemetry", _create, _is_row_sound, self._clock.wall_ns())
         self._counters.quarantined += 1
         log.error(
-            "telemetry %s is corrupt (%s); set aside as %s, starting a new one", self._path, error, aside
+            "telemetry %s is corrupt (%s); set aside as %s, going on with the %d messages that can be read",
+            self._path,
+            error,
+            aside,
+            count,
         )
 
     def _into_memory(self, error: Exception) -> None:
@@ -363,6 +369,12 @@ def _known_version(connection: sqlite3.Connection) -> int:
     if version not in {0, SCHEMA_VERSION}:
         raise corruption(f"schema version {version}, this program knows {SCHEMA_VERSION}")
     return version
+
+
+def _is_row_sound(row: tuple[Any, ...]) -> bool:
+    number, topic, payload, *times, told = row
+    told_rightly = isinstance(told, int) and is_sound(number, topic, payload, told)
+    return told_rightly and all(isinstance(time_ns, int) for time_ns in times)
 
 
 def _create(connection: sqlite3.Connection) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import sqlite3
 
 import pytest
+from crashing import dies_at
 
 from daqsvc.outbox import dead_letters
 from daqsvc.outbox.dead_letters import DeadLetters
-from daqsvc.outbox.messages import OutboxError, OutboxMessage
+from daqsvc.outbox.messages import OutboxError, OutboxMessage, checksum
 
 
 @pytest.fixture
@@ -107,3 +110,57 @@ async def test_whoever_is_cancelled_leaves_nothing_half_done(path):
     known = letters.waiting
     await letters.load()
     assert letters.waiting == known
+
+
+def damaged(path, count=200):
+    """A file with a page that nobody can read; the numbers of letters on other pages."""
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as made:
+        dead_letters._make(made)
+        made.execute("BEGIN")
+        for number in range(count):
+            payload = b"%d " % number * 100
+            told = checksum(number, f"t/{number % 3}", payload)
+            made.execute(
+                "INSERT INTO letters VALUES (?, ?, ?, 1, 'no', 0, ?)",
+                (number, f"t/{number % 3}", payload, told),
+            )
+        made.execute("COMMIT")
+    content = bytearray(path.read_bytes())
+    begin = content.index(b"%d " % (count // 2) * 100) // 4096 * 4096
+    on_page = [n for n in range(count) if b"%d " % n * 100 in content[begin : begin + 4096]]
+    content[begin : begin + 4096] = b"\xff" * 4096
+    path.write_bytes(content)
+    return set(range(count)) - set(range(min(on_page) - 1, max(on_page) + 2))
+
+
+def numbers(path):
+    letters = at(path)
+    letters._work(lambda connection: None)
+    with contextlib.closing(sqlite3.connect(path)) as there:
+        return {row[0] for row in there.execute("SELECT sequence FROM letters")}, letters
+
+
+async def test_of_a_damaged_file_what_can_be_read_is_kept(path, caplog):
+    readable = damaged(path)
+    kept, letters = await asyncio.to_thread(numbers, path)
+    assert kept >= readable
+    assert letters.waiting == len(kept) > 150
+    assert f"{len(kept)} can be read and are kept" in caplog.text
+    assert len(list(path.parent.glob("refused.sqlite.corrupt-*"))) == 1
+    assert (await letters.oldest("t/0")).sequence == 0
+
+
+def test_a_crash_while_a_damaged_file_is_replaced_loses_nothing_that_can_be_read(tmp_path):
+    step = 1
+    while True:
+        path = tmp_path / f"{step}" / "refused.sqlite"
+        path.parent.mkdir()
+        readable = damaged(path, 60)
+        done = dies_at(step, lambda path=path: at(path)._work(lambda connection: None))
+        kept, _ = numbers(path)
+        assert kept >= readable, f"died before step {step}"
+        assert not path.with_name("refused.sqlite.saved").exists()
+        if done < step:
+            break
+        step += 4
+    assert step > 20
