@@ -5,6 +5,8 @@
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
 # make dist   what a release consists of, in dist/: wheel, and a CycloneDX list of everything it is installed with
+# make guard  is what users see as before? make guard ARGS=--take takes the golden texts anew
+# make measure  figures of the source: lines, circles of imports, names that occur twice
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
@@ -25,7 +27,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check bench bench-data dist nothing-lost test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data dist nothing-lost test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -82,6 +84,12 @@ test-wheel: dist
 
 hooks: $(READY)
 	@$(BIN)/pre-commit install
+
+guard: $(READY)
+	@PYTHONPATH=tests $(BIN)/python -m guard $(ARGS)
+
+measure: $(READY)
+	@PYTHONPATH=tests $(BIN)/python -m guard.measure
 
 nothing-lost: $(READY)
 	@PYTHONPATH=tests $(BIN)/python -m nothing_lost $(ARGS)

@@ -1,0 +1,162 @@
+"""What users see is what the golden texts say; and the guard that holds it so catches a changed word."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+from guard.broken import contradictions, covered
+from guard.golden import FOLDER, compare
+from guard.measure import circles, imports, modules, repeated_classes
+from guard.recordings import DATA, GROUPS
+from guard.verbs import ROOT, SPECIMENS, answer, workplace
+
+import daqsvc.settings  # noqa: F401 - all tables are known
+from daqsvc.cli import CheckCommand
+from daqsvc.settings.section import Section
+
+CONFIG = ROOT / "config" / "machines"
+
+
+def guard(*arguments: str | Path, code: int = 0) -> str:
+    """What the guard prints; in a process of its own, as `make guard` runs it."""
+    done = subprocess.run(
+        [sys.executable, "-m", "guard", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.timeout(300)
+def test_what_users_see_is_as_before():
+    guard("--fast")
+
+
+@pytest.mark.long
+@pytest.mark.data
+@pytest.mark.timeout(1800)
+def test_what_is_said_of_every_recording_is_as_before():
+    if not DATA.is_dir():
+        pytest.skip(f"no recordings at {DATA}; set DAQSVC_DATA to where they are")
+    guard("--only", *GROUPS)
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return Path(shutil.copytree(FOLDER, tmp_path / "golden"))
+
+
+def test_a_changed_key_is_caught_shown_and_taken(copy):
+    text = (copy / "schemas.txt").read_text(encoding="utf-8")
+    (copy / "schemas.txt").write_text(text.replace('"wall_ns"', '"wall_time_ns"', 1), encoding="utf-8")
+    said = guard("--only", "schemas", "--golden", copy, code=1)
+    assert "--- golden/schemas.txt" in said
+    assert any(line.startswith("-") and '"wall_time_ns"' in line for line in said.splitlines())
+    assert any(line.startswith("+") and '"wall_ns"' in line for line in said.splitlines())
+    assert "If that is meant: make guard ARGS=--take" in said
+    assert "1 of them new or other than before" in guard("--only", "schemas", "--golden", copy, "--take")
+    guard("--only", "schemas", "--golden", copy)
+
+
+def test_a_changed_word_of_the_code_is_caught(monkeypatch):
+    def whole(old, new):
+        with workplace():
+            said = f"{answer('--help')}\n\n{answer('run', '--help')}\n\n{answer('check', '--help')}\n"
+        golden = (FOLDER / "help.txt").read_text(encoding="utf-8")
+        assert old in golden
+        assert new not in golden
+        return compare("help.txt", said + golden[len(said) :], FOLDER)
+
+    word, other = (
+        "read a machine file and say what was understood",
+        "read a machine file and tell what it holds",
+    )
+    assert whole(word, other) == ""
+    monkeypatch.setattr(CheckCommand, "help", other)
+    diff = whole(word, other)
+    assert any(line.startswith("+") and other in line for line in diff.splitlines())
+    assert any(line.startswith("-") and word in line for line in diff.splitlines())
+
+
+def test_a_changed_key_of_a_message_is_caught():
+    text = (FOLDER / "messages.txt").read_text(encoding="utf-8")
+    diff = compare("messages.txt", text.replace("  cause.severity\n", "  cause.level\n", 1), FOLDER)
+    assert "-  cause.severity" in diff
+    assert "+  cause.level" in diff
+
+
+def texts(*folders):
+    return {
+        path.name: path.read_text(encoding="utf-8") for one in folders for path in sorted(one.glob("*.toml"))
+    }
+
+
+def sections(above=Section):
+    for section in above.__subclasses__():
+        yield section
+        yield from sections(section)
+
+
+def subtables(known, title):
+    """Keys of a table that hold tables with a header of their own."""
+    begin = f"{title}." if title else ""
+    return {other.removeprefix(begin).split("<")[0] for other in known if other.startswith(begin)}
+
+
+def test_every_key_of_every_table_is_spoilt():
+    for group in ("daqsvc.drivers", "daqsvc.detectors", "daqsvc.outputs"):
+        for point in entry_points(group=group):
+            point.load()
+    known = covered(texts(CONFIG, SPECIMENS))
+    left_out = {}
+    seen = 0
+    for section in sections():
+        # One with kinds of its own shows by these; one with an underscore before its name never stands alone.
+        if section.__subclasses__() or section.__name__.startswith("_"):
+            continue
+        if section.__module__.split(".")[0] not in {"daqsvc", "drivers"}:
+            continue  # of another test
+        seen += 1
+        held = set(section.model_fields)
+        # A table of another plugin may stand in this one without being a key of its model.
+        spoilt = set().union(
+            *(keys for title, keys in known.items() if keys - subtables(known, title) <= held and keys & held)
+        )
+        if missing := held - spoilt:
+            left_out[section.__name__] = sorted(missing)
+    assert seen > 40
+    assert left_out == {}, "add them to a file of tests/guard/specimens, then make guard ARGS=--take"
+
+
+def test_there_are_as_many_broken_files_as_said():
+    cases = [*contradictions(texts(CONFIG, SPECIMENS))]
+    assert len(cases) > 200
+    assert len({case.text for case in cases}) == len(cases)
+    golden = "".join(path.read_text(encoding="utf-8") for path in FOLDER.glob("broken-*.txt"))
+    assert golden.count("\nexit code 2") > 800
+
+
+def test_circles_and_names_that_occur_twice_are_counted():
+    trees = modules(
+        {
+            "a/__init__.py": "",
+            "a/one.py": "from a import two\nclass Same: ...\n",
+            "a/two.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from a.one import Same\n",
+            "a/three.py": "def later():\n    from a import four\nclass Same: ...\n",
+            "a/four.py": "from .three import later\n",
+        }
+    )
+    packages = frozenset({"a"})
+    assert circles(imports(trees, packages, "run")) == []
+    assert circles(imports(trees, packages, "types")) == [["a.one", "a.two"]]
+    assert circles(imports(trees, packages, "all")) == [["a.four", "a.three"], ["a.one", "a.two"]]
+    assert repeated_classes(trees) == {"Same": ["a.one", "a.three"]}
