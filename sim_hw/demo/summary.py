@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sim_hw.node_faults import NodeFaults
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -71,8 +73,8 @@ def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str
 
 def _not_sent(script: Script) -> list[str]:
     """When the device sends nothing, in words: frames that it would have sent count as lost, too."""
-    if script.faults is None:
-        return []
+    if not isinstance(script.faults, NodeFaults):
+        return []  # none, or a link's only
     seconds = {
         what: sum(min(window.end_s, script.duration_s) - window.start_s for window in windows)
         for what, windows in (("silence", script.faults.silence), ("brown-out", script.faults.brown_out))

@@ -270,9 +270,14 @@ def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
         assert left_behind(tmp_path)
         running.send_signal(number)
         _, said = running.communicate()
-        assert said == "daqsvc demo: interrupted\n"
+        assert without_delays(said) == ["daqsvc demo: interrupted"]
         assert running.returncode == 1
     assert left_behind(tmp_path) == []
+
+
+def without_delays(said: str) -> list[str]:
+    """The lines, but for those by which a process on a slow machine says that it stood still."""
+    return [line for line in said.splitlines() if "the process stood still for" not in line]
 
 
 def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path: Path) -> None:
@@ -284,7 +289,7 @@ def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path:
         running.stdout.readline()
         running.send_signal(signal.SIGTERM)
         _, said = running.communicate()
-    assert (said, running.returncode) == ("daqsvc demo: interrupted\n", 1)
+    assert (without_delays(said), running.returncode) == (["daqsvc demo: interrupted"], 1)
     assert left_behind(tmp_path) == []
 
 
