@@ -160,7 +160,7 @@ def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
 START_UP = """[alarm_handling.start_up]
 detector = "rotor-bank"
 measure = "speed"
-between = [300.0, 2700.0]
+between = [60.0, 540.0]
 """
 
 
