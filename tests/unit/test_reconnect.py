@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from daqsvc.acquisition.supervisor import Link
-from drivers import keeping
 from drivers.base import BusPort, DeviceAbsentError
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect
 
@@ -111,7 +110,7 @@ async def test_a_driver_that_is_started_again_tries_what_was_there_before() -> N
 
 
 async def test_a_reader_whose_thread_is_gone_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeping, "LOOK_S", 0.01)
+    monkeypatch.setattr(reconnect, "LOOK_S", 0.01)
     reason: asyncio.Future[str] = asyncio.get_running_loop().create_future()
     reader = threading.Thread(target=lambda: None)
     reader.start()
