@@ -32,7 +32,7 @@ from daqsvc.publish.topics import Topics
 from daqsvc.self_check import SelfCheck, Vitals, conditions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -95,7 +95,7 @@ class AlarmDesk:
         handling: what holds for all alarms.
         limits: how much the journal may keep.
         sparkplug: what the box is to Sparkplug, beside its own topics; None for nothing.
-        buses: the driver of each bus, by name.
+        buses: by name, what can be watched of each bus.
         bus_health: says how the buses stand.
     """
 
@@ -110,7 +110,7 @@ class AlarmDesk:
         handling: AlarmHandling | None = None,
         limits: OutboxLimits | None = None,
         sparkplug: SparkplugSettings | None = None,
-        buses: Mapping[str, str] | None = None,
+        buses: Mapping[str, Collection[str]] | None = None,
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
     ) -> None:
         limits = limits or OutboxLimits()

@@ -13,6 +13,7 @@ from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
 from daqsvc.self_check import conditions
 from daqsvc.settings.alarms import DiagnosisAlarm
 from daqsvc.settings.broker_url import host_of, is_tls, port_of
+from drivers.make import bus_self_checks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -130,7 +131,7 @@ def _services(machine: MachineFile, mqtt: MqttSettings | None) -> Iterator[str]:
         yield from plugin.quality_alarms(machine, given)
     handling = machine.alarm_handling
     yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
-    yield from conditions(mqtt, {name: bus.driver for name, bus in machine.buses.items()})
+    yield from conditions(mqtt, bus_self_checks(machine))
 
 
 def _readings(machine: MachineFile) -> tuple[Reading, ...]:

@@ -15,7 +15,7 @@ from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
     from daqsvc.publish.settings import MqttSettings
@@ -119,17 +119,22 @@ class Vitals:
     set_aside: bool = False
 
 
-def conditions(mqtt: MqttSettings | None, buses: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+def conditions(
+    mqtt: MqttSettings | None, buses: Mapping[str, Collection[str]] = MappingProxyType({})
+) -> list[str]:
     """The names of all that can be said, so that people may act on it before it is.
 
     Args:
         mqtt: how to reach the broker; None without one.
-        buses: the driver of each bus, by name.
+        buses: by name, what can be watched of each bus; see `BusTable.self_checks`.
     """
     found = list(STORE)
-    found += [f"{BUS_OVERRUN}{bus}" for bus, driver in buses.items() if driver in {"can", "serial"}]
-    for kind in (BUS_CONTROLLER, BUS_RECORDING):
-        found += [f"{kind}{bus}" for bus, driver in buses.items() if driver == "can"]
+    for kind, check in (
+        (BUS_OVERRUN, "overrun"),
+        (BUS_CONTROLLER, "controller"),
+        (BUS_RECORDING, "recording"),
+    ):
+        found += [f"{kind}{bus}" for bus, watched in buses.items() if check in watched]
     if mqtt is not None:
         found.append(REFUSED)
     if mqtt is not None and mqtt.tls:

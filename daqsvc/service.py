@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -27,11 +26,11 @@ from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import at_once, patience
 from daqsvc.publish.payloads import diagnosis_payload, status_payload
 from daqsvc.self_check import BusHealth
-from daqsvc.settings.alignment import Grid
+from daqsvc.settings.streams import Grid
 from daqsvc.supervision import EssentialLostError, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
 from drivers.base import DeviceAbsentError
-from drivers.can.errors import CanCounters
+from drivers.make import bus_drivers, bus_self_checks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -138,7 +137,7 @@ class Service:
         self._standings = dict.fromkeys(machine.streams, StreamState())
         self.rings = {grid.name: _ring(machine, grid, watching) for grid in grids}
         self.alignment = alignment(machine, self.clock, self._deliver)
-        self.drivers: list[Driver] = assembly_drivers.drivers(machine, self.clock, self._deliver, self._stand)
+        self.drivers: list[Driver] = bus_drivers(machine, self.clock, self._deliver, self._stand)
         settling_ns = {aligner.name: SETTLE_NS for aligner in self.alignment.aligners}
         self.pipeline = Pipeline(
             self.rings,
@@ -159,7 +158,7 @@ class Service:
             handling=alarm_handling(machine),
             limits=outbox_limits(machine),
             sparkplug=sparkplug_settings(machine, store),
-            buses={name: bus.driver for name, bus in machine.buses.items()},
+            buses=bus_self_checks(machine),
             bus_health=self._bus_health,
         )
         self.control = ControlServer(
@@ -323,12 +322,8 @@ class Service:
         found: dict[str, BusHealth] = {}
         for driver in self.drivers:
             counters = driver.counters
-            found[driver.name] = (
-                BusHealth(
-                    counters.overruns, counters.bus_off, counters.controller_state, counters.frames_unrecorded
-                )
-                if isinstance(counters, CanCounters)
-                else BusHealth(counters.overruns, counters.bus_off, None)
+            found[driver.name] = BusHealth(
+                counters.overruns, counters.bus_off, counters.controller_state, counters.frames_unrecorded
             )
         return found
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 LayoutT = TypeVar("LayoutT")
 
 StartPolicy = Literal["error", "retry", "ignore"]
+ControllerState = Literal["error-active", "error-warning", "error-passive", "bus-off"]
 
 
 class DeviceAbsentError(Exception):
@@ -115,6 +116,16 @@ class BusCounters:
         """What was lost to full buffers between the bus and this process, as far as that is known."""
         return 0
 
+    @property
+    def controller_state(self) -> ControllerState | None:
+        """The state of the bus's controller; None if it has none that is known."""
+        return None
+
+    @property
+    def frames_unrecorded(self) -> int:
+        """Frames that should have been recorded and were not."""
+        return 0
+
 
 class Driver(Protocol):
     """One link, kept up.
@@ -124,7 +135,11 @@ class Driver(Protocol):
 
     name: str
     link: Link
-    counters: BusCounters
+
+    @property
+    def counters(self) -> BusCounters:
+        """What happened on the bus beside its streams."""
+        ...
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from daqsvc import assembly_drivers
+from drivers.can.build import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.sim_command_order import NodeError
 
@@ -88,7 +88,7 @@ class CanNodes:
         try:
             for played in order.streams:
                 opened.append(await asyncio.to_thread(bus))
-                layout = assembly_drivers.frame_layout(order.machine, played.stream)
+                layout = frame_layout(order.machine, played.stream)
                 nodes[played.stream] = CanNode(
                     opened[-1],
                     layout,

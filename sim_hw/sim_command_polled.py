@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from drivers.modbus.build import modbus_layout
 from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -102,7 +102,7 @@ class ModbusNodes:
     async def open(cls, order: NodeOrder) -> ModbusNodes:
         """See `sim_hw.sim_command_nodes.node_for`."""
         options = order.options
-        layouts = {s.stream: assembly_drivers.modbus_layout(order.machine, s.stream) for s in order.streams}
+        layouts = {s.stream: modbus_layout(order.machine, s.stream) for s in order.streams}
         units = {layout.unit: ModbusUnit() for layout in layouts.values()}
         nodes = {
             s.stream: ModbusNode(units[layouts[s.stream].unit], layouts[s.stream], s.samples, s.rate_hz)

@@ -6,8 +6,8 @@ import asyncio
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc import assembly_drivers
 from drivers.base import StreamSpec
+from drivers.make import stream_layout
 from drivers.serial.driver import framing_of
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
@@ -36,8 +36,7 @@ class SerialNodes:
         options = order.options
         path = order.link or Path(options["port"])
         specs: list[StreamSpec[Any]] = [
-            StreamSpec(s.stream, assembly_drivers.stream_layout(order.machine, s.stream), s.rate_hz)
-            for s in order.streams
+            StreamSpec(s.stream, stream_layout(order.machine, s.stream), s.rate_hz) for s in order.streams
         ]
         if path.exists() and not path.is_symlink():
             raise NodeError(f"{path} is a real port; put the simulated one elsewhere with --link PATH")

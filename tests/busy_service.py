@@ -15,9 +15,9 @@ import can
 import numpy as np
 from machine_files import MACHINES
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -179,7 +179,7 @@ class Devices(threading.Thread):
         return [asyncio.create_task(work) for work in (*shafts, self._lines())]
 
     async def _shaft(self, machine: MachineFile, stream: str, bus_name: str) -> None:
-        layout = assembly_drivers.frame_layout(machine, stream)
+        layout = frame_layout(machine, stream)
         rate_hz = machine.streams[stream].rate_hz
         turns = SPEED_HZ * np.arange(round(60.0 * rate_hz)) / rate_hz
         rng = np.random.default_rng(5)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import can
 from brokers import eventually
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.service import Service
+from drivers.can.build import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
 
@@ -42,7 +42,7 @@ async def running(machine: MachineFile, store: Path, clock: Clock | None = None)
 async def play(service: Service, samples: np.ndarray[Any, Any], rate_hz: float) -> None:
     """Play samples ``[n, channels]`` on the bus that the first stream of a service comes over."""
     stream = next(iter(service.machine.streams))
-    layout = assembly_drivers.frame_layout(service.machine, stream)
+    layout = frame_layout(service.machine, stream)
     channel = service.machine.buses["can0"].model_dump()["channel"]
     await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
     with can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD) as bus:

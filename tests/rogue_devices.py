@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 import can
 import numpy as np
 
-from daqsvc import assembly_drivers
 from drivers.base import StreamSpec
+from drivers.make import stream_layout
 from drivers.serial.driver import framing_of
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -363,6 +363,4 @@ def _can_encoder(layout: FrameLayout) -> Encode:
 
 
 def _spec(machine: MachineFile, stream: str) -> StreamSpec[Any]:
-    return StreamSpec(
-        stream, assembly_drivers.stream_layout(machine, stream), machine.streams[stream].rate_hz
-    )
+    return StreamSpec(stream, stream_layout(machine, stream), machine.streams[stream].rate_hz)

@@ -12,7 +12,6 @@ import numpy as np
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.assembly_alignment import alignment
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.detectors.bearing.settings import Bearing
 from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
@@ -20,10 +19,11 @@ from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import CAN_LOGS
 from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE
 from daqsvc.recording.recording import Recording
-from daqsvc.settings.models import DbcLayout, PlainLayout
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import DecodedBatch, FrameDemultiplexer
+from drivers.can.build import frame_layout
+from drivers.can.settings import DbcLayout, PlainLayout
 from drivers.replay.can_log import CanLog
 from drivers.replay.files import RecordedLogError as LogError
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.assembly_alignment import alignment
@@ -14,6 +13,7 @@ from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
+from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,7 +93,7 @@ class _Listener:
         self._ring = SampleRing(grid.name, grid.channel_names, capacity)
         self._alignment = alignment(machine, clock, self._deliver)
         self._reason = ""
-        self.drivers = assembly_drivers.drivers(machine, clock, self._deliver)
+        self.drivers = bus_drivers(machine, clock, self._deliver)
         self.pipeline = Pipeline({detector.stream: self._ring}, [detector], self._report, clock)
 
     def _deliver(self, block: SampleBlock) -> None:

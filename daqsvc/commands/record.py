@@ -78,10 +78,10 @@ class RecordCommand:
         except _MisuseError as error:
             return _say(error, EXIT_MISUSED)
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
-        from daqsvc.assembly_drivers import bus_driver  # noqa: PLC0415
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.base import DeviceAbsentError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
+        from drivers.make import bus_driver  # noqa: PLC0415
 
         there = _logs(arguments.out)
         try:
@@ -111,7 +111,9 @@ class _MisuseError(Exception):
 
 
 def _bus(machine: MachineFile, name: str | None) -> str:
-    can_buses = [key for key, bus in machine.buses.items() if bus.driver == "can"]
+    from drivers.can.settings import CanBus  # noqa: PLC0415 - each verb imports what it needs
+
+    can_buses = [key for key, bus in machine.buses.items() if isinstance(bus, CanBus)]
     there = f"CAN buses of {machine.path} are {', '.join(can_buses)}" if can_buses else "there is none"
     if name is None:
         if len(can_buses) != 1:

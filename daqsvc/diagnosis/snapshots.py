@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.silence import Patience
-from daqsvc.settings.modbus import WaveformLayout
 
 if TYPE_CHECKING:
+    from daqsvc.settings.buses import Block
     from daqsvc.settings.models import MachineFile
 
 
@@ -20,19 +20,18 @@ def patience(machine: MachineFile, stream: str, rate_hz: float) -> Patience:
         stream: its name, or that of the grid.
         rate_hz: its sampling rate.
     """
-    given = _snapshots(machine, stream)
-    if given is None:
+    block = _block(machine, stream)
+    if block is None:
         return Patience(NS_PER_S / rate_hz)
-    every_ns = None if given.trigger is None else round(given.trigger.every_s * NS_PER_S)
+    every_ns = None if block.every_s is None else round(block.every_s * NS_PER_S)
     return Patience(snapshots=True, every_ns=every_ns)
 
 
 def at_once(machine: MachineFile, stream: str) -> int:
     """Samples that come in one piece of a stream, or a grid, and are judged as one; 0 if none need to be."""
-    given = _snapshots(machine, stream)
-    return 0 if given is None else given.samples
+    block = _block(machine, stream)
+    return 0 if block is None else block.samples
 
 
-def _snapshots(machine: MachineFile, stream: str) -> WaveformLayout | None:
-    given = machine.streams[stream].layout if stream in machine.streams else None
-    return given if isinstance(given, WaveformLayout) else None
+def _block(machine: MachineFile, stream: str) -> Block | None:
+    return machine.streams[stream].layout.block if stream in machine.streams else None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from pathlib import Path
 from typing import Annotated, TypeAlias
 
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
+from daqsvc.settings.buses import Device
 from daqsvc.settings.section import Text
 
 _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
@@ -71,3 +73,14 @@ Host: TypeAlias = Annotated[Text, AfterValidator(_host)]
 
 DevicePath: TypeAlias = Annotated[Text, AfterValidator(_device_path)]
 """The whole path of a device file."""
+
+
+def serial_port(key: str, path: str) -> Device:
+    """A serial port that a bus has for itself, whatever it carries and whichever link to it is named.
+
+    Args:
+        key: the key that names it.
+        path: its device file.
+    """
+    remedy = "give each bus its own port, or put all streams of the port on one bus"
+    return Device(key, ("serial port", Path(path).resolve()), remedy)

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import Field
 
 from daqsvc.settings.section import Section, WaitMs
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from daqsvc.settings.buses import Stream
-    from daqsvc.settings.sensors import Sensor
 
 
 class Alignment(Section):
@@ -25,45 +18,3 @@ class Alignment(Section):
     max_wait_ms: WaitMs = Field(
         default=1000.0, description="how long after all others a stream may come before the rest goes on"
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Where a detector finds its samples: in one stream, or in several on the grid of the first one.
-
-    Attributes:
-        streams: by name, the one whose samples are the grid first.
-    """
-
-    streams: Mapping[str, Stream]
-
-    @property
-    def name(self) -> str:
-        """Name of the stream, or of the grid: its streams joined by ``+``, which no stream's name has."""
-        return "+".join(self.streams)
-
-    @property
-    def aligned(self) -> bool:
-        """Whether several streams must be put on one grid."""
-        return len(self.streams) > 1
-
-    @property
-    def rate_hz(self) -> float:
-        """Samples per second."""
-        return next(iter(self.streams.values())).rate_hz
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        if not self.aligned:
-            return next(iter(self.streams.values())).layout.channel_names
-        return tuple(
-            f"{name}.{channel}" for name, s in self.streams.items() for channel in s.layout.channel_names
-        )
-
-    def column(self, sensor: Sensor) -> int:
-        """Where a sensor stands among the columns."""
-        names = list(self.streams)
-        before = names[: names.index(sensor.stream)]
-        own = self.streams[sensor.stream].layout.channel_names.index(sensor.channel)
-        return sum(len(self.streams[name].layout.channel_names) for name in before) + own

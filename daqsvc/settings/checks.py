@@ -8,65 +8,53 @@ from __future__ import annotations
 
 import ipaddress
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.broker_url import is_tls
-from daqsvc.settings.bus_checks import check_can_keys, check_can_owners, check_drivers, check_interfaces
-from daqsvc.settings.buses import DbcLayout, PlainLayout
+from daqsvc.settings.bus_checks import check_devices, check_drivers, check_unused
 from daqsvc.settings.layout_checks import (
-    check_bus_load,
     check_channel_use,
     check_channels,
-    check_counter,
-    check_frame_length,
-    check_ids,
-    check_plain_layout,
     check_sensor_channel,
     check_stream_bus,
     unique,
 )
 from daqsvc.settings.memory_checks import check_memory
-from daqsvc.settings.modbus_checks import check_line_load, check_modbus
-from daqsvc.settings.modbus_overlaps import check_writes_and_samples
 from daqsvc.settings.mqtt_files import credential_files
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.record_checks import check_recorded_buses
-from daqsvc.settings.registry import configured
-from daqsvc.settings.replay_checks import check_replay_buses, check_replayed
+from daqsvc.settings.registry import bus_tables, configured, driver_of_layout
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
     check_alarm_reach,
-    check_dbc_unit,
     check_probe_angles,
     check_reach,
     check_sensitivity,
     check_voltages,
 )
-from daqsvc.settings.serial_checks import check_serial, check_serial_ports
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
-    from daqsvc.settings.dbc import DbcMessage
-    from daqsvc.settings.models import MachineFile, Mqtt
+    from daqsvc.settings.models import MachineFile, Mqtt, Stream
     from daqsvc.settings.problems import KeyPath
+    from daqsvc.settings.registry import BusTable
 
 _MOST_FINDINGS = 200
 """Whoever has mended these may ask again."""
 
 
-def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Finding]:
+def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
     """Run every check on a machine file.
 
     Args:
         draft: the machine file, or what is valid of it.
-        messages: by stream, the DBC messages that could be read.
+        facts: by stream, what was read from the files that its layout names.
     """
     findings: list[Finding] = []
-    for found in _checks(draft, messages):
+    for found in _checks(draft, facts):
         with suppress(UnusableValueError):
             for finding in found:
                 findings.append(finding)
@@ -75,41 +63,31 @@ def check(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> list[Findin
     return findings
 
 
-def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Iterator[Finding]]:
+def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
     """Every check with what it is about."""
     with suppress(UnusableValueError):
         for name, stream in draft.streams.items():
             at: KeyPath = ("streams", name)
             yield check_stream_bus(draft, stream, at)
-            yield check_frame_length(draft, stream, messages.get(name), at)
-            yield check_counter(stream, messages.get(name), at)
-            yield check_modbus(draft, stream, at)
-            yield check_serial(draft, stream, at)
-            yield check_replayed(draft, stream, at)
+            for plugin in _drivers_of(draft, stream):
+                with suppress(UnusableValueError):
+                    yield from plugin.stream_checks(draft, stream, facts.get(name), at)
             with suppress(UnusableValueError):
-                if isinstance(stream.layout, PlainLayout):
-                    yield check_plain_layout(stream.layout, (*at, "layout"))
                 yield check_channels(stream.layout, (*at, "layout"))
-    yield check_ids(draft, messages)
-    yield check_bus_load(draft, messages)
-    yield _unused_buses(draft)
+    yield check_unused(draft)
     yield check_drivers(draft)
-    yield check_interfaces(draft)
-    yield check_can_owners(draft)
-    yield check_can_keys(draft)
-    yield check_serial_ports(draft)
-    yield check_line_load(draft)
-    yield check_replay_buses(draft)
-    yield check_recorded_buses(draft)
-    yield from _sensor_checks(draft, messages)
+    yield check_devices(draft)
+    for plugin in _drivers(draft):
+        with suppress(UnusableValueError):
+            yield from plugin.checks(draft, facts)
+    yield from _sensor_checks(draft, facts)
     yield check_memory(draft)
     yield _names(draft)
-    yield check_writes_and_samples(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
-        for _, plugin, given in configured(draft.pipeline, valid_only=True):
+        for _, detector, given in configured(draft.pipeline, valid_only=True):
             with suppress(UnusableValueError):
-                yield from plugin.checks(draft, given)
+                yield from detector.checks(draft, given)
     yield from alignment_checks(draft)
     yield from alarm_checks(draft)
     with suppress(UnusableValueError):
@@ -121,7 +99,32 @@ def _checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[
             yield _open_to_commands(draft.mqtt)
 
 
-def _sensor_checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Iterator[Finding]]:
+def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
+    """The driver of a stream's bus, and that of its layout if it is another; in the order of their place."""
+    used: set[BusTable | None] = set()
+    with suppress(UnusableValueError):
+        bus = draft.buses.get(stream.bus)
+        used.add(None if bus is None else bus_tables().get(bus.driver))
+    with suppress(UnusableValueError):
+        if not any(plugin is not None and type(stream.layout) in plugin.layouts for plugin in used):
+            used.add(driver_of_layout(stream.layout))
+    return [plugin for plugin in bus_tables().values() if plugin in used]
+
+
+def _drivers(draft: MachineFile) -> list[BusTable]:
+    """The drivers that a machine file has a bus or a layout of, in the order of their place."""
+    used: set[BusTable] = set()
+    with suppress(UnusableValueError):
+        for bus in draft.buses.values():
+            with suppress(UnusableValueError):
+                used.update(plugin for key, plugin in bus_tables().items() if key == bus.driver)
+    with suppress(UnusableValueError):
+        for stream in draft.streams.values():
+            used.update(_drivers_of(draft, stream))
+    return [plugin for plugin in bus_tables().values() if plugin in used]
+
+
+def _sensor_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
     """Every check of the sensors, and of what their channels can carry."""
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
@@ -129,26 +132,16 @@ def _sensor_checks(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> It
             yield check_sensor_channel(draft, sensor, at)
             yield check_voltages(draft, sensor, at)
             yield check_sensitivity(sensor, at)
-            yield check_reach(draft, sensor, messages, at)
-            yield check_dbc_unit(draft, sensor, messages, at)
+            yield check_reach(draft, sensor, facts, at)
     yield check_channel_use(draft)
     yield check_probe_angles(draft)
-    yield check_alarm_reach(draft, messages)
+    yield check_alarm_reach(draft, facts)
 
 
 def _names(draft: MachineFile) -> Iterator[Finding]:
     with suppress(UnusableValueError):
         yield from unique([sensor.name for sensor in draft.sensors], ("sensors",), "sensor")
     yield from unique([alarm.name for alarm in draft.alarms], ("alarms",), "alarm")
-
-
-def _unused_buses(draft: MachineFile) -> Iterator[Finding]:
-    used = {stream.bus for stream in draft.streams.values()}
-    for name in draft.buses:
-        if name not in used:
-            yield Finding(
-                ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
-            )
 
 
 def _transport(mqtt: Mqtt) -> Iterator[Finding]:
@@ -240,12 +233,3 @@ def _is_this_host(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def dbc_layouts(draft: MachineFile) -> Iterable[tuple[str, DbcLayout]]:
-    """The streams of a draft whose layout comes from a DBC file, with that layout."""
-    with suppress(UnusableValueError):
-        for name, stream in draft.streams.items():
-            with suppress(UnusableValueError):
-                if isinstance(stream.layout, DbcLayout):
-                    yield name, stream.layout

@@ -7,18 +7,13 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
-from daqsvc.settings.buses import CanBus, DbcLayout, OtherBus, PlainLayout
-from daqsvc.settings.layout_checks import bus_share, frame_facts
-from daqsvc.settings.modbus import ModbusRtuBus
-from daqsvc.settings.modbus_load import line_load
-from daqsvc.settings.registry import configured
+from daqsvc.settings.registry import StreamWords, bus_tables, configured, driver_of_layout
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from daqsvc.settings.buses import Stream
-    from daqsvc.settings.models import MachineFile, Mqtt, Sensor
+    from daqsvc.settings.models import MachineFile, Mqtt, Sensor, Stream
 
 COLUMNS = 100
 _INDENT = "  "
@@ -77,33 +72,7 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
 
 def _bus(machine: MachineFile, name: str) -> str:
     bus = machine.buses[name]
-    if isinstance(bus, OtherBus):
-        options = f" with options {', '.join(sorted(bus.options))}" if bus.options else ""
-        return f"driver {bus.driver}{options}; if absent at start: {bus.start}"
-    if isinstance(bus, ModbusRtuBus):
-        asked = line_load(machine, name, bus)
-        taken = _percent(asked.least, asked.usual)
-        return f"{bus.summary}, load about {taken} of the line; if absent at start: {bus.start}"
-    if not isinstance(bus, CanBus):
-        return f"{bus.summary}; if absent at start: {bus.start}"
-    parts = [f"{'CAN FD' if bus.fd else 'classic CAN'}, {bus.interface} {bus.channel}"]
-    if bus.bitrate is not None:
-        parts.append(_bit_rate(bus.bitrate))
-    if bus.fd and bus.data_bitrate is not None:
-        parts.append(f"data {_bit_rate(bus.data_bitrate)}")
-    if bus.options:
-        parts.append(f"options {' '.join(sorted(bus.options))}")
-    streams = [key for key, stream in machine.streams.items() if stream.bus == name]
-    loads = [bus_share(machine, key, machine.dbc_messages.get(key)) for key in streams]
-    known = [load for load in loads if load is not None]
-    if loads and len(known) == len(loads):
-        load = _percent(sum(least for least, _ in known), sum(most for _, most in known))
-        parts.append(f"load about {load} of the bus")
-    if bus.record is not None:
-        parts.append(
-            f"recorded as {bus.record.format} in {bus.record.folder}, {bus.record.keep_mb} MB at most"
-        )
-    return f"{', '.join(parts)}; if absent at start: {bus.start}"
+    return f"{bus_tables()[bus.driver].describe_bus(machine, name)}; if absent at start: {bus.start}"
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
@@ -111,31 +80,16 @@ _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bu
 
 def _streams(machine: MachineFile) -> list[str]:
     rows = [_stream(machine, *item) for item in machine.streams.items()]
-    # Only of a CAN bus with a bit rate is it known what a stream takes.
+    # Of few buses it is known what share of their time a stream takes.
     shown = slice(None) if any(row[-1] for row in rows) else slice(-1)
     return _table(_STREAM_HEADER[shown], [row[shown] for row in rows])
 
 
 def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
-    facts = frame_facts(stream, machine.dbc_messages.get(name))
-    share = bus_share(machine, name, machine.dbc_messages.get(name))
-    shown_share = "" if share is None else _percent(*share)
-    layout = stream.layout
-    if not isinstance(layout, PlainLayout | DbcLayout):
-        return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", layout.summary, "", ""
-    if facts is None:
-        return name, stream.bus, "", f"{stream.rate_hz:g} Hz", "", "", "", shown_share
-    samples = f"{facts.samples_per_frame} x {len(layout.channels)} samples"
-    return (
-        name,
-        stream.bus,
-        f"{facts.frame_id:#x}",
-        f"{stream.rate_hz:g} Hz",
-        f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
-        f"{facts.length} bytes, {samples}",
-        "none: by time" if layout.counter is None else f"{facts.counter_bits} bit {layout.counter.counts}",
-        shown_share,
-    )
+    plugin = driver_of_layout(stream.layout)
+    words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
+    rate = f"{stream.rate_hz:g} Hz"
+    return name, stream.bus, words.frame_id, rate, words.frames, words.frame, words.counter, words.share
 
 
 _SENSOR_HEADER = ("name", "type", "channel", "unit", "sensitivity", "details")
@@ -250,16 +204,6 @@ def _broker(machine: MachineFile, mqtt: Mqtt) -> str:
             f"Sparkplug B edge node {group}/{node}{f', waits for host {host}' if host is not None else ''}"
         )
     return "; ".join(parts)
-
-
-def _bit_rate(rate: int) -> str:
-    return f"{rate / 1_000_000:g} Mbit/s" if rate >= 1_000_000 else f"{rate / 1000:g} kbit/s"
-
-
-def _percent(least: float, most: float) -> str:
-    """A range of shares; the wire's stuff bits depend on the data, so there is no single figure."""
-    low, high = f"{100 * least:.2g}", f"{100 * most:.2g}"
-    return f"{low} %" if low == high else f"{low} to {high} %"
 
 
 def _facts(facts: Iterable[tuple[str, str]]) -> list[str]:

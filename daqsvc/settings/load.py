@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from itertools import islice
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from daqsvc.settings.checks import check, dbc_layouts
-from daqsvc.settings.dbc import DbcMessage, check_dbc
+from daqsvc.settings.checks import check
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
-from daqsvc.settings.registry import broken_detectors
+from daqsvc.settings.registry import broken_detectors, driver_of_layout
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
@@ -76,12 +76,12 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
     reading = _Reading(document, spots, path)
     reading.leave_out_broken()
     draft = reading.validate()
-    messages = _read_dbc(draft, path, reading.findings)
-    reading.findings += check(draft, messages)
+    facts = _read_files(draft, path, reading.findings)
+    reading.findings += check(draft, facts)
     problems, warnings = reading.problems()
     if problems:
         raise MachineFileError(problems)
-    return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(messages)))
+    return draft.found_at(Origin(path, tuple(warnings), MappingProxyType(facts)))
 
 
 class _Reading:
@@ -189,19 +189,20 @@ def _copy(value: Any) -> Any:
     return [_copy(item) for item in value] if isinstance(value, list) else value
 
 
-def _read_dbc(draft: MachineFile, path: Path, findings: list[Finding]) -> dict[str, DbcMessage]:
-    """The messages in DBC files that the streams name."""
-    messages: dict[str, DbcMessage] = {}
-    for name, layout in dbc_layouts(draft):
-        try:
-            file = (path.parent / layout.dbc).absolute()
-            message, found = check_dbc(layout, file, ("streams", name, "layout"))
-        except UnusableValueError:
-            continue
-        findings += found
-        if message is not None:
-            messages[name] = message
-    return messages
+def _read_files(draft: MachineFile, path: Path, findings: list[Finding]) -> dict[str, Any]:
+    """By stream, what the files say that its layout names."""
+    known: dict[str, Any] = {}
+    with suppress(UnusableValueError):
+        for name, stream in draft.streams.items():
+            with suppress(UnusableValueError):
+                plugin = driver_of_layout(stream.layout)
+                if plugin is None:
+                    continue
+                facts, found = plugin.read_files(stream.layout, path.parent, ("streams", name, "layout"))
+                findings += found
+                if facts is not None:
+                    known[name] = facts
+    return known
 
 
 def _shown(path: KeyPath, source: str) -> str:

@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.modbus import WaveformLayout
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile
 
 SAMPLE_BYTES = 4
-_REGISTER_BYTES = 2
 _MOST_SHARE = 0.5
 """Of the memory: the rest is for detectors, outbox, operating system and whoever else there is."""
 _CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
@@ -46,9 +44,8 @@ def needed_bytes(draft: MachineFile) -> dict[str, float]:
             row_bytes = SAMPLE_BYTES * len(stream.layout.channel_names)
             kept_s = pipeline.ring_s * rings[name] + stream.reorder_window_ms / 1e3
             needed[name] = stream.rate_hz * kept_s * row_bytes
-            if isinstance(stream.layout, WaveformLayout):
-                registers = stream.layout.samples * stream.layout.sample_registers
-                needed[name] += registers * _REGISTER_BYTES + stream.layout.samples * row_bytes
+            if (block := stream.layout.block) is not None:
+                needed[name] += block.buffer_bytes
     return needed
 
 

@@ -18,18 +18,7 @@ from daqsvc.settings.alarms import (
     SetpointAlarm,
     VotingAlarm,
 )
-from daqsvc.settings.alignment import Grid
-from daqsvc.settings.buses import (
-    Bus,
-    CanBus,
-    DbcChannel,
-    DbcCounter,
-    DbcLayout,
-    Layout,
-    OtherBus,
-    PlainLayout,
-    Stream,
-)
+from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.mqtt import Mqtt
 from daqsvc.settings.packing import Channel, Counter
 from daqsvc.settings.pipeline import Pipeline
@@ -44,11 +33,11 @@ from daqsvc.settings.sensors import (
     VelocitySensor,
 )
 from daqsvc.settings.store import Store
+from daqsvc.settings.streams import AnyBus, Grid, Stream
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daqsvc.settings.dbc import DbcMessage
     from daqsvc.settings.problems import Problem
 
 __all__ = [
@@ -56,12 +45,8 @@ __all__ = [
     "Alarm",
     "AlarmHandling",
     "Bus",
-    "CanBus",
     "Channel",
     "Counter",
-    "DbcChannel",
-    "DbcCounter",
-    "DbcLayout",
     "DiagnosisAlarm",
     "Keyphasor",
     "Layout",
@@ -70,9 +55,7 @@ __all__ = [
     "MachineFile",
     "Mqtt",
     "Origin",
-    "OtherBus",
     "Pipeline",
-    "PlainLayout",
     "ProximityProbe",
     "Rotor",
     "Sensor",
@@ -167,12 +150,12 @@ class Origin:
     Attributes:
         path: the file.
         warnings: what should be looked at although the file can be used.
-        dbc_messages: by stream, the messages that the layouts name in DBC files.
+        layout_facts: by stream, what was read from the files that its layout names.
     """
 
     path: Path = Path("<text>")
     warnings: tuple[Problem, ...] = ()
-    dbc_messages: Mapping[str, DbcMessage] = field(default_factory=lambda: MappingProxyType({}))
+    layout_facts: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
 
 class MachineFile(Section):
@@ -186,7 +169,7 @@ class MachineFile(Section):
     site: Annotated[Name, Field(description="where the box stands; part of every topic", examples=["lab"])]
     box: Annotated[Name, Field(description="name of this box; part of every topic", examples=["edge-1"])]
     machine: Annotated[Machine, Field(description="the machine that is watched")]
-    buses: Annotated[dict[Name, Bus], Field(min_length=1, max_length=64, description="the buses, by name")]
+    buses: Annotated[dict[Name, AnyBus], Field(min_length=1, max_length=64, description="the buses, by name")]
     streams: Annotated[
         dict[Name, Stream],
         Field(min_length=1, max_length=1024, description="the streams of samples, by name"),
@@ -224,9 +207,9 @@ class MachineFile(Section):
         return self._origin.warnings
 
     @property
-    def dbc_messages(self) -> Mapping[str, DbcMessage]:
-        """By stream, the facts of the message that a `DbcLayout` names."""
-        return self._origin.dbc_messages
+    def layout_facts(self) -> Mapping[str, Any]:
+        """By stream, what was read from the files that its layout names, e.g. a message of a DBC file."""
+        return self._origin.layout_facts
 
     @property
     def detectors(self) -> tuple[str, ...]:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.section import MOST, Name, Quantity, Section
+from daqsvc.settings.buses import Layout, WireRange
+from daqsvc.settings.section import MOST, MOST_CHANNELS, Name, Quantity, Section
 
 CRC_BYTES = 2
+LONGEST_FRAME = 65_536
+NO_COUNTER = "says that the frames carry none: what is lost is then estimated from the times of arrival"
 LEAST_SCALE = 1 / MOST
 LARGEST_SCALE = MOST
 VALID_RAW = "least and largest raw value that is a measurement; any other says that there is none"
 
 RawType = Literal["int8", "int16", "int24", "int32", "uint8", "uint16", "uint24", "uint32", "float32"]
 Counts = Literal["samples", "frames"]
-StartPolicy = Literal["error", "retry", "ignore"]
 
 _RAW_BYTES: dict[RawType, int] = {
     "int8": 1,
@@ -78,10 +80,12 @@ ValidRaw = Annotated[
 """Raw values that are measurements; any other says that the device has none."""
 
 
-class Counter(Section):
+class PackedCounter(Section):
     """The running count in each frame that tells loss and gives a sample its place in time."""
 
-    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
+    byte: Annotated[
+        int, Field(ge=0, lt=LONGEST_FRAME, description="where it lies in the payload", examples=[0])
+    ]
     bits: Annotated[Literal[8, 16, 32], Field(description="its width", examples=[16])]
     counts: Annotated[
         Counts,
@@ -92,6 +96,12 @@ class Counter(Section):
     def end_byte(self) -> int:
         """One past its last byte."""
         return self.byte + self.bits // 8
+
+
+class Counter(PackedCounter):
+    """The counter of a frame that is short, or has it at its beginning."""
+
+    byte: Annotated[int, Field(ge=0, le=63, description="where it lies in the payload", examples=[0])]
 
 
 class Channel(Section):
@@ -122,3 +132,95 @@ class Channel(Section):
             if self.type.startswith("u")
             else (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1.0)
         )
+
+
+class PackedFields(Layout):
+    """Samples side by side in a frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
+
+    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
+    counter: (
+        Annotated[
+            PackedCounter,
+            Field(
+                description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']
+            ),
+        ]
+        | None
+    ) = None
+    no_counter: bool = Field(default=False, description=NO_COUNTER)
+    crc_byte: (
+        Annotated[int, Field(ge=0, lt=LONGEST_FRAME, description="byte where a CRC-16 starts")] | None
+    ) = None
+    first_byte: Annotated[
+        int, Field(ge=0, lt=LONGEST_FRAME, description="where the samples start", examples=[2])
+    ]
+    samples_per_frame: Annotated[
+        int, Field(ge=1, le=LONGEST_FRAME, description="samples per channel", examples=[10])
+    ]
+    channels: Annotated[
+        tuple[Channel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            max_length=MOST_CHANNELS,
+            description="the channels of each sample",
+            examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
+        ),
+    ]
+
+    @property
+    def frame_length(self) -> int:
+        """Bytes of a frame."""
+        raise NotImplementedError
+
+    @property
+    def sample_bytes(self) -> int:
+        """Bytes of one sample of every channel."""
+        return sum(channel.raw_bytes for channel in self.channels)
+
+    @property
+    def samples_end_byte(self) -> int:
+        """One past the last byte of the samples."""
+        return self.first_byte + self.samples_per_frame * self.sample_bytes
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    def wire_range(self, channel: str, facts: Any) -> WireRange | None:
+        """See `Layout.wire_range`."""
+        del facts
+        return packed_range(self.channels, channel)
+
+
+class PackedLayout(PackedFields):
+    """A frame of any length, for drivers whose frames carry nothing but a counter and samples.
+
+    The CRC is CRC-16/IBM-3740, big endian, over all other bytes.
+    """
+
+    kind: ClassVar[str] = "a layout of a packed frame"
+    mark: ClassVar[str] = "frame_bytes"
+
+    frame_bytes: Annotated[int, Field(ge=1, le=LONGEST_FRAME, description="bytes of a frame", examples=[128])]
+
+    @property
+    def frame_length(self) -> int:
+        """See `PackedFields.frame_length`."""
+        return self.frame_bytes
+
+    @property
+    def summary(self) -> str:
+        """See `Layout.summary`."""
+        count = "no count" if self.counter is None else f"{self.counter.bits} bit count"
+        samples = f"{self.samples_per_frame} x {len(self.channels)} samples"
+        return f"{self.frame_bytes} bytes, {samples}, {count}"
+
+
+def packed_range(channels: tuple[Channel, ...], name: str) -> WireRange | None:
+    """What one of these channels can carry; see `Layout.wire_range`."""
+    channel = next((item for item in channels if item.name == name), None)
+    if channel is None or channel.type == "float32":
+        return None
+    return WireRange.scaled(channel.valid_raw or channel.raw_limits, channel.scale, channel.offset)

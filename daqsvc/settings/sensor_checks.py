@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.settings.alarms import SetpointAlarm
-from daqsvc.settings.buses import DbcLayout
-from daqsvc.settings.channel_ranges import wire_range
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import Keyphasor, ProximityProbe, TrendValue
-from daqsvc.settings.units import factor_between, same_unit, unit_of
+from daqsvc.settings.units import factor_between
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from daqsvc.settings.channel_ranges import WireRange
-    from daqsvc.settings.dbc import DbcMessage
+    from daqsvc.settings.buses import WireRange
     from daqsvc.settings.models import MachineFile, Sensor
     from daqsvc.settings.problems import KeyPath
 
@@ -155,50 +152,11 @@ def check_probe_angles(draft: MachineFile) -> Iterator[Finding]:
         )
 
 
-def check_dbc_unit(
-    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
-) -> Iterator[Finding]:
-    """The DBC file and the sensor agree on the unit."""
-    layout = draft.streams[sensor.stream].layout if sensor.stream in draft.streams else None
-    message = messages.get(sensor.stream)
-    if not isinstance(layout, DbcLayout) or message is None:
-        return
-    wire_unit = sensor.unit if sensor.sensitivity_mv_per_unit is None else "V"
-    signals = next((channel.signals for channel in layout.channels if channel.name == sensor.channel), ())
-    for signal in signals:
-        unit = message.signal_units.get(signal, "")
-        if unit == "" or same_unit(unit, wire_unit):
-            continue
-        factor = factor_between(unit, wire_unit)
-        said = f'the DBC file gives signal "{signal}" in "{unit}", but this sensor takes it as "{wire_unit}"'
-        known = unit_of(unit) is not None and unit_of(wire_unit) is not None
-        yield Finding(
-            (*at, "unit"),
-            said if factor is None else f"{said}: wrong by a factor of {max(factor, 1 / factor):.4g}",
-            _unit_remedy(sensor, unit, factor),
-            fatal=known,
-        )
-        return
-
-
-def _unit_remedy(sensor: Sensor, unit: str, factor: float | None) -> str:
-    meant = unit_of(unit)
-    if sensor.sensitivity_mv_per_unit is None and meant is not None and meant.quantity == "voltage":
-        return "add sensitivity_mv_per_unit, if the channel carries a voltage; or correct the DBC file"
-    if sensor.sensitivity_mv_per_unit is not None and factor is not None:
-        return f"give the signal in V in the DBC file: multiply its scale and offset there by {factor:g}"
-    if sensor.sensitivity_mv_per_unit is not None:
-        return "remove sensitivity_mv_per_unit if the device sends the physical unit; or correct the DBC file"
-    if meant is not None and factor is not None:
-        return f'write unit = "{meant.name}" if sensors of this type have it, or correct the DBC file'
-    return "correct unit (or sensitivity_mv_per_unit), or the unit in the DBC file"
-
-
 def check_reach(
-    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], at: KeyPath
+    draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any], at: KeyPath
 ) -> Iterator[Finding]:
     """The limits of a sensor lie within what its channel can carry."""
-    wire = wire_range(draft, sensor, messages)
+    wire = wire_range(draft, sensor, facts)
     if wire is None:
         return
     low, high = wire.low, wire.high
@@ -244,7 +202,7 @@ def _in_units(sensor: Sensor, wire: WireRange) -> tuple[float, float]:
     return min(a, b), max(a, b)
 
 
-def check_alarm_reach(draft: MachineFile, messages: Mapping[str, DbcMessage]) -> Iterator[Finding]:
+def check_alarm_reach(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Finding]:
     """Setpoints lie within what the channels can carry."""
     sensors = {sensor.name: sensor for sensor in draft.sensors}
     for index, alarm in enumerate(draft.alarms):
@@ -254,7 +212,7 @@ def check_alarm_reach(draft: MachineFile, messages: Mapping[str, DbcMessage]) ->
             for name in alarm.watched:
                 with suppress(UnusableValueError):
                     sensor = sensors.get(name)
-                    reach = None if sensor is None else _reach(draft, sensor, messages, alarm.measure)
+                    reach = None if sensor is None else _reach(draft, sensor, facts, alarm.measure)
                     if sensor is None or reach is None:
                         continue
                     for key, value in alarm.setpoints.items():
@@ -276,10 +234,10 @@ def _range(reach: tuple[float, float], unit: str) -> str:
 
 
 def _reach(
-    draft: MachineFile, sensor: Sensor, messages: Mapping[str, DbcMessage], measure: str
+    draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any], measure: str
 ) -> tuple[float, float] | None:
     """Least and largest value that a measure of a sensor can have; None if that is not known."""
-    wire = wire_range(draft, sensor, messages)
+    wire = wire_range(draft, sensor, facts)
     if wire is None:
         return None
     if measure == "gap_voltage":
@@ -289,3 +247,15 @@ def _reach(
         return low, high
     # From the mean to the farthest sample, where the mean may lie at one end.
     return (-math.inf, high - low) if measure in {"rms", "peak", "peak_to_peak"} else None
+
+
+def wire_range(draft: MachineFile, sensor: Sensor, facts: Mapping[str, Any]) -> WireRange | None:
+    """What the channel of a sensor can carry; None of a float or a text, and where it is not known.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+        sensor: one of its sensors.
+        facts: by stream, what was read from the files that its layout names.
+    """
+    stream = draft.streams.get(sensor.stream)
+    return None if stream is None else stream.layout.wire_range(sensor.channel, facts.get(sensor.stream))

@@ -7,7 +7,7 @@ details (``linux/can/error.h``). They come from the receiver's own controller, n
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from drivers.base import BusCounters
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from drivers.base import ControllerState
 
 TX_TIMEOUT = 0x001
 ARBITRATION_LOST = 0x002
@@ -35,7 +37,6 @@ _PASSIVE = 0x10 | 0x20
 _ACTIVE = 0x40
 """Bits of data[1] in a frame of class `CONTROLLER`."""
 
-ControllerState = Literal["error-active", "error-warning", "error-passive", "bus-off"]
 
 _PLAIN_CLASSES: dict[str, int] = {
     "tx_timeouts": TX_TIMEOUT,

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import aiomqtt
 import can
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.service import Service
+from drivers.can.build import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.errors import DemoError
@@ -187,7 +187,7 @@ class DemoSession:
 
     async def _play(self, bus: can.BusABC, service: Service, clock: SystemClock | DrivenClock) -> None:
         script = self.script
-        layout = assembly_drivers.frame_layout(service.machine, script.stream)
+        layout = frame_layout(service.machine, script.stream)
         node = self.node = _node(bus, layout, script)
         pacer: Pacer
         if isinstance(clock, DrivenClock):

@@ -13,10 +13,10 @@ from brokers import eventually
 from machine_files import MACHINES
 from scipy.interpolate import CubicSpline
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.wire import to_frames
 from sim_hw.scenario import Scenario
@@ -60,7 +60,7 @@ def machine_file(name):
 
 def device_frames(service, stream, shaft, ppm, delay_ms, rng):
     """Frames of a device whose clock is ``ppm`` fast: when each arrives, and its bytes."""
-    layout = assembly_drivers.frame_layout(service.machine, stream)
+    layout = frame_layout(service.machine, stream)
     rate_hz = service.machine.streams[stream].rate_hz * (1.0 + ppm * 1e-6)
     t_s = np.arange(math.floor((LAST_REV / SPEED_HZ - 0.1) * rate_hz)) / rate_hz
     noise = {"x": NOISE_UM, "y": NOISE_UM, "kph": NOISE_V}

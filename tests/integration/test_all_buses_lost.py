@@ -16,9 +16,10 @@ from conformance.virtual_can_transport import PER_FRAME, CanDevice
 from live_service import running
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from daqsvc.assembly_drivers import frame_layout, stream_layout
 from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
+from drivers.can.build import frame_layout
+from drivers.make import stream_layout
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit, RingStore
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from orbit_files import RATE_HZ, SPEED_RPM, UNBALANCE, Orbit
 
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import load_machine_file
+from drivers.can.build import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 

@@ -18,7 +18,6 @@ import pytest
 from machine_files import MACHINES
 from run_ups import ECCENTRICITY, OMEGA, RATE_HZ, record
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
 from daqsvc.commands.calibrate_live import calibrate_live
@@ -26,6 +25,7 @@ from daqsvc.rotor.calibration.file import load_calibration, load_record
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
 from sim_hw.scenario import Scenario
@@ -324,7 +324,7 @@ def machine_file(channel: str):
 async def test_the_live_bus_gives_the_same_machine() -> None:
     machine = machine_file("calibrate-live")
     channel = machine.buses["can0"].model_dump()["channel"]
-    layout = assembly_drivers.frame_layout(machine, "shaft")
+    layout = frame_layout(machine, "shaft")
     clock = SystemClock()
     told: list[tuple[int, int]] = []
     listening = asyncio.create_task(

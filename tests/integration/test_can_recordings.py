@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.assembly_drivers import drivers
 from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import FrameDemultiplexer
 from drivers.can.dbc import layout_from_dbc
+from drivers.make import bus_drivers
 from drivers.replay.can_log import CanLog
 from drivers.replay.driver import ReplayCounters
 
@@ -179,7 +179,7 @@ async def test_the_service_plays_the_log_of_a_vehicle_frame_by_frame(data: Path,
     t_s = {m.name: [t for t, _ in sent[f"{m.frame_id:03X}"]] for m in messages}
     rates_hz = {name: round(1.0 / float(np.median(np.diff(t))), 2) for name, t in t_s.items()}
     blocks: list[SampleBlock] = []
-    [driver] = drivers(machine_of(recording, data, messages, rates_hz), DrivenClock(), blocks.append)
+    [driver] = bus_drivers(machine_of(recording, data, messages, rates_hz), DrivenClock(), blocks.append)
 
     await driver.run()
 

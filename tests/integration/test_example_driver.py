@@ -15,9 +15,10 @@ from conformance.rig import samples_of
 from live_service import running
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_drivers import drivers, frame_layout
 from daqsvc.settings import load_machine_file, parse_machine_file
 from daqsvc.settings.problems import AssemblyError
+from drivers.can.build import frame_layout
+from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
@@ -70,7 +71,7 @@ def test_an_option_that_is_of_no_use_is_named_with_its_bus() -> None:
     with pytest.raises(
         AssemblyError, match=r"machine.toml: buses.logger: tcp_port is '4001'; give it as int"
     ):
-        drivers(machine("= 4001", '= "4001"'), SystemClock(), lambda _: None)
+        bus_drivers(machine("= 4001", '= "4001"'), SystemClock(), lambda _: None)
 
 
 def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +79,7 @@ def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(monkeypatch: pyte
     with pytest.raises(
         AssemblyError, match=r"buses.logger.driver = 'tcp-frames'.*cannot be loaded from tcp_f"
     ):
-        drivers(machine(), SystemClock(), lambda _: None)
+        bus_drivers(machine(), SystemClock(), lambda _: None)
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:

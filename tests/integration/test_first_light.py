@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from brokers import Consumer, running_mosquitto
 
-from daqsvc import assembly_drivers
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.recording.recording import Recording, load_recording
+from drivers.can.build import frame_layout
 from sim_hw.demo.baseline import setpoints
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
@@ -156,7 +156,7 @@ async def test_a_race_fault_arrives_sample_for_sample_and_raises_the_alarm_of_re
     assert session.service is not None
     ring = session.service.rings["recording"]
     got = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)
-    layout = assembly_drivers.frame_layout(session.service.machine, "recording")
+    layout = frame_layout(session.service.machine, "recording")
     whole = len(fault.samples) // layout.samples_per_frame * layout.samples_per_frame
     sent = quantised(fault.samples[:whole], layout)
     assert ring.end_index == whole
@@ -198,7 +198,7 @@ async def test_loss_counters_equal_what_was_injected(seed: int) -> None:
     assert session.service is not None
     ring = session.service.rings["recording"]
     got = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)[:, 0]
-    layout = assembly_drivers.frame_layout(session.service.machine, "recording")
+    layout = frame_layout(session.service.machine, "recording")
     sent = quantised(noise.samples[: ring.end_index], layout)[-len(got) :, 0]
     there = np.isfinite(got)
     np.testing.assert_array_equal(got[there], sent[there])

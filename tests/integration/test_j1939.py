@@ -14,10 +14,10 @@ from machine_files import MACHINES, changed, problems_of
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.samples import Quality
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.can.batches import EXTENDED, CanBatch, IdMatch
+from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
 from drivers.can.driver import CanDriver
 

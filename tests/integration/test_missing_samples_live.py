@@ -12,9 +12,10 @@ from brokers import eventually
 from live_service import running
 from machine_files import MACHINES
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
+from drivers.modbus.build import modbus_layout
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
@@ -71,7 +72,7 @@ async def test_a_live_alert_does_not_return_while_frames_are_lost(tmp_path: Path
     text = text.replace('channel = "can0"', 'channel = "lossy"').replace('bus = "lossy"', 'bus = "can0"')
     text = text.replace("window_s = 0.5", "window_s = 0.2")
     machine = parse_machine_file(text, MOTOR)
-    layout = assembly_drivers.frame_layout(machine, "drive-end")
+    layout = frame_layout(machine, "drive-end")
     # Loud, and as loud while 30 % of the frames are lost, and quiet while they are, and quiet.
     parts = [(1.15, 0.0, 0.8), (1.15, 0.3, 1.6), (0.5, 0.3, 0.8), (0.5, 0.0, 0.8)]
     lossy_from = lossy_to = 0
@@ -155,7 +156,7 @@ async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block
     await server.start()
     text = WAVEFORMS.format(port=server.port, every_s=every_s) + ALARM
     machine = parse_machine_file(text, tmp_path / "machine.toml")
-    layout = assembly_drivers.modbus_layout(machine, "casing")
+    layout = modbus_layout(machine, "casing")
     store = WaveformStore(unit, layout)
     async with running(machine, tmp_path / "store") as service:
         heard = Heard(service)

@@ -11,9 +11,10 @@ from brokers import eventually
 from live_service import running
 from machine_files import MACHINES, problems_of
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
+from drivers.make import bus_drivers
+from drivers.modbus.build import modbus_layout
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.line import WriteRefusedError
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
@@ -39,7 +40,7 @@ async def test_probes_on_an_analogue_module_are_read_by_the_service(tmp_path):
     where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
     text = edited(GAPS, ('host = "192.0.2.20"', where), ("rate_hz = 10.0", "rate_hz = 50.0"))
     machine = parse_machine_file(text, GAPS)
-    layout = assembly_drivers.modbus_layout(machine, "gap")
+    layout = modbus_layout(machine, "gap")
     (run,) = layout.record.runs
     assert (run.address, run.count) == (0, 2)
     gap_v = np.stack([np.linspace(-12.0, -8.0, 60), np.linspace(-8.5, -11.5, 60)], axis=1)
@@ -94,7 +95,7 @@ async def test_nothing_is_written_but_what_the_machine_file_allows():
     where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
     text = edited(GAPS, ('host = "192.0.2.20"', where), ("timeout_ms = 200.0", allowed))
     machine = parse_machine_file(text, GAPS)
-    (driver,) = assembly_drivers.drivers(machine, SystemClock(), lambda _block: None)
+    (driver,) = bus_drivers(machine, SystemClock(), lambda _block: None)
     assert isinstance(driver, ModbusDriver)
     task = asyncio.create_task(driver.run())
     await eventually(lambda: driver.link.state == "up", "the line is up")

@@ -15,10 +15,10 @@ import pytest
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
-from daqsvc.assembly_drivers import drivers
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
+from drivers.make import bus_drivers
 from drivers.replay.driver import ReplayDriver
 from drivers.replay.files import ColumnLayout
 from drivers.replay.growing import candump_log
@@ -404,7 +404,7 @@ angle_deg = 45.0
     )
     machine = load_machine_file(tmp_path / "machine.toml")
     blocks: list[SampleBlock] = []
-    [driver] = drivers(machine, DrivenClock(), blocks.append)
+    [driver] = bus_drivers(machine, DrivenClock(), blocks.append)
     await driver.run()
     got = np.concatenate([block.samples[:, 0] for block in blocks])
     np.testing.assert_allclose(got, volts / -7.87e-3, rtol=1e-6)

@@ -10,10 +10,11 @@ from can_standin import StandInBus, frame_bytes
 from running_drivers import running, until
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
-from daqsvc.assembly_drivers import drivers, frame_layout
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
+from drivers.can.build import frame_layout
 from drivers.can.driver import CanDriver
+from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
@@ -45,7 +46,7 @@ async def test_a_recording_of_the_fan_plays_through_its_dbc_file(tmp_path: Path)
         text = text.replace(old, new)
     (tmp_path / "m.toml").write_text(text, encoding="utf-8")
     blocks: list[SampleBlock] = []
-    [driver] = drivers(load_machine_file(tmp_path / "m.toml"), DrivenClock(), blocks.append)
+    [driver] = bus_drivers(load_machine_file(tmp_path / "m.toml"), DrivenClock(), blocks.append)
     await driver.run()
 
     assert driver.link.reason == "end of file"

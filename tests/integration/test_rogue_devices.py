@@ -14,9 +14,9 @@ from machine_files import LAVAL
 from rogue_buses import LAYOUT, machine_text
 from rogue_devices import WORST, RogueDevices, recording
 
-from daqsvc import assembly_drivers
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,7 +53,7 @@ async def all_do_their_worst(kinds: tuple[str, ...], folder: Path, phase_s: floa
     with RogueDevices(folder, SEED) as devices:
         machine = parse_machine_file(machine_text(kinds, devices), LAVAL)
         if "replay" in kinds:
-            layout = assembly_drivers.frame_layout(machine, "replay")
+            layout = frame_layout(machine, "replay")
             recording(folder / "rogue.log", layout, WORST, phase_s, SEED)
         service = Service(machine, folder / "store")
         stop = asyncio.Event()

@@ -15,10 +15,10 @@ import numpy as np
 from brokers import eventually
 from machine_files import MACHINES
 
-from daqsvc import assembly_drivers
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
+from drivers.make import bus_drivers, stream_layout
 from drivers.serial import reader as serial_reader
 from drivers.serial.driver import SerialDriver, framing_of
 from drivers.serial.lines import TextLayout
@@ -75,14 +75,14 @@ async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) ->
     machine = parse_machine_file(text, tmp_path / "machine.toml")
     clock = DrivenClock()
     blocks: dict[str, list[SampleBlock]] = {"shaft": [], "casing": []}
-    drivers = assembly_drivers.drivers(machine, clock, lambda block: blocks[block.stream].append(block))
+    drivers = bus_drivers(machine, clock, lambda block: blocks[block.stream].append(block))
     faults = LinkFaults(drop=0.02, duplicate=0.02, corrupt=0.02, reorder=0.02, seed=5)
     rng = np.random.default_rng(3)
     nodes: dict[str, SerialNode] = {}
     sent: dict[str, Any] = {}
     with PseudoTerminal(tmp_path / "probes") as probes, PseudoTerminal(tmp_path / "casing") as casing:
         for stream, bus, cable, seconds in (("shaft", "probes", probes, 2), ("casing", "casing", casing, 2)):
-            layout = assembly_drivers.stream_layout(machine, stream)
+            layout = stream_layout(machine, stream)
             rate_hz = machine.streams[stream].rate_hz
             framing = framing_of(machine.buses[bus].model_dump(), [StreamSpec(stream, layout, rate_hz)])
             sent[stream] = rng.normal(0, 5, (int(seconds * rate_hz), len(layout.channels)))

@@ -26,8 +26,8 @@ from sim_processes import (
     summary_of,
 )
 
-from daqsvc import assembly_drivers
 from daqsvc.settings import parse_machine_file
+from drivers.can.build import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.scenario import load_any_scenario
 from sim_hw.sim_command_signals import BearingSignals
@@ -198,7 +198,7 @@ def test_a_recording_is_played_by_the_names_of_the_sensors(tmp_path: Path) -> No
         while (message := client.recv(0.2)) is not None:
             payloads.append(np.frombuffer(bytes(message.data), np.uint8))
     machine = parse_machine_file(VIRTUAL_RIG.read_text(), VIRTUAL_RIG)
-    decoded = assembly_drivers.frame_layout(machine, "shaft").decode(np.stack(payloads))
+    decoded = frame_layout(machine, "shaft").decode(np.stack(payloads))
     # Half a second of recording fills a second of playing twice.
     assert np.abs(decoded.samples.reshape(-1, 3) - np.tile(recorded, (2, 1))).max() < 0.13
     assert json.loads(output)["streams"]["shaft"]["samples_sent"] == 640

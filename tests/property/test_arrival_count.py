@@ -11,8 +11,8 @@ from machine_files import MACHINES, changed, only_problem
 from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
+from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
 
 PERIOD_NS = 10_000_000

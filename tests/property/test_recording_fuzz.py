@@ -13,11 +13,11 @@ from fuzz_bytes import mutated
 from orbit_files import OPTIONS, Orbit
 
 from daqsvc.analysis.can_logs import load_can_log
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.cli import main
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, shared, stop_reading
 from daqsvc.settings import load_machine_file
+from drivers.can.build import frame_layout
 
 MACHINE = Path(__file__).parents[2] / "config" / "machines" / "rotor-synchronous.toml"
 MOST_MB = 450

@@ -14,11 +14,11 @@ from machine_files import MACHINES, TRIAXIAL, changed, only_problem
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.assembly_alarms import alarm_rules
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import load_machine_file, parse_machine_file
+from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
 from drivers.frames import FrameLayout, LayoutError
 

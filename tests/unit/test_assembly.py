@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daqsvc import assembly_drivers, cli
+from daqsvc import cli
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
 from daqsvc.detectors.make import detectors
 from daqsvc.settings import load_machine_file
+from drivers.can.build import frame_layout
 from drivers.frames import FrameLayout
+from drivers.make import bus_drivers, stream_layout
 
 FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"))
 
@@ -25,7 +27,7 @@ FILES = sorted((Path(__file__).parents[2] / "config" / "machines").glob("*.toml"
 def test_frames_of_every_example_decode_to_the_sensors_units(file: Path) -> None:
     machine = load_machine_file(file)
     for name in machine.streams:
-        layout = assembly_drivers.stream_layout(machine, name)
+        layout = stream_layout(machine, name)
         if not isinstance(layout, FrameLayout):
             continue
         middle = np.tile(layout.offset, (3, 1, 1)) + 5 * layout.scale
@@ -38,7 +40,7 @@ def test_frames_of_every_example_decode_to_the_sensors_units(file: Path) -> None
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
 def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     machine = load_machine_file(file)
-    made = assembly_drivers.drivers(machine, SystemClock(), lambda _: None)
+    made = bus_drivers(machine, SystemClock(), lambda _: None)
     assert [driver.name for driver in made] == list(machine.buses)
     assert sorted(name for driver in made for name in driver.streams) == sorted(machine.streams)
     watching = detectors(machine)
@@ -51,7 +53,7 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
 
 def test_a_probe_reads_micrometres_from_its_gap_voltage() -> None:
     machine = load_machine_file(next(file for file in FILES if file.stem == "laval-rig"))
-    layout = assembly_drivers.frame_layout(machine, "shaft")
+    layout = frame_layout(machine, "shaft")
     raw = dataclasses.replace(layout, scale=np.ones_like(layout.scale), offset=np.zeros_like(layout.offset))
     volts_per_count = machine.streams["shaft"].layout.channels[0].scale
     counts = np.full((1, layout.samples_per_frame, 3), -9.5 / volts_per_count)

@@ -11,6 +11,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import Level
 from daqsvc.publish.settings import MqttSettings
 from daqsvc.self_check import MIB, NS_PER_DAY, BusHealth, SelfCheck, Vitals, conditions
+from daqsvc.settings.registry import bus_tables
 from drivers.base import BusCounters
 from drivers.can.errors import CanCounters
 from drivers.serial.driver import SerialCounters
@@ -223,7 +224,8 @@ def test_a_bus_that_is_no_longer_there_has_no_alarm() -> None:
 
 
 def test_the_alarms_of_a_bus_are_known_before_they_are_raised() -> None:
-    buses = {"can0": "can", "tty": "serial", "plc": "modbus", "log": "replay"}
+    drivers = {"can0": "can", "tty": "serial", "plc": "modbus", "log": "replay"}
+    buses = {name: bus_tables()[driver].self_checks for name, driver in drivers.items()}
     assert set(conditions(None, buses)) - set(conditions(None)) == {
         "bus-overrun/can0",
         "bus-controller/can0",

@@ -8,12 +8,12 @@ import pytest
 from machine_files import LAVAL, changed, only_problem
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_drivers import bus_driver
 from daqsvc.commands.record import ENDINGS
 from daqsvc.settings import describe, parse_machine_file
 from drivers.can.driver import CanDriver
 from drivers.can.record_files import ENDINGS as WRITTEN
 from drivers.can.record_files import OneLog
+from drivers.make import bus_driver
 
 WITH_RECORD = ("fd = true", 'fd = true\nrecord = { folder = "can", format = "candump", keep_mb = 500 }')
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from machine_files import MACHINES, changed, problems_of
 
-from daqsvc import assembly_drivers
 from daqsvc.settings import load_machine_file, parse_machine_file
-from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialLayout
+from drivers.make import bus_drivers, stream_layout
 from drivers.serial.driver import SerialDriver
 from drivers.serial.lines import TextLayout as DriverLines
+from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SerialLayout
 
 SERIAL = MACHINES / "serial-probes.toml"
 COBS = 'framing = "cobs"                 # "cobs", "sync" (with sync_word = "a55a") or "lines"'
@@ -30,10 +30,10 @@ def test_the_example_as_it_is_read():
     assert (probes.bits_per_character, probes.crc_bytes, casing.delimiter) == (10, 2, "\n")
     assert isinstance(machine.streams["shaft"].layout, SerialLayout)
     assert isinstance(machine.streams["casing"].layout, LineLayout)
-    packed = assembly_drivers.stream_layout(machine, "shaft")
+    packed = stream_layout(machine, "shaft")
     samples = packed.decode(np.zeros((1, 64), np.uint8)).samples
     np.testing.assert_allclose(samples[0, 0], [10 / 7.87e-3, 10 / 7.87e-3, 0.0], rtol=1e-6)
-    lines = assembly_drivers.stream_layout(machine, "casing")
+    lines = stream_layout(machine, "casing")
     assert isinstance(lines, DriverLines)
     assert (lines.prefix, lines.counter, lines.counter_bits) == ("$ACC", "seq", 16)
 
@@ -41,7 +41,7 @@ def test_the_example_as_it_is_read():
 def test_the_driver_is_found_by_its_name():
     from daqsvc.acquisition.clock import SystemClock
 
-    drivers = assembly_drivers.drivers(load_machine_file(SERIAL), SystemClock(), lambda _: None)
+    drivers = bus_drivers(load_machine_file(SERIAL), SystemClock(), lambda _: None)
     assert [type(driver) for driver in drivers] == [SerialDriver, SerialDriver]
 
 

@@ -20,7 +20,7 @@ from daqsvc.settings.section import Kinds, Section
 DOCS = Path(__file__).parents[2] / "docs"
 
 # Handed to a driver as they are, which checks them itself.
-FREE = {"CanBus.options", "OtherBus.options"}
+FREE = {"CanBus.options"}
 
 
 def flattened(metadata):

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daqsvc.assembly_drivers import frame_layout
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 from daqsvc.settings.problems import MachineFileError
+from drivers.can.build import frame_layout
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,8 +9,9 @@ import pytest
 from machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
-from daqsvc.settings.models import DbcLayout, LevelAlarm, PlainLayout
-from daqsvc.settings.wire import frame_time
+from daqsvc.settings.models import LevelAlarm
+from drivers.can.settings import DbcLayout, PlainLayout
+from drivers.can.wire import frame_time
 
 CONFIG = MACHINES.parent
 EXAMPLES = sorted(MACHINES.glob("*.toml"))
@@ -116,11 +117,11 @@ def test_relative_paths_start_at_the_machine_file(tmp_path):
     (tmp_path / "devices" / device).write_bytes((CONFIG / "devices" / device).read_bytes())
     path = tmp_path / "machines" / "m.toml"
     path.write_bytes(TRIAXIAL.read_bytes())
-    assert load_machine_file(path).dbc_messages["housing"].frame_id == 513
+    assert load_machine_file(path).layout_facts["housing"].frame_id == 513
 
 
 def test_what_the_dbc_file_says():
-    message = load_machine_file(TRIAXIAL).dbc_messages["housing"]
+    message = load_machine_file(TRIAXIAL).layout_facts["housing"]
     assert (message.frame_id, message.extended, message.length) == (0x201, False, 8)
     assert message.signal_bits["Sequence"] == 8
     assert {message.signal_bits[f"Accel{axis}"] for axis in "XYZ"} == {16}

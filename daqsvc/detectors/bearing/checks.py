@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from daqsvc.detectors.bearing.settings import WINDOW_S
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
 from daqsvc.settings.layout_checks import unique
-from daqsvc.settings.modbus import WaveformLayout
 from daqsvc.settings.problems import Finding, choice
 
 if TYPE_CHECKING:
@@ -253,13 +252,14 @@ def _blocks(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
     """Blocks that a device takes by themselves are long enough for a look each."""
     first = named(draft).get(given.bearings[0].sensor)
     stream = None if first is None else draft.streams.get(first.stream)
-    if first is None or stream is None or not isinstance(stream.layout, WaveformLayout):
+    block = None if stream is None else stream.layout.block
+    if first is None or stream is None or block is None:
         return
     least = math.ceil(_LEAST_BLOCK_S * stream.rate_hz)
-    if stream.layout.samples < least:
+    if block.samples < least:
         yield Finding(
             ("streams", first.stream, "layout", "samples"),
-            f"are {stream.layout.samples / stream.rate_hz:.3g} s at {stream.rate_hz:g} Hz; a bearing is "
+            f"are {block.samples / stream.rate_hz:.3g} s at {stream.rate_hz:g} Hz; a bearing is "
             f"judged by {_LEAST_BLOCK_S:g} s or more",
             f"make the device take blocks of {least} samples, or remove [pipeline.bearing]",
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.modbus import RegistersLayout
 from daqsvc.settings.problems import Finding
 
 if TYPE_CHECKING:
@@ -106,5 +105,5 @@ def _lowest_frequency(draft: MachineFile, levels: Levels) -> Iterator[Finding]:
 
 def _if_no_waveform(draft: MachineFile, stream: str) -> str:
     """What else to do about a stream that is too slow for waveforms, if its registers are polled."""
-    polled = isinstance(draft.streams[stream].layout, RegistersLayout)
+    polled = draft.streams[stream].layout.polled
     return ', or type = "trend" for sensors whose level the device measures itself' if polled else ""

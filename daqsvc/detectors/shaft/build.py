@@ -8,8 +8,8 @@ from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
 from daqsvc.settings.models import Keyphasor, ProximityProbe
 
 if TYPE_CHECKING:
-    from daqsvc.settings.alignment import Grid
     from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.streams import Grid
 
 _UM_PER_UNIT = {"um": 1.0, "mm": 1000.0, "mil": 25.4}
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.addresses import DevicePath, Host  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.addresses import DevicePath, Host, serial_port
+from daqsvc.settings.buses import Block, Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, WaitMs
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_REGISTER_BYTES = 2
+_SAMPLE_BYTES = 4
 
 MAX_REGISTERS = 125
 """Registers that a request can read (Modbus Application Protocol 1.1b3, 6.3)."""
@@ -56,7 +63,7 @@ class Writable(Section):
     count: Annotated[int, Field(ge=1, le=123)] = 1
 
 
-class _ModbusBus(Section):
+class _ModbusBus(Bus):
     """What all Modbus lines have."""
 
     driver: Annotated[Literal["modbus"], Field(description="which driver reads the bus", examples=["modbus"])]
@@ -71,9 +78,6 @@ class _ModbusBus(Section):
     )
     writes: Annotated[tuple[Writable, ...], Field(strict=False, max_length=1024)] = Field(
         default=(), description="registers that may be written; nothing else ever is"
-    )
-    start: Literal["error", "retry", "ignore"] = Field(
-        default="retry", description="what to do if the device is absent at start"
     )
 
     def may_write(self, unit: int, address: int, count: int = 1) -> bool:
@@ -122,6 +126,11 @@ class ModbusRtuBus(_ModbusBus):
         framing = f"8{self.parity[0].upper()}{self.stop_bits}"
         return f"Modbus RTU, {self.serial_port}, {self.baud} bit/s {framing}, time-out {self.timeout_ms:g} ms"
 
+    @property
+    def device(self) -> Device:
+        """See `Bus.device`."""
+        return serial_port("serial_port", self.serial_port)
+
 
 class _Quantity(Section):
     """What all channels in registers have: wire value = raw * scale + offset."""
@@ -157,8 +166,20 @@ class SampleChannel(_Quantity):
     )
 
 
-class _ModbusLayout(Section):
+def _range(channels: Sequence[_Quantity], name: str) -> WireRange | None:
+    number = next((item for item in channels if item.name == name), None)
+    if number is None or number.type.startswith("float"):
+        return None
+    bits = 16 * number.registers if number.bits is None else number.bits[1]
+    half = 2.0 ** (bits - 1)
+    raw = (0.0, 2 * half - 1) if number.type.startswith("u") else (-half, half - 1)
+    return WireRange.scaled(raw, number.scale, number.offset)
+
+
+class _ModbusLayout(Layout):
     """What all layouts in registers have."""
+
+    mark: ClassVar[str] = "way"
 
     unit: Annotated[UnitAddress, Field(description="address of the unit", examples=[1])]
 
@@ -189,6 +210,11 @@ class _Sampled(_ModbusLayout):
     def sample_registers(self) -> int:
         """Registers of one sample of every channel."""
         return max(channel.place + channel.registers for channel in self.channels)
+
+    def wire_range(self, channel: str, facts: Any) -> WireRange | None:
+        """See `Layout.wire_range`."""
+        del facts
+        return _range(self.channels, channel)
 
 
 class RegistersLayout(_ModbusLayout):
@@ -228,6 +254,16 @@ class RegistersLayout(_ModbusLayout):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         return f"{len(self.channels)} values polled in {self.table} registers"
+
+    @property
+    def polled(self) -> bool:
+        """See `Layout.polled`."""
+        return True
+
+    def wire_range(self, channel: str, facts: Any) -> WireRange | None:
+        """See `Layout.wire_range`."""
+        del facts
+        return _range(self.channels, channel)
 
 
 class FifoCount(Section):
@@ -319,11 +355,19 @@ class WaveformLayout(_Sampled):
         """What a person should know about it, in a few words."""
         return f"{len(self.channels)} channels in blocks of {self.samples} samples"
 
+    @property
+    def block(self) -> Block:
+        """See `Layout.block`."""
+        every_s = None if self.trigger is None else self.trigger.every_s
+        registers = self.samples * self.sample_registers
+        row_bytes = _SAMPLE_BYTES * len(self.channels)
+        return Block(self.samples, every_s, registers * _REGISTER_BYTES + self.samples * row_bytes)
+
 
 ModbusBus: TypeAlias = ModbusTcpBus | ModbusRtuBus
 ModbusLayout: TypeAlias = RegistersLayout | FifoLayout | RingLayout | WaveformLayout
 
-WAYS: dict[object, type[Section]] = {
+WAYS: dict[object, type[ModbusLayout]] = {
     "registers": RegistersLayout,
     "fifo": FifoLayout,
     "ring": RingLayout,

@@ -6,9 +6,6 @@ from typing import NamedTuple
 
 CLASSIC_MAX_LENGTH = 8
 
-BUSY = 0.8
-"""A bus or line that takes a larger share of its time for streams leaves no room for anything else."""
-
 _TAIL_BITS = 13
 """CRC delimiter, ACK slot, ACK delimiter, end of frame (7) and intermission (3)."""
 

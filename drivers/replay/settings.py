@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, Text
@@ -14,7 +15,7 @@ TABLES = frozenset({".npz", ".csv"})
 """Endings of the files that hold a table of samples; any other is a CAN log."""
 
 
-class ReplayBus(Section):
+class ReplayBus(Bus):
     """A recording that is played as if it came over a bus."""
 
     kind: ClassVar[str] = "a replayed bus"
@@ -51,9 +52,6 @@ class ReplayBus(Section):
         "at most 4",
         examples=[4.0],
     )
-    start: Literal["error", "retry", "ignore"] = Field(
-        default="retry", description="what to do if the file is absent at start"
-    )
 
     @property
     def is_table(self) -> bool:
@@ -83,10 +81,12 @@ class TableColumn(Section):
     offset: Quantity = Field(default=0.0, description="wire value of the value 0")
 
 
-class TableLayout(Section):
+class TableLayout(Layout):
     """Samples as columns of a table."""
 
     kind: ClassVar[str] = "a layout of columns in a table"
+    mark: ClassVar[str] = "columns"
+    channels_key: ClassVar[str] = "columns"
 
     columns: Annotated[
         tuple[TableColumn, ...],

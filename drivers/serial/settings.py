@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from daqsvc.settings.addresses import DevicePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.addresses import DevicePath, serial_port
+from daqsvc.settings.buses import Bus, Device, Layout, WireRange
 from daqsvc.settings.packing import (
     CRC_BYTES,
     Channel,
     Counter,
     Scale,
-    StartPolicy,
+    packed_range,
 )
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section
 
@@ -55,7 +56,7 @@ def _delimiter(text: str) -> str:
     return text
 
 
-class SerialBus(Section):
+class SerialBus(Bus):
     """What all serial ports have."""
 
     driver: Annotated[Literal["serial"], Field(description="which driver reads the bus", examples=["serial"])]
@@ -74,7 +75,11 @@ class SerialBus(Section):
         default="none", description="whether and how the device is told to wait"
     )
     low_latency: bool = Field(default=False, description="have the port's driver pass bytes on at once")
-    start: StartPolicy = Field(default="retry", description="what to do if the port is absent at start")
+
+    @property
+    def device(self) -> Device:
+        """See `Bus.device`."""
+        return serial_port("port", self.port)
 
     @property
     def bits_per_character(self) -> int:
@@ -160,10 +165,11 @@ class LinesBus(SerialBus):
         return f"{self._line()}, lines of text, {checksum}"
 
 
-class SerialLayout(Section):
+class SerialLayout(Layout):
     """Samples side by side in a binary frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
 
     kind: ClassVar[str] = "a layout of a binary serial frame"
+    mark: ClassVar[str] = "payload_length"
 
     payload_length: Annotated[
         int,
@@ -216,6 +222,11 @@ class SerialLayout(Section):
             f"{self.counter.bits} bit count"
         )
 
+    def wire_range(self, channel: str, facts: Any) -> WireRange | None:
+        """See `Layout.wire_range`."""
+        del facts
+        return packed_range(self.channels, channel)
+
 
 class LineCounter(Section):
     """The column that counts lines, and so samples."""
@@ -239,10 +250,11 @@ class LineChannel(Section):
     offset: Quantity = Field(default=0.0, description="wire value of a 0")
 
 
-class LineLayout(Section):
+class LineLayout(Layout):
     """A sample of every channel as the columns of a line."""
 
     kind: ClassVar[str] = "a layout of a line of text"
+    mark: ClassVar[str] = "line"
 
     line: Annotated[
         tuple[Name, ...],

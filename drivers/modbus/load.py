@@ -13,7 +13,8 @@ from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.settings.modbus import (
+from daqsvc.settings.section import UnusableValueError
+from drivers.modbus.settings import (
     FIFO_REGISTERS,
     MAX_REGISTERS,
     FifoLayout,
@@ -22,13 +23,12 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
-from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from daqsvc.settings.modbus import RegisterChannel
     from daqsvc.settings.models import MachineFile
+    from drivers.modbus.settings import RegisterChannel
 
 USUAL_ANSWER_S = 0.010
 """Units on serial lines take a few ms to some tens of them until they answer."""

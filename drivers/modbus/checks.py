@@ -5,7 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.modbus import (
+from daqsvc.settings.buses import BUSY
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.section import UnusableValueError
+from drivers.modbus.load import USUAL_ANSWER_S, line_load
+from drivers.modbus.overlaps import check_channel_overlaps
+from drivers.modbus.settings import (
     FIFO_REGISTERS,
     MAX_REGISTERS,
     FifoLayout,
@@ -15,19 +20,13 @@ from daqsvc.settings.modbus import (
     RingLayout,
     WaveformLayout,
 )
-from daqsvc.settings.modbus_load import USUAL_ANSWER_S, line_load
-from daqsvc.settings.modbus_overlaps import check_channel_overlaps
-from daqsvc.settings.problems import Finding
-from daqsvc.settings.section import UnusableValueError
-from daqsvc.settings.wire import BUSY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.settings.buses import Stream
-    from daqsvc.settings.modbus import ModbusLayout
-    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import KeyPath
+    from drivers.modbus.settings import ModbusLayout
 
 ADDRESSES = 65_536
 _LAYOUTS = (RegistersLayout, FifoLayout, RingLayout, WaveformLayout)

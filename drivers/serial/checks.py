@@ -5,20 +5,17 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.modbus import ModbusRtuBus
+from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
-from daqsvc.settings.serial import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
-from daqsvc.settings.wire import BUSY
+from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.settings.buses import Stream
-    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import KeyPath
 
 _CHECKSUM_CHARACTERS = {"none": 0, "xor": 3, "crc16": 5}
@@ -67,8 +64,7 @@ def check_serial(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Fi
 
 
 def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
-    """Ports are named so as to be found again, belong to one bus, and are fast enough for their streams."""
-    yield from _check_owners(draft)
+    """Ports are named so as to be found again, and are fast enough for their streams."""
     for name, bus in draft.buses.items():
         with suppress(UnusableValueError):
             if not isinstance(bus, SerialBus):
@@ -81,26 +77,6 @@ def check_serial_ports(draft: MachineFile) -> Iterator[Finding]:
                     fatal=False,
                 )
             yield from _check_streams(draft, name, bus)
-
-
-def _check_owners(draft: MachineFile) -> Iterator[Finding]:
-    """No port belongs to two buses, whatever they carry and whichever link to the port they name."""
-    owners: dict[Path, str] = {}
-    for name, bus in draft.buses.items():
-        with suppress(UnusableValueError):
-            if isinstance(bus, SerialBus):
-                key, port = "port", bus.port
-            elif isinstance(bus, ModbusRtuBus):
-                key, port = "serial_port", bus.serial_port
-            else:
-                continue
-            owner = owners.setdefault(Path(port).resolve(), name)
-            if owner != name:
-                yield Finding(
-                    ("buses", name, key),
-                    f'belongs to bus "{owner}" already',
-                    "give each bus its own port, or put all streams of the port on one bus",
-                )
 
 
 def _check_id(bus: CobsBus | SyncBus, name: str, layout: SerialLayout, path: KeyPath) -> Iterator[Finding]:

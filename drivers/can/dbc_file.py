@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
 from daqsvc.settings.packing import LARGEST_SCALE, LEAST_SCALE
 from daqsvc.settings.problems import Finding, choice
+from drivers.can.settings import DbcMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
 
-    from daqsvc.settings.buses import DbcLayout
     from daqsvc.settings.problems import KeyPath
+    from drivers.can.settings import DbcLayout
 
 
 MOST_DBC_BYTES = 4 << 20
@@ -30,31 +30,6 @@ _ENDLESS = re.compile(
     r"\bSG_\s[^:@]{0,200}:[^@(]{0,60}?\d{6}|\bBO_\s[^:]{0,200}:\s{0,20}\d{6}|\d\s{0,9}-\s{0,9}\d{6}"
 )
 _STRING = re.compile(r'"[^"]*"')
-
-
-@dataclass(frozen=True, slots=True)
-class DbcMessage:
-    """What a machine file needs to know of a message in a DBC file.
-
-    Attributes:
-        frame_id: CAN id.
-        extended: whether the id has 29 bits.
-        length: payload bytes.
-        signal_bits: width of each signal in bits, by name.
-        signal_units: unit of each signal, by name; empty if the DBC gives none.
-        signal_ranges: least and largest value that each signal can carry, in its unit; none of a float.
-        any_priority: whether it is one of SAE J1939, whatever the priority in its id.
-        pages: which values of which multiplexers the frames have that hold the layout's signals.
-    """
-
-    frame_id: int
-    extended: bool
-    length: int
-    signal_bits: Mapping[str, int]
-    signal_units: Mapping[str, str]
-    signal_ranges: Mapping[str, tuple[float, float]]
-    any_priority: bool
-    pages: Mapping[str, frozenset[int]]
 
 
 def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | None, list[Finding]]:

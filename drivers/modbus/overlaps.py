@@ -5,16 +5,16 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
-from daqsvc.settings.modbus import FifoLayout, RegisterChannel, RegistersLayout, RingLayout, WaveformLayout
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
+from drivers.modbus.settings import FifoLayout, RegisterChannel, RegistersLayout, RingLayout, WaveformLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from daqsvc.settings.modbus import ModbusLayout, SampleChannel
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import KeyPath
+    from drivers.modbus.settings import ModbusLayout, SampleChannel
 
 _LAYOUTS = (RegistersLayout, FifoLayout, RingLayout, WaveformLayout)
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.buses import DbcLayout, PlainLayout
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.replay import ReplayBus, TableLayout
 from daqsvc.settings.section import UnusableValueError
+from drivers.can.settings import DbcLayout, PlainLayout
+from drivers.replay.settings import ReplayBus, TableLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.settings.buses import Stream
-    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import KeyPath
 
 

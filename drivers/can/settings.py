@@ -1,0 +1,228 @@
+"""CAN buses, and how samples lie in the frames on them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping  # noqa: TC003 - a field of a dataclass
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticCustomError
+
+from daqsvc.settings.buses import Bus, Device, Layout, WireRange
+from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.packing import NO_COUNTER, VALID_RAW, Channel, Counter, Counts, PackedFields, ValidRaw
+from daqsvc.settings.section import MOST_CHANNELS, Name, Section, Text
+
+CAN_FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Payload lengths in bytes that a CAN FD frame can have (ISO 11898-1); up to 8 also in classic CAN."""
+
+
+def _payload_length(length: int) -> int:
+    if length not in CAN_FD_LENGTHS:
+        raise PydanticCustomError(
+            "payload_length",
+            "is not a length that a CAN frame can have",
+            {"remedy": "take 0 to 8 (classic CAN), or 12, 16, 20, 24, 32, 48 or 64 (CAN FD)"},
+        )
+    return length
+
+
+class CanRecord(Section):
+    """Files that every frame received on a CAN bus is recorded in."""
+
+    folder: Annotated[
+        FilePath,
+        Field(
+            description="holds the files, relative to the machine file; must be there",
+            examples=["/var/lib/daqsvc/can"],
+        ),
+    ]
+    format: Literal["blf", "asc", "candump"] = Field(default="blf", description="which kind of CAN log")
+    file_mb: Annotated[int, Field(ge=1, le=4000)] = Field(
+        default=64, description="a file that is this large is ended, and another one begun"
+    )
+    keep_mb: Annotated[int, Field(ge=2, le=100_000_000)] = Field(
+        default=2048, description="what all files may take together; the oldest are taken away"
+    )
+
+
+class CanBus(Bus):
+    """A CAN or CAN FD bus: SocketCAN read directly, any other interface through python-can."""
+
+    kind: ClassVar[str] = "a CAN bus"
+
+    driver: Annotated[Literal["can"], Field(description="which driver reads the bus", examples=["can"])]
+    interface: Annotated[Text, Field(description="the python-can interface", examples=["socketcan"])]
+    channel: Annotated[Text, Field(description="the channel of that interface", examples=["can0"])]
+    fd: Annotated[bool, Field(description="whether CAN FD frames are on the bus", examples=[True])] = False
+    bitrate: Annotated[int, Field(ge=1000, le=1_000_000, description="bit/s")] | None = None
+    data_bitrate: Annotated[int, Field(ge=1000, le=20_000_000, description="bit/s of FD data")] | None = None
+    options: dict[str, Any] = Field(
+        default={}, description="handed to python-can as they are; none with SocketCAN"
+    )
+    receive_buffer_bytes: Annotated[int, Field(ge=4096, le=1 << 30)] = Field(
+        default=4 << 20, description="SocketCAN: what the kernel holds for us; a frame takes some 400 of it"
+    )
+    filter: bool | None = Field(
+        default=None,
+        description="SocketCAN: let the kernel leave out frames of no stream, uncounted; if left out, it "
+        "does so unless the bus is recorded",
+    )
+    record: CanRecord | None = Field(default=None, description="record every frame received in files")
+
+    @property
+    def device(self) -> Device:
+        """See `Bus.device`: each of two buses would take the other's frames for foreign ones."""
+        remedy = "put all streams of the interface on one bus, or correct the channel"
+        return Device("channel", ("can", self.interface, self.channel), remedy)
+
+
+class PlainLayout(PackedFields):
+    """Samples side by side in a frame, sample after sample: s0c0 s0c1 s0c2 s1c0 ..."""
+
+    kind: ClassVar[str] = "a layout without a DBC file"
+
+    id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF, description="the frame's CAN id", examples=["0x101"])]
+    extended: bool = Field(default=False, description="whether the id has 29 bits rather than 11")
+    any_priority: bool = Field(
+        default=False,
+        description="SAE J1939: frames with another priority than the id's are the same, and unsigned raw "
+        "values from 0xfb.. on are no measurements",
+    )
+    length: Annotated[
+        int,
+        Field(ge=0, le=64, description="payload length in bytes", examples=[64]),
+        AfterValidator(_payload_length),
+    ]
+    byte_order: Literal["little", "big"] = Field(default="little", description="of counter and samples")
+    counter: (
+        Annotated[
+            Counter,
+            Field(
+                description="the frame's counter", examples=['{ byte = 0, bits = 16, counts = "samples" }']
+            ),
+        ]
+        | None
+    ) = None
+    no_counter: bool = Field(default=False, description=NO_COUNTER)
+    crc_byte: Annotated[int, Field(ge=0, le=62, description="byte where a CRC-16 starts")] | None = None
+    first_byte: Annotated[int, Field(ge=0, le=63, description="where the samples start", examples=[2])]
+    samples_per_frame: Annotated[int, Field(ge=1, le=64, description="samples per channel", examples=[10])]
+    channels: Annotated[
+        tuple[Channel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            max_length=MOST_CHANNELS,
+            description="the channels of each sample",
+            examples=['[{ name = "x", type = "int16", scale = 0.0005 }]'],
+        ),
+    ]
+
+    @property
+    def frame_length(self) -> int:
+        """See `PackedFields.frame_length`."""
+        return self.length
+
+
+@dataclass(frozen=True, slots=True)
+class DbcMessage:
+    """What a machine file needs to know of a message in a DBC file.
+
+    Attributes:
+        frame_id: CAN id.
+        extended: whether the id has 29 bits.
+        length: payload bytes.
+        signal_bits: width of each signal in bits, by name.
+        signal_units: unit of each signal, by name; empty if the DBC gives none.
+        signal_ranges: least and largest value that each signal can carry, in its unit; none of a float.
+        any_priority: whether it is one of SAE J1939, whatever the priority in its id.
+        pages: which values of which multiplexers the frames have that hold the layout's signals.
+    """
+
+    frame_id: int
+    extended: bool
+    length: int
+    signal_bits: Mapping[str, int]
+    signal_units: Mapping[str, str]
+    signal_ranges: Mapping[str, tuple[float, float]]
+    any_priority: bool
+    pages: Mapping[str, frozenset[int]]
+
+
+class DbcCounter(Section):
+    """The running count, as a signal of the DBC message."""
+
+    signal: Annotated[Text, Field(description="the counter's signal", examples=["Sequence"])]
+    counts: Annotated[
+        Counts,
+        Field(description="what it counts; of samples, the first one in the frame", examples=["frames"]),
+    ]
+
+
+class DbcChannel(Section):
+    """One quantity in a DBC message: its consecutive samples are signals of their own."""
+
+    name: Annotated[Name, Field(description="name of the channel", examples=["x"])]
+    signals: Annotated[
+        tuple[Text, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            max_length=512,
+            description="signals that hold its samples, oldest first",
+            examples=['["AccelX"]'],
+        ),
+    ]
+    valid_raw: ValidRaw | None = Field(default=None, description=VALID_RAW, examples=["[-32767, 32767]"])
+
+
+class DbcLayout(Layout):
+    """Samples as signals of a message in a DBC file."""
+
+    kind: ClassVar[str] = "a layout from a DBC file"
+    mark: ClassVar[str] = "dbc"
+
+    dbc: Annotated[FilePath, Field(description="the DBC file, relative to the machine file")]
+    message: Annotated[
+        Text,
+        Field(description="the message that carries the samples", examples=["Acceleration"]),
+    ]
+    counter: (
+        Annotated[
+            DbcCounter,
+            Field(description="the frame's counter", examples=['{ signal = "Sequence", counts = "frames" }']),
+        ]
+        | None
+    ) = None
+    no_counter: bool = Field(default=False, description=NO_COUNTER)
+    channels: Annotated[
+        tuple[DbcChannel, ...],
+        Field(
+            strict=False,
+            min_length=1,
+            max_length=MOST_CHANNELS,
+            description="the channels of each sample",
+            examples=['[{ name = "x", signals = ["AccelX"] }]'],
+        ),
+    ]
+
+    @property
+    def samples_per_frame(self) -> int:
+        """Samples of each channel in a frame."""
+        return len(self.channels[0].signals)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the channels in the order of a sample."""
+        return tuple(channel.name for channel in self.channels)
+
+    def wire_range(self, channel: str, facts: Any) -> WireRange | None:
+        """See `Layout.wire_range`."""
+        signals = next((item.signals for item in self.channels if item.name == channel), ())
+        ranges = facts.signal_ranges if isinstance(facts, DbcMessage) else {}
+        known = [ranges[signal] for signal in signals if signal in ranges]
+        if not known or len(known) < len(signals):
+            return None
+        return WireRange(min(low for low, _ in known), max(high for _, high in known), 0.0)

@@ -1,0 +1,55 @@
+"""The replay of recordings as a plugin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from drivers.plugin import DriverPlugin
+from drivers.replay.checks import check_replay_buses, check_replayed
+from drivers.replay.settings import ReplayBus, TableLayout
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daqsvc.settings.buses import Bus, Layout
+    from daqsvc.settings.models import MachineFile, Stream
+    from daqsvc.settings.problems import Finding, KeyPath
+    from drivers.base import BusPort, Driver
+    from drivers.replay.files import ColumnLayout
+
+
+class ReplayPlugin(DriverPlugin[ReplayBus]):
+    """Recordings in place of a bus: CAN logs with the layouts of CAN frames, and tables of samples."""
+
+    buses: ClassVar[tuple[type[Bus], ...]] = (ReplayBus,)
+    layouts: ClassVar[tuple[type[Layout], ...]] = (TableLayout,)
+    place = 4
+
+    def checks(self, draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
+        """See `BusTable.checks`."""
+        del facts
+        yield check_replay_buses(draft)
+
+    def stream_checks(
+        self, draft: MachineFile, stream: Stream, facts: Any, at: KeyPath
+    ) -> Iterator[Iterator[Finding]]:
+        """See `BusTable.stream_checks`."""
+        del facts
+        yield check_replayed(draft, stream, at)
+
+    def stream_layout(self, machine: MachineFile, stream: str) -> ColumnLayout:
+        """See `DriverPlugin.stream_layout`."""
+        from drivers.replay.build import column_layout  # noqa: PLC0415 - only the service needs it
+
+        return column_layout(machine, stream)
+
+    def options(self, machine: MachineFile, bus: ReplayBus) -> dict[str, Any]:
+        """See `DriverPlugin.options`."""
+        return {**bus.model_dump(), "file": machine.resolve(bus.file)}
+
+    def build(self, bus: ReplayBus, port: BusPort) -> Driver:
+        """See `DriverPlugin.build`."""
+        from drivers.replay.driver import ReplayDriver  # noqa: PLC0415 - brings python-can
+
+        del bus
+        return ReplayDriver(port)
