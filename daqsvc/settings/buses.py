@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
-from daqsvc.settings.section import Name, Section
+from daqsvc.settings.section import Name, Section, UnusableValueError
 
 StartPolicy = Literal["error", "retry", "ignore"]
 
@@ -131,6 +131,21 @@ class Layout(Section):
         """
         del channel, facts
         return None
+
+
+class UnknownLayout(Layout):
+    """A layout where no driver is installed."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """See `Layout.channel_names`.
+
+        Raises:
+            UnusableValueError: always.
+        """
+        raise UnusableValueError("channels")
 
 
 def percent(least: float, most: float) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Typ
 
 from pydantic import Field, create_model
 
-from daqsvc.settings.buses import Bus, Layout, UnknownBus
+from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
 from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.pipeline import Pipeline
@@ -281,7 +281,7 @@ def _layout_kind(table: Mapping[str, Any]) -> type[Layout]:
         if layout is not None:
             return layout
     kinds = _layout_kinds()
-    return kinds[0] if kinds else Layout
+    return kinds[0] if kinds else UnknownLayout
 
 
 def _layout_kinds() -> tuple[type[Layout], ...]:

@@ -134,11 +134,11 @@ class ExampleLogger:
         self.device.close()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> Driver:
-        options = {"host": "127.0.0.1", "tcp_port": self.device.tcp_port}
+        module = example()
+        bus = module.LoggerBus(driver="tcp-frames", host="127.0.0.1", tcp_port=self.device.tcp_port)
         spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
-        made: Driver = example().TcpFramesDriver(
-            BusPort("logger", options, [spec], self.time.clock, deliver, start)
-        )
+        port = BusPort("logger", {}, [spec], self.time.clock, deliver, start)
+        made: Driver = module.LoggerPlugin().build(bus, port)
         return made
 
 

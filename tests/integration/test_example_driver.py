@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import tomllib
-from pathlib import Path
+import ast
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,77 +10,133 @@ import pytest
 from brokers import eventually
 from conformance.example_transport import LoggerDevice
 from conformance.rig import samples_of
+from example_packages import DETECTOR, DOCS, DRIVER, installed, lines_of
 from live_service import running
+from machine_files import problems_of
 
-from daqsvc.acquisition.clock import SystemClock
-from daqsvc.settings import load_machine_file, parse_machine_file
-from daqsvc.settings.problems import AssemblyError
-from drivers.can.build import frame_layout
-from drivers.make import bus_drivers
+from daqsvc.settings import describe, load_machine_file, parse_machine_file, registry
+from drivers.make import stream_layout
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
     from daqsvc.settings import MachineFile
 
-DOCS = Path(__file__).parents[2] / "docs"
-EXAMPLE = DOCS / "example_driver"
+MACHINE = DRIVER / "machine.toml"
 
 
 @pytest.fixture(autouse=True)
-def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put the package where Python looks for packages, with the entry points that its project file states."""
-    project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text())["project"]
-    info = tmp_path / "site" / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    (info / "entry_points.txt").write_text(
-        "".join(
-            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
-            for group, points in project["entry-points"].items()
-        )
-    )
-    monkeypatch.syspath_prepend(str(info.parent))
-    monkeypatch.syspath_prepend(str(EXAMPLE))
-    importlib.invalidate_caches()
+def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    yield from installed(DRIVER, tmp_path / "site", monkeypatch)
+
+
+def changed(old: str, new: str) -> str:
+    text = MACHINE.read_text()
+    assert old in text
+    return text.replace(old, new)
 
 
 def machine(old: str = "", new: str = "") -> MachineFile:
-    file = EXAMPLE / "machine.toml"
-    return parse_machine_file(file.read_text().replace(old, new) if old else file.read_text(), file)
+    return parse_machine_file(changed(old, new), MACHINE)
 
 
 async def test_the_example_serves_a_machine(tmp_path: Path) -> None:
-    logger = LoggerDevice(frame_layout(load_machine_file(EXAMPLE / "machine.toml"), "casing"))
+    logger = LoggerDevice(stream_layout(load_machine_file(MACHINE), "casing"))
     try:
         async with running(machine("4001", f"{logger.tcp_port}"), tmp_path / "store") as service:
             [driver] = service.drivers
             await eventually(lambda: driver.link.state == "up", "the logger is connected")
             ring = service.rings["casing"]
-            await logger.send(0, samples_of(np.arange(600)))
+            await logger.send(0, samples_of(np.arange(1500)))
             # The last frames are held until it is sure that none of before them is still to come.
-            await eventually(lambda: ring.end_index >= 500, "the samples have arrived")
-            np.testing.assert_array_equal(ring.read(0, 500), samples_of(np.arange(500)))
+            await eventually(lambda: ring.end_index >= 1200, "the samples have arrived")
+            np.testing.assert_array_equal(ring.read(0, 1200), samples_of(np.arange(1200)))
     finally:
         logger.close()
 
 
-def test_an_option_that_is_of_no_use_is_named_with_its_bus() -> None:
-    with pytest.raises(
-        AssemblyError, match=r"machine.toml: buses.logger: tcp_port is '4001'; give it as int"
-    ):
-        bus_drivers(machine("= 4001", '= "4001"'), SystemClock(), lambda _: None)
+def test_check_says_what_it_has_understood_of_it() -> None:
+    text = " ".join(describe(load_machine_file(MACHINE)).split())
+    assert "logger driver tcp-frames, host 127.0.0.1, tcp_port 4001; if absent at start: retry" in text
+    assert "128 bytes, 30 x 2 samples, 32 bit count" in text
 
 
-def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.modules", {**__import__("sys").modules, "tcp_frames": None})
-    with pytest.raises(
-        AssemblyError, match=r"buses.logger.driver = 'tcp-frames'.*cannot be loaded from tcp_f"
-    ):
-        bus_drivers(machine(), SystemClock(), lambda _: None)
+def test_a_frame_may_have_any_length() -> None:
+    long = machine("frame_bytes = 128", "frame_bytes = 60000")
+    assert stream_layout(long, "casing").length == 60_000
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "said"),
+    [
+        ("= 4001", '= "4001"', "buses.logger.tcp_port", "must be a whole number"),
+        ("= 4001", "= 70000", "buses.logger.tcp_port", "must be 65535 or less"),
+        ("tcp_port", "tpc_port", "buses.logger.tpc_port", "did you mean tcp_port?"),
+        ('host = "127.0.0.1"\n', "", "buses.logger.host", 'add host = "192.0.2.10" to [buses.logger]'),
+        (
+            "frame_bytes = 128",
+            "frame_bytes = 64",
+            "streams.casing.layout.first_byte",
+            "of a frame of 64 bytes",
+        ),
+        ("byte = 0", "byte = 70", "streams.casing.layout.counter", "would overlap the samples"),
+        (
+            "counter = {",
+            "# counter = {",
+            "streams.casing.layout.counter",
+            "is missing: it tells what was lost",
+        ),
+        (
+            "frame_bytes = 128",
+            "id = 5\nlength = 64",
+            "streams.casing.layout",
+            'bus "logger" is a data logger',
+        ),
+        ('"tcp-frames"', '"tcp-frame"', "buses.logger.driver", 'did you mean "tcp-frames"?'),
+    ],
+)
+def test_what_is_wrong_is_said_with_line_value_and_remedy(old: str, new: str, key: str, said: str) -> None:
+    problems = [problem for problem in problems_of(changed(old, new), MACHINE) if problem.key == key]
+    assert any(said in str(problem) for problem in problems), problems_of(changed(old, new), MACHINE)
+    assert all(problem.line is not None for problem in problems)
+
+
+def test_a_second_stream_is_too_much_for_it() -> None:
+    text = MACHINE.read_text()
+    stream = text[text.index("[streams.casing]") : text.index("[[sensors]]")]
+    both = f"{text}\n{stream.replace('streams.casing', 'streams.other')}"
+    assert "buses.logger: has several streams. Remedy: give it exactly one" in str(
+        problems_of(both, MACHINE)[0]
+    )
+
+
+@pytest.mark.parametrize("place", [None, "not_a_plugin"])
+def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(
+    monkeypatch: pytest.MonkeyPatch, place: str | None
+) -> None:
+    broken = None if place is None else type("module", (), {"LoggerPlugin": dict})
+    monkeypatch.setitem(__import__("sys").modules, "tcp_frames", broken)
+    registry.forget()
+    [problem] = [p for p in problems_of(MACHINE.read_text(), MACHINE) if p.key == "buses.logger.driver"]
+    assert "the driver cannot be loaded from tcp_frames:LoggerPlugin: " in problem.message
+    assert problem.remedy == "install the package that brings it again, or remove [buses.logger]"
+    assert problem.line == 10
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:
     text = (DOCS / "drivers.md").read_text()
     for name in ("tcp_frames.py", "pyproject.toml", "machine.toml"):
-        assert (EXAMPLE / name).read_text().strip() in text, f"docs/drivers.md does not show {name} as it is"
+        assert (DRIVER / name).read_text().strip() in text, f"docs/drivers.md does not show {name} as it is"
+
+
+@pytest.mark.parametrize(("example", "most"), [(DRIVER, 60), (DETECTOR, 40)], ids=["driver", "detector"])
+def test_an_example_is_short_and_imports_what_is_public_only(example: Path, most: int) -> None:
+    assert lines_of(example) <= most
+    [module] = example.glob("*.py")
+    imported = {
+        node.module
+        for node in ast.walk(ast.parse(module.read_text()))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in {"daqsvc", "drivers"}
+    }
+    assert imported == {"daqsvc.api"}

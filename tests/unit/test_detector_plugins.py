@@ -59,9 +59,12 @@ def installed(monkeypatch):
     """Have these entry points besides ours, by key and place."""
 
     def install(**places):
-        ours = list(entry_points(group=registry.DETECTORS))
         theirs = [EntryPoint(key, place, registry.DETECTORS) for key, place in places.items()]
-        monkeypatch.setattr(registry, "entry_points", lambda group: [*ours, *theirs])
+
+        def found(group):
+            return [*entry_points(group=group), *(point for point in theirs if point.group == group)]
+
+        monkeypatch.setattr(registry, "entry_points", found)
         registry.forget()
 
     yield install
