@@ -73,7 +73,7 @@ class WalkingDoubts(Doubts):
         names = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(names, frozenset())
 
-    def resume(self, doubts):
+    def resume(self, doubts, t_ns):
         for doubt in doubts:
             self.table[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
 
