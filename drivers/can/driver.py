@@ -12,7 +12,6 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING
 
-from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.supervisor import Link
 from drivers.can.adapter import open_adapter
 from drivers.can.batches import FrameDemultiplexer
@@ -21,16 +20,16 @@ from drivers.can.reader import SHUTDOWN_S, CanReader, close_quietly, words
 from drivers.can.record import recorder_of
 from drivers.can.socketcan import open_socketcan
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
+from drivers.stream_driver import assembler_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
-    from drivers.base import BusPort, StreamSpec
+    from drivers.base import BusPort
     from drivers.can.batches import CanSource, DecodedBatch
     from drivers.can.record import CanRecorder
-    from drivers.frames import FrameLayout
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ class CanDriver:
         self.counters = CanCounters()
         self._port = port
         self._sorter = FrameDemultiplexer(port.streams)
-        self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
+        self._assemblers = {s.name: assembler_of(s, port) for s in port.streams}
         self._open_source = open_source or _open_source
         self._said: set[str] = set()
         self._recorder: CanRecorder | None = None
@@ -211,19 +210,6 @@ class CanDriver:
         if key not in self._said:
             self._said.add(key)
             logger.warning(message, *arguments)
-
-
-def _assembler(spec: StreamSpec[FrameLayout], port: BusPort) -> StreamAssembler:
-    return StreamAssembler(
-        spec.name,
-        spec.rate_hz,
-        counter_bits=spec.layout.counter_bits,
-        samples_per_frame=spec.layout.samples_per_frame,
-        counts_per_frame=spec.layout.counts_per_frame,
-        deliver=port.deliver,
-        reorder_window_ns=spec.reorder_window_ns,
-        tell=port.tell,
-    )
 
 
 def _open_source(port: BusPort, sorter: FrameDemultiplexer) -> CanSource:
