@@ -18,8 +18,8 @@ from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.models import MachineFile, Sensor, Stream
 from daqsvc.settings.packing import PackedLayout
+from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError, Finding, choice
-from daqsvc.settings.registry import StreamWords
 from daqsvc.settings.section import Name, Section, Text
 from drivers.base import BusCounters, BusPort, Driver, StreamSpec
 from drivers.frames import FrameLayout, LayoutError

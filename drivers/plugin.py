@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from daqsvc.settings.buses import Bus
 from daqsvc.settings.packing import PackedLayout
+from daqsvc.settings.plugins import BusTable
 from daqsvc.settings.problems import AssemblyError
-from daqsvc.settings.registry import BusTable
 from drivers.packed import packed_layout
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from daqsvc.settings.registry import configured
+from daqsvc.settings.plugins import configured
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

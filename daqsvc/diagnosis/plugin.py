@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
-from daqsvc.settings.registry import PipelineTable
+from daqsvc.settings.plugins import PipelineTable
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:

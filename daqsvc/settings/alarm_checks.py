@@ -6,8 +6,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import DiagnosisAlarm, SetpointAlarm, VotingAlarm
+from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import Finding, choice
-from daqsvc.settings.registry import configured, detector_tables
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.setpoint_checks import setpoint_checks
 

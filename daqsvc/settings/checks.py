@@ -23,8 +23,8 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.mqtt_files import credential_files
+from daqsvc.settings.plugins import bus_tables, configured, driver_of_layout
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.registry import bus_tables, configured, driver_of_layout
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from daqsvc.settings.models import MachineFile, Mqtt, Stream
+    from daqsvc.settings.plugins import BusTable
     from daqsvc.settings.problems import KeyPath
-    from daqsvc.settings.registry import BusTable
 
 _MOST_FINDINGS = 200
 """Whoever has mended these may ask again."""

@@ -7,7 +7,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
-from daqsvc.settings.registry import StreamWords, bus_tables, configured, driver_of_layout
+from daqsvc.settings.plugins import StreamWords, bus_tables, configured, driver_of_layout
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from pydantic import Field, create_model
 
 from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
-from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
-from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.pipeline import Pipeline
-from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import Kinds, Section, UnusableValueError
 
 if TYPE_CHECKING:
@@ -27,8 +24,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
     from pathlib import Path
 
-    from daqsvc.settings.models import MachineFile, Stream
-    from daqsvc.settings.problems import KeyPath
+    from daqsvc.settings.problems import Finding, KeyPath
 
 DRIVERS = "daqsvc.drivers"
 """The group of entry points that drivers are registered in, by the name that ``driver = "..."`` gives."""
@@ -38,8 +34,8 @@ DETECTORS = "daqsvc.detectors"
 SettingsT = TypeVar("SettingsT", bound=Section)
 
 
-class PipelineTable(Generic[SettingsT]):
-    """What a detector says of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector.
+class DetectorKind(Generic[SettingsT]):
+    """What a detector says of its table in ``[pipeline]`` to have it read; `PipelineTable` adds to it.
 
     Attributes:
         settings: the table.
@@ -65,57 +61,9 @@ class PipelineTable(Generic[SettingsT]):
         del given
         return ()
 
-    def checks(self, draft: MachineFile, given: SettingsT) -> Iterator[Iterator[Finding]]:
-        """Every check of what the table says, and of what it asks of other tables.
 
-        Args:
-            draft: the machine file, or what is valid of it.
-            given: the table, or what is valid of it.
-        """
-        del draft, given
-        return iter(())
-
-    def alarm_checks(self, given: SettingsT, at: KeyPath) -> Iterator[Finding]:
-        """Whether an alarm that follows the detector can be raised.
-
-        Args:
-            given: the table, or what is valid of it.
-            at: where the alarm stands in the file.
-        """
-        del given, at
-        return iter(())
-
-    def start_up_signals(self, draft: MachineFile, given: SettingsT) -> Mapping[str, tuple[str, ...]]:
-        """By detector, the statistics that it goes on stating while the speed of the machine changes."""
-        del draft, given
-        return {}
-
-    def describe(self, machine: MachineFile, given: SettingsT) -> str:
-        """What was understood of the table, for a person."""
-        del machine
-        return ", ".join(f"{key} {value}" for key, value in given)
-
-
-class StreamWords(NamedTuple):
-    """What `daqsvc check` shows of a stream beside name, bus and rate; each may be empty.
-
-    Attributes:
-        frame_id: what the stream is known by on its bus.
-        frames: how many frames come in a second.
-        frame: what is in one.
-        counter: how loss is told.
-        share: of the bus's time that it takes.
-    """
-
-    frame_id: str = ""
-    frames: str = ""
-    frame: str = ""
-    counter: str = ""
-    share: str = ""
-
-
-class BusTable:
-    """What a driver brings to the machine file; `drivers.plugin` adds the driver.
+class DriverKind:
+    """What a driver says of its buses and layouts to have them read; `BusTable` adds to it.
 
     Attributes:
         buses: the kinds of its table in ``[buses]``.
@@ -153,49 +101,6 @@ class BusTable:
         """
         del layout, folder, at
         return None, []
-
-    def checks(self, draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
-        """Every check of the driver's buses and layouts as a whole.
-
-        Args:
-            draft: the machine file, or what is valid of it; a value that is not valid cannot be asked for.
-            facts: by stream, what was read from the files that its layout names.
-        """
-        del draft, facts
-        return iter(())
-
-    def stream_checks(
-        self, draft: MachineFile, stream: Stream, facts: Any, at: KeyPath
-    ) -> Iterator[Iterator[Finding]]:
-        """Every check of one stream that comes over the driver's bus, or has a layout of its kind.
-
-        Args:
-            draft: the machine file, or what is valid of it.
-            stream: the stream, or what is valid of it.
-            facts: what was read from the files that its layout names; None if nothing is known.
-            at: where the stream stands in the file.
-        """
-        del facts
-        yield self._fits(draft, stream, at)
-        if isinstance(stream.layout, PackedLayout):
-            yield packed_room(stream.layout, (*at, "layout"))
-            yield valid_raw(stream.layout.channels, (*at, "layout", "channels"))
-            yield counted(stream.layout, (*at, "layout"))
-
-    def _fits(self, draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
-        """The driver's bus carries its own layouts, and its layouts come over its own bus."""
-        bus, layout = draft.buses.get(stream.bus), stream.layout
-        if bus is not None and isinstance(bus, self.buses) != isinstance(layout, self.layouts):
-            remedy = "correct bus, or describe what comes over it; docs/drivers.md has the layouts"
-            yield Finding((*at, "layout"), f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}', remedy)
-
-    def describe_bus(self, machine: MachineFile, name: str) -> str:
-        """What was understood of a bus, for a person."""
-        return machine.buses[name].summary
-
-    def describe_stream(self, machine: MachineFile, name: str) -> StreamWords:
-        """What was understood of a stream, for a person."""
-        return StreamWords(frame=machine.streams[name].layout.summary)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,27 +142,27 @@ def forget() -> None:
     pipeline_model.cache_clear()
 
 
-def detector_tables() -> Mapping[str, PipelineTable[Any]]:
+def detector_tables() -> Mapping[str, DetectorKind[Any]]:
     """The detectors that are installed, by the key of their table, in the order of their place."""
-    return _installed(DETECTORS, "detector", PipelineTable).tables
+    return _installed(DETECTORS, "detector", DetectorKind).tables
 
 
 def broken_detectors() -> Mapping[str, str]:
     """Why a detector that is installed cannot be loaded, by the key of its table."""
-    return _installed(DETECTORS, "detector", PipelineTable).broken
+    return _installed(DETECTORS, "detector", DetectorKind).broken
 
 
-def bus_tables() -> Mapping[str, BusTable]:
+def bus_tables() -> Mapping[str, DriverKind]:
     """The drivers that are installed, by name, in the order of their place."""
-    return _installed(DRIVERS, "driver", BusTable).tables
+    return _installed(DRIVERS, "driver", DriverKind).tables
 
 
 def broken_drivers() -> Mapping[str, str]:
     """Why a driver that is installed cannot be loaded, by name."""
-    return _installed(DRIVERS, "driver", BusTable).broken
+    return _installed(DRIVERS, "driver", DriverKind).broken
 
 
-def driver_of_layout(layout: Layout) -> BusTable | None:
+def driver_of_layout(layout: Layout) -> DriverKind | None:
     """The first driver that brings this kind of layout."""
     return next((plugin for plugin in bus_tables().values() if type(layout) in plugin.layouts), None)
 
@@ -315,7 +220,7 @@ INSTALLED: Final = Kinds(lambda _table: pipeline_model(), lambda: (pipeline_mode
 
 def configured(
     pipeline: Pipeline, *, valid_only: bool = False
-) -> Iterator[tuple[str, PipelineTable[Any], Any]]:
+) -> Iterator[tuple[str, DetectorKind[Any], Any]]:
     """The detectors that a file has a table for: key, plugin and table, in order.
 
     Args:

@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm
+from daqsvc.settings.plugins import configured, detector_tables
 from daqsvc.settings.problems import Finding, choice
-from daqsvc.settings.registry import configured, detector_tables
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensors import ProximityProbe, TrendValue
 

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.buses import Bus, Layout
     from daqsvc.settings.models import MachineFile, Stream
+    from daqsvc.settings.plugins import StreamWords
     from daqsvc.settings.problems import Finding, KeyPath
-    from daqsvc.settings.registry import StreamWords
     from drivers.base import BusPort, Driver
     from drivers.frames import FrameLayout
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.buses import percent
-from daqsvc.settings.registry import StreamWords
+from daqsvc.settings.plugins import StreamWords
 from drivers.can.checks import bus_share, frame_facts
 from drivers.can.settings import CanBus, DbcLayout, PlainLayout
 

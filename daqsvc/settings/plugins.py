@@ -1,0 +1,144 @@
+"""What drivers and detectors bring to the machine file: checks of their tables, and words for a person."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+
+from daqsvc.settings import registry
+from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
+from daqsvc.settings.packing import PackedLayout
+from daqsvc.settings.problems import Finding
+from daqsvc.settings.registry import DetectorKind, DriverKind
+from daqsvc.settings.section import Section
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from daqsvc.settings.buses import Layout
+    from daqsvc.settings.models import MachineFile, Stream
+    from daqsvc.settings.pipeline import Pipeline
+    from daqsvc.settings.problems import KeyPath
+
+SettingsT = TypeVar("SettingsT", bound=Section)
+
+
+class PipelineTable(DetectorKind[SettingsT]):
+    """What a detector says of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector."""
+
+    def checks(self, draft: MachineFile, given: SettingsT) -> Iterator[Iterator[Finding]]:
+        """Every check of what the table says, and of what it asks of other tables.
+
+        Args:
+            draft: the machine file, or what is valid of it.
+            given: the table, or what is valid of it.
+        """
+        del draft, given
+        return iter(())
+
+    def alarm_checks(self, given: SettingsT, at: KeyPath) -> Iterator[Finding]:
+        """Whether an alarm that follows the detector can be raised.
+
+        Args:
+            given: the table, or what is valid of it.
+            at: where the alarm stands in the file.
+        """
+        del given, at
+        return iter(())
+
+    def start_up_signals(self, draft: MachineFile, given: SettingsT) -> Mapping[str, tuple[str, ...]]:
+        """By detector, the statistics that it goes on stating while the speed of the machine changes."""
+        del draft, given
+        return {}
+
+    def describe(self, machine: MachineFile, given: SettingsT) -> str:
+        """What was understood of the table, for a person."""
+        del machine
+        return ", ".join(f"{key} {value}" for key, value in given)
+
+
+class StreamWords(NamedTuple):
+    """What `daqsvc check` shows of a stream beside name, bus and rate; each may be empty.
+
+    Attributes:
+        frame_id: what the stream is known by on its bus.
+        frames: how many frames come in a second.
+        frame: what is in one.
+        counter: how loss is told.
+        share: of the bus's time that it takes.
+    """
+
+    frame_id: str = ""
+    frames: str = ""
+    frame: str = ""
+    counter: str = ""
+    share: str = ""
+
+
+class BusTable(DriverKind):
+    """What a driver says of its buses and layouts; `drivers.plugin` adds the driver."""
+
+    def checks(self, draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
+        """Every check of the driver's buses and layouts as a whole.
+
+        Args:
+            draft: the machine file, or what is valid of it; a value that is not valid cannot be asked for.
+            facts: by stream, what was read from the files that its layout names.
+        """
+        del draft, facts
+        return iter(())
+
+    def stream_checks(
+        self, draft: MachineFile, stream: Stream, facts: Any, at: KeyPath
+    ) -> Iterator[Iterator[Finding]]:
+        """Every check of one stream that comes over the driver's bus, or has a layout of its kind.
+
+        Args:
+            draft: the machine file, or what is valid of it.
+            stream: the stream, or what is valid of it.
+            facts: what was read from the files that its layout names; None if nothing is known.
+            at: where the stream stands in the file.
+        """
+        del facts
+        yield self._fits(draft, stream, at)
+        if isinstance(stream.layout, PackedLayout):
+            yield packed_room(stream.layout, (*at, "layout"))
+            yield valid_raw(stream.layout.channels, (*at, "layout", "channels"))
+            yield counted(stream.layout, (*at, "layout"))
+
+    def _fits(self, draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
+        """The driver's bus carries its own layouts, and its layouts come over its own bus."""
+        bus, layout = draft.buses.get(stream.bus), stream.layout
+        if bus is not None and isinstance(bus, self.buses) != isinstance(layout, self.layouts):
+            remedy = "correct bus, or describe what comes over it; docs/drivers.md has the layouts"
+            yield Finding((*at, "layout"), f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}', remedy)
+
+    def describe_bus(self, machine: MachineFile, name: str) -> str:
+        """What was understood of a bus, for a person."""
+        return machine.buses[name].summary
+
+    def describe_stream(self, machine: MachineFile, name: str) -> StreamWords:
+        """What was understood of a stream, for a person."""
+        return StreamWords(frame=machine.streams[name].layout.summary)
+
+
+def bus_tables() -> Mapping[str, BusTable]:
+    """See `registry.bus_tables`."""
+    return cast("Mapping[str, BusTable]", registry.bus_tables())
+
+
+def driver_of_layout(layout: Layout) -> BusTable | None:
+    """See `registry.driver_of_layout`."""
+    return cast("BusTable | None", registry.driver_of_layout(layout))
+
+
+def detector_tables() -> Mapping[str, PipelineTable[Any]]:
+    """See `registry.detector_tables`."""
+    return cast("Mapping[str, PipelineTable[Any]]", registry.detector_tables())
+
+
+def configured(
+    pipeline: Pipeline, *, valid_only: bool = False
+) -> Iterator[tuple[str, PipelineTable[Any], Any]]:
+    """See `registry.configured`."""
+    found = registry.configured(pipeline, valid_only=valid_only)
+    return cast("Iterator[tuple[str, PipelineTable[Any], Any]]", found)
