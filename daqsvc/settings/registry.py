@@ -122,17 +122,20 @@ def _installed(group: str, what: str, contract: type[Any]) -> _Installed:
     broken: dict[str, str] = {}
     for point in entry_points(group=group):
         try:
-            found[point.name] = _made(point, contract)
+            found[point.name] = _made(point, what, contract)
         except Exception as error:  # noqa: BLE001  whatever a plugin does when it is imported
             broken[point.name] = f"the {what} cannot be loaded from {point.value}: {error}"
     ordered = sorted(found.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
 
 
-def _made(point: EntryPoint, contract: type[Any]) -> Any:
+def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
     plugin = point.load()
     if not (isinstance(plugin, type) and issubclass(plugin, contract)):
-        raise TypeError(f"it is no {contract.__name__}")
+        raise TypeError(f"it is not derived from {what.title()}Plugin of daqsvc.api")
+    needed = "buses" if contract is DriverKind else "settings"
+    if not getattr(plugin, needed, None):
+        raise TypeError(f"{plugin.__name__} does not say its {needed}")
     return plugin()
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from machine_files import problems_of
 
 from daqsvc.settings import describe, load_machine_file, parse_machine_file, registry
 from drivers.make import stream_layout
+from drivers.plugin import DriverPlugin
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,15 +113,26 @@ def test_a_second_stream_is_too_much_for_it() -> None:
     )
 
 
-@pytest.mark.parametrize("place", [None, "not_a_plugin"])
+class _Unfinished(DriverPlugin[Any]):
+    """A plugin whose author has forgotten the model of its bus."""
+
+
+@pytest.mark.parametrize(
+    ("plugin", "why"),
+    [
+        (None, "import of tcp_frames halted"),
+        (dict, "it is not derived from DriverPlugin of daqsvc.api"),
+        (_Unfinished, "_Unfinished does not say its buses"),
+    ],
+)
 def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(
-    monkeypatch: pytest.MonkeyPatch, place: str | None
+    monkeypatch: pytest.MonkeyPatch, plugin: type[Any] | None, why: str
 ) -> None:
-    broken = None if place is None else type("module", (), {"LoggerPlugin": dict})
-    monkeypatch.setitem(__import__("sys").modules, "tcp_frames", broken)
+    broken = None if plugin is None else type("module", (), {"LoggerPlugin": plugin})
+    monkeypatch.setitem(sys.modules, "tcp_frames", broken)
     registry.forget()
     [problem] = [p for p in problems_of(MACHINE.read_text(), MACHINE) if p.key == "buses.logger.driver"]
-    assert "the driver cannot be loaded from tcp_frames:LoggerPlugin: " in problem.message
+    assert f"the driver cannot be loaded from tcp_frames:LoggerPlugin: {why}" in problem.message
     assert problem.remedy == "install the package that brings it again, or remove [buses.logger]"
     assert problem.line == 10
 
