@@ -2,8 +2,8 @@
 
 A driver owns one link. It takes frames off the bus, decodes them in bulk, and delivers blocks; it
 keeps the link up by itself, counts what goes wrong, and lets no exception out. Drivers register by
-entry point in the group ``daqsvc.drivers`` as a callable that takes a `BusPort`. What this asks of
-them, ``tests/conformance/test_conformance.py`` tests over every transport.
+entry point in the group ``daqsvc.drivers`` as a `drivers.plugin.DriverPlugin`. What this asks of them,
+``tests/conformance/test_conformance.py`` tests over every transport.
 """
 
 from __future__ import annotations

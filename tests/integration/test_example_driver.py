@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import json
 import sys
+import tomllib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +16,10 @@ from conformance.rig import samples_of
 from example_packages import DETECTOR, DOCS, DRIVER, installed, lines_of
 from live_service import running
 from machine_files import problems_of
+from machine_mutations import toml
 
 from daqsvc.settings import describe, load_machine_file, parse_machine_file, registry
+from daqsvc.settings.packing import PackedLayout
 from drivers.make import stream_layout
 from drivers.plugin import DriverPlugin
 
@@ -102,6 +106,23 @@ def test_what_is_wrong_is_said_with_line_value_and_remedy(old: str, new: str, ke
     problems = [problem for problem in problems_of(changed(old, new), MACHINE) if problem.key == key]
     assert any(said in str(problem) for problem in problems), problems_of(changed(old, new), MACHINE)
     assert all(problem.line is not None for problem in problems)
+
+
+@pytest.mark.parametrize("key", PackedLayout.model_fields)
+def test_every_key_of_its_layout_is_checked(key: str) -> None:
+    document = tomllib.loads(MACHINE.read_text())
+    layout = document["streams"]["casing"]["layout"]
+
+    def keys_of_problems(spoilt: dict[str, Any]) -> set[str]:
+        whole = document | {"streams": {"casing": document["streams"]["casing"] | {"layout": spoilt}}}
+        text = "".join(f"{json.dumps(name)} = {toml(value)}\n" for name, value in whole.items())
+        return {problem.key for problem in problems_of(text, MACHINE)}
+
+    assert f"streams.casing.layout.{key}" in keys_of_problems(layout | {key: 17.5})
+    assert f"streams.casing.layout.{key}x" in keys_of_problems(layout | {f"{key}x": 1})
+    if PackedLayout.model_fields[key].is_required() and key != PackedLayout.mark:
+        without = {name: value for name, value in layout.items() if name != key}
+        assert f"streams.casing.layout.{key}" in keys_of_problems(without)
 
 
 def test_a_second_stream_is_too_much_for_it() -> None:
