@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
 from daqsvc import kernel_cache
-from daqsvc.commands.alarm_orders import order_commands
+from daqsvc.commands.alarm_commands import alarm_verbs
 from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.arguments import ArgumentParser
@@ -114,7 +114,7 @@ def commands() -> dict[str, Command]:
         "run": RunCommand(load, start_logging),
         "check": CheckCommand(),
         "alarms": AlarmsCommand(load),
-        **order_commands(load),
+        **alarm_verbs(load),
         "analyze": AnalyzeCommand(load, kernel_cache.prepare),
         "calibrate": CalibrateCommand(load, kernel_cache.prepare),
         "detectability": DetectabilityCommand(load, kernel_cache.prepare),

@@ -25,8 +25,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
-from daqsvc.alarms.asked import printable, refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.alarms.text_validation import printable, refuse_twice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -157,17 +157,17 @@ class ControlServer:
     Args:
         store: the store's directory; the caller holds the store, so that a socket found there is left over.
         machine: name of the machine that the service watches.
-        obey: carries a command out.
+        execute: carries a command out.
         waiting: how many alarm events the disk has not got yet.
     """
 
     def __init__(
-        self, store: Path, machine: str, obey: CommandHandler, waiting: Callable[[], int] = lambda: 0
+        self, store: Path, machine: str, execute: CommandHandler, waiting: Callable[[], int] = lambda: 0
     ) -> None:
         self.path = store / SOCKET
         self.counters = ControlCounters()
         self._machine = machine
-        self._obey = obey
+        self._execute = execute
         self._waiting = waiting
         self._server: asyncio.Server | None = None
         self._inode: int | None = None
@@ -306,7 +306,7 @@ class ControlServer:
             self.counters.malformed += 1
             return ControlAnswer(accepted=False, reason=f"{error}")
         self.counters.requests += 1
-        outcome = await self._obey(request.command(), source)
+        outcome = await self._execute(request.command(), source)
         return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
 
 

@@ -15,7 +15,7 @@ from daqsvc.acquisition.alignment import SETTLE_NS
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
 from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
@@ -149,7 +149,7 @@ class Service:
             supervisor=self.supervisor,
             fall_silent=self._fall_silent,
         )
-        self.desk = AlarmDesk(
+        self.alarms = AlarmService(
             self._identity,
             alarm_rules(machine),
             store,
@@ -162,13 +162,16 @@ class Service:
             bus_health=self._bus_health,
         )
         self.control = ControlServer(
-            store, machine.machine.name, self.desk.obey, lambda: self.desk.outbox.counters.waiting
+            store,
+            machine.machine.name,
+            self.alarms.execute,
+            lambda: self.alarms.outbox.counters.waiting,
         )
 
     @property
     def publisher(self) -> MqttPublisher | None:
         """The way to the broker; None if the machine file has none."""
-        return self.desk.publisher
+        return self.alarms.publisher
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
@@ -197,10 +200,10 @@ class Service:
                 starting.cancel()
                 await asyncio.wait({starting}, timeout=DRAIN_S)
                 await self.control.close()
-                await self.desk.close(CLOSE_S)
+                await self.alarms.close(CLOSE_S)
 
     async def _start(self) -> None:
-        await self.desk.open()
+        await self.alarms.open()
         await self.pipeline.warm()
         await self._resume()
         try:
@@ -212,22 +215,22 @@ class Service:
     async def _resume(self) -> None:
         """Take over from the journal how the alarms stood when the service ended."""
         now_ns = self.clock.monotonic_ns()
-        speakers: dict[str, Sequence[str]] = {}
+        active_detectors: dict[str, Sequence[str]] = {}
         for detector in self.pipeline.detectors:
             with self.supervisor.sparing_others(f"detector {detector.name}", "its alarms begin anew"):
-                speakers.update({s.detector: s.sensors for s in detector.silent(0.0, now_ns)})
-        await self.desk.resume(speakers)
+                active_detectors.update({s.detector: s.sensors for s in detector.silent(0.0, now_ns)})
+        await self.alarms.resume(active_detectors)
 
     async def _serve(self, stop: asyncio.Event) -> None:
         keep = self.supervisor.keep
         helpers = [
             keep("loop lag", self.lag.watch),
             keep("status", self._tell_status),
-            keep("alarm times", self.desk.keep_time),
+            keep("alarm times", self.alarms.keep_time),
             keep("journal", self._watch_journal),
         ]
         controlling = keep("control socket", self.control.serve)
-        telling = [keep(name, teller.run) for name, teller in self.desk.tellers.items()]
+        telling = [keep(name, teller.run) for name, teller in self.alarms.tellers.items()]
         pipeline = keep(
             "pipeline", self.pipeline.run, may_end=lambda: all(r.is_closed for r in self.rings.values())
         )
@@ -254,10 +257,10 @@ class Service:
             for ring in self.rings.values():
                 ring.close()
             await over([pipeline], left.most(DRAIN_S))
-            await self.desk.settle(left.most(DRAIN_S))
+            await self.alarms.settle(left.most(DRAIN_S))
             with self.supervisor.sparing_others("status", "the service is stopping anyway"):
                 self._publish_status()
-            await self.desk.stop(left.most(GOODBYE_S))
+            await self.alarms.stop(left.most(GOODBYE_S))
             await stop_all([*helpers, *telling, pipeline], left.most(DRAIN_S))
 
     async def _until_stopped(self, stop: asyncio.Event, first: asyncio.Task[None] | None = None) -> None:
@@ -281,7 +284,7 @@ class Service:
 
     async def _watch_journal(self) -> None:
         """Have the service end if no alarm can reach the disk any more: as a zombie it would be of no use."""
-        reason = await self.desk.outbox.until_broken()
+        reason = await self.alarms.outbox.until_broken()
         self.supervisor.give_up(EssentialLostError(reason))
         await asyncio.Event().wait()
 
@@ -309,7 +312,7 @@ class Service:
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):
-            self.desk.take(diagnosis)
+            self.alarms.take(diagnosis)
         if self.publisher is not None:
             with self.supervisor.sparing_others(f"telemetry of {diagnosis.detector}", "one message is lost"):
                 payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
@@ -333,8 +336,8 @@ class Service:
             self._publish_status()
 
     def _publish_status(self) -> None:
-        if self.desk.sparkplug is not None:
-            self.desk.sparkplug.reach(there=any(driver.link.state == "up" for driver in self.drivers))
+        if self.alarms.sparkplug is not None:
+            self.alarms.sparkplug.reach(there=any(driver.link.state == "up" for driver in self.drivers))
         if self.publisher is not None:
             payload = status_payload(self.machine.site, self.machine.box, self.figures(), self.clock)
             self.publisher.telemetry("status", payload.to_json())
@@ -367,12 +370,12 @@ class Service:
             "loop_lag_ms": self.lag.figures_ms(),
             "suspensions": self.lag.suspensions,
             "failures": dict(self.supervisor.failures),
-            "alarms": self.desk.figures(),
-            "commands": asdict(self.desk.commands),
+            "alarms": self.alarms.figures(),
+            "commands": asdict(self.alarms.commands),
             "control": asdict(self.control.counters),
-            "outbox": asdict(self.desk.outbox.counters),
+            "outbox": asdict(self.alarms.outbox.counters),
             "mqtt": {} if self.publisher is None else self.publisher.figures(),
-            "sparkplug": {} if self.desk.sparkplug is None else asdict(self.desk.sparkplug.counters),
+            "sparkplug": {} if self.alarms.sparkplug is None else asdict(self.alarms.sparkplug.counters),
         }
 
 

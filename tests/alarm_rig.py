@@ -49,7 +49,7 @@ class AlarmRig:
         self.manager = AlarmManager(RIG, rules, self.clock, handling=self.handling)
         self.events = []
 
-    def restarted(self, speakers=None, conditions=()):
+    def restarted(self, active_detectors=None, conditions=()):
         """A service that knows nothing but the last payload of each alarm."""
         last = {}
         for event in self.events:
@@ -58,7 +58,7 @@ class AlarmRig:
         after = AlarmRig(*self.rules, handling=self.handling, clock=self.clock)
         after.events = list(self.events)
         told = [alarm_event(alarm_payload(event, 1, "series").to_json()) for event in last.values()]
-        after.told(after.manager.resume(told, speakers or {}, conditions))
+        after.told(after.manager.resume(told, active_detectors or {}, conditions))
         return after
 
     def told(self, events):
@@ -97,7 +97,7 @@ class AlarmRig:
         return self.told(self.manager.condition(name, level, sentence))
 
     def ask(self, verb, alarm, by="ann", **more):
-        (event,) = self.told(self.manager.obey(AlarmCommand(verb=verb, alarm=alarm, by=by, **more)))
+        (event,) = self.told(self.manager.execute(AlarmCommand(verb=verb, alarm=alarm, by=by, **more)))
         return event
 
     def acknowledge(self, alarm, by="ann", **more):

@@ -71,7 +71,7 @@ class Machine:
 
     async def shelves(self) -> None:
         command = AlarmCommand(verb=Verb.SHELVE, alarm="rotor-fault", by="me", duration_s=60.0)
-        await self._tell(self._manager.obey(command))
+        await self._tell(self._manager.execute(command))
 
     async def _tell(self, events) -> None:
         for event in events:

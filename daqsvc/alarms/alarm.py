@@ -306,7 +306,7 @@ class Alarm:
         Raises:
             CommandNotAllowedError: there is nothing to acknowledge, or the alarm is held.
         """
-        return self._obey(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, request)
+        return self._execute(Stimulus.ACKNOWLEDGE, EventKind.ACKNOWLEDGED, request)
 
     def reset(self, request: HandlingRequest) -> AlarmEvent:
         """A person lets go of a latched alarm.
@@ -314,9 +314,9 @@ class Alarm:
         Raises:
             CommandNotAllowedError: its condition stands, there is nothing to reset, or the alarm is held.
         """
-        return self._obey(Stimulus.RESET, EventKind.RESET, request)
+        return self._execute(Stimulus.RESET, EventKind.RESET, request)
 
-    def _obey(self, stimulus: Stimulus, kind: EventKind, request: HandlingRequest) -> AlarmEvent:
+    def _execute(self, stimulus: Stimulus, kind: EventKind, request: HandlingRequest) -> AlarmEvent:
         cause = self._cause
         if self._holds or cause is None:
             reason = f"it is {self._shown.in_words}" if self._holds else "it has never been raised"

@@ -26,14 +26,16 @@ class Expected:
         self.quality: set[str] = set()
         """Those that say whether a sensor can be judged."""
 
-    def take(self, speakers: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
+    def take(self, active_detectors: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
         """Learn more of them.
 
         Args:
-            speakers: the detectors that will make statements, with the sensors that these rest on.
+            active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself.
         """
-        self.quality.update(quality_alarm(detector, sensors) for detector, sensors in speakers.items())
+        self.quality.update(
+            quality_alarm(detector, sensors) for detector, sensors in active_detectors.items()
+        )
         self.conditions.update(conditions)
 
     @property

@@ -25,7 +25,7 @@ from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
 from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
-from daqsvc.alarms.quality import PREFIXES, Doubts
+from daqsvc.alarms.quality import PREFIXES, SensorHealth
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
 from daqsvc.alarms.shelving import ShelvingEnds
@@ -95,7 +95,7 @@ class AlarmManager:
         self._unlooked = False
         """Whether no diagnosis has come since `resume`: what was doubted before may silence any alarm."""
         self._conditions: set[str] = set()
-        self._doubts = Doubts()
+        self._doubts = SensorHealth()
         self._waiting: dict[str, Diagnosis] = {}
         """By quality alarm, the statement whose reason is still to be told: see `Alarm.waits`."""
         self._start_up = StartUpSignal(self._handling.start_up)
@@ -168,7 +168,7 @@ class AlarmManager:
         """
         return self._tell(self._stand(name, level, sentence, self._now()))
 
-    def obey(self, command: AlarmCommand) -> list[AlarmEvent]:
+    def execute(self, command: AlarmCommand) -> list[AlarmEvent]:
         """Do what a person asks.
 
         Raises:
@@ -188,7 +188,7 @@ class AlarmManager:
         return self._tell([event])
 
     def refusal(self, command: AlarmCommand) -> str | None:
-        """Why `obey` would refuse a command now; None if it would not. Nothing changes by asking."""
+        """Why `execute` would refuse a command now; None if it would not. Nothing changes by asking."""
         try:
             self._obeyed(command, self._named(command.alarm).twin())
         except CommandNotAllowedError as refusal:
@@ -198,7 +198,7 @@ class AlarmManager:
     def resume(
         self,
         told: Iterable[AlarmEvent],
-        speakers: Mapping[str, Sequence[str]],
+        active_detectors: Mapping[str, Sequence[str]],
         conditions: Iterable[str] = (),
     ) -> list[AlarmEvent]:
         """Go on from where the alarms stood when the service ended; before the first diagnosis.
@@ -210,7 +210,7 @@ class AlarmManager:
 
         Args:
             told: the last event of each alarm, in the order in which they were told.
-            speakers: the detectors that will make statements, with the sensors that these rest on.
+            active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself by `condition`.
 
         Returns:
@@ -218,12 +218,12 @@ class AlarmManager:
             no longer has them, or not what a quality alarm is about.
         """
         told = list(told)
-        self._expected.take(speakers, conditions)
+        self._expected.take(active_detectors, conditions)
         for ruled in self._ruled:
-            named = {sensor for d in ruled.rule.detectors for sensor in speakers.get(d, ())}
+            named = {sensor for d in ruled.rule.detectors for sensor in active_detectors.get(d, ())}
             self._ruled.rest(ruled, frozenset(named) or ruled.sensors)
         self._first_out.resume(event for event in told if event.identity == self._identity)
-        withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, speakers)]
+        withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, active_detectors)]
         self._unlooked = True
         for ruled in self._ruled:
             if (
@@ -400,7 +400,7 @@ class AlarmManager:
             there_are = f"there are {len(known)} others; daqsvc check lists those of the machine file"
         raise CommandNotAllowedError(f"no alarm is named {name!r}; {there_are}")
 
-    def _resumed(self, event: AlarmEvent, speakers: Mapping[str, Sequence[str]]) -> bool:
+    def _resumed(self, event: AlarmEvent, active_detectors: Mapping[str, Sequence[str]]) -> bool:
         """Go on with the alarm of ``event``; False if it stands and nobody will judge it any more."""
         ours, name = event.identity == self._identity, event.alarm
         ruled = self._ruled.named(name)
@@ -410,7 +410,7 @@ class AlarmManager:
             return True
         elif ours and name in self._expected.quality:
             self._resume_unruled(event)
-            doubts = [doubt for doubt in event.doubts if doubt.detector in speakers]
+            doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
             self._doubts.resume(doubts, self._clock.monotonic_ns())
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
             self._resume_unruled(event)

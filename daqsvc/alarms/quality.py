@@ -107,7 +107,7 @@ class _Shortage:
         return lasts
 
 
-class Doubts:
+class SensorHealth:
     """What each detector has against its sensors, from a statement that is not good to the next good one.
 
     Missing samples do not take back that a sensor was not OK; a partial statement does, which has seen at

@@ -17,8 +17,8 @@ from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import load_bearing_baseline
 from daqsvc.detectors.bearing.build import bearing_detector, orders_of
 from daqsvc.detectors.bearing.finding import BearingFinding
+from daqsvc.detectors.bearing.persistence import UNDETERMINED
 from daqsvc.detectors.bearing.settings import Bearing
-from daqsvc.detectors.bearing.standing import UNDETERMINED
 from daqsvc.diagnosis.detector import Window
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from daqsvc.analysis.acceleration import AccelerationUnit
     from daqsvc.bearing.race.verdict import RaceWord
     from daqsvc.detectors.bearing.detector import BearingDetector
-    from daqsvc.detectors.bearing.look import Look
-    from daqsvc.detectors.bearing.standing import Standing
+    from daqsvc.detectors.bearing.evaluation import Evaluation
+    from daqsvc.detectors.bearing.persistence import ConfirmedState
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
@@ -116,7 +116,7 @@ def analyse_machine_bearings(
     assert given is not None  # noqa: S101 - the caller has looked
     detector = bearing_detector(machine, given, None, calibration)
     said: list[Diagnosis] = []
-    looks: list[Look] = []
+    looks: list[Evaluation] = []
     for statements in _watch(detector, samples, recording.rate_hz, progress):
         said += statements
         if detector.seen is not None and (not looks or detector.seen is not looks[-1]):
@@ -150,7 +150,7 @@ def _analysis(
     recording: Recording,
     detector: BearingDetector,
     said: list[Diagnosis],
-    looks: list[Look],
+    looks: list[Evaluation],
 ) -> BearingAnalysis:
     """What the detector stands by at the end, with the figures of the look that shows it most."""
     setup = _setup(machine)
@@ -202,7 +202,7 @@ def _analysis(
     )
 
 
-def _decisive(looks: list[Look], standing: Standing) -> Look | None:
+def _decisive(looks: list[Evaluation], standing: ConfirmedState) -> Evaluation | None:
     """The look that a standing verdict rests on: the strongest that found the same, or else the last."""
     same = [
         look

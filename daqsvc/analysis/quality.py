@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.marks import EdgeCounts
+    from daqsvc.dsp.keyphasor_edges import EdgeCounts
 
     Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed_trend import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
-from daqsvc.dsp.marks import EdgeFinder
+from daqsvc.dsp.keyphasor_edges import EdgeFinder
 from daqsvc.dsp.orbit_speed import estimate_speed
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing import hit
+from daqsvc.bearing import impact
 from daqsvc.bearing.model import BearingModel
 
 if TYPE_CHECKING:
-    from daqsvc.bearing.hit import HealthySpectrum
+    from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import BearingParameters, Floats
 
 STEADY = 2.0
@@ -37,12 +37,12 @@ class BurstMeter:
     """
 
     def __init__(
-        self, parameters: BearingParameters, healthy: HealthySpectrum, frame: int, kept: hit.Mask
+        self, parameters: BearingParameters, healthy: HealthySpectrum, frame: int, kept: impact.Mask
     ) -> None:
         self._frame, self._kept = frame, kept
-        along, _ = hit.best_direction(healthy.covariance, np.diag(BearingModel(parameters).D))
+        along, _ = impact.best_direction(healthy.covariance, np.diag(BearingModel(parameters).D))
         self._along = along.conj()
-        self._alike = hit.energy_correlation(len(along))
+        self._alike = impact.energy_correlation(len(along))
 
     def measure(self, residual: Floats) -> float:
         """Variance of the frames' energies over that of stationary noise; NaN if too little is there.
@@ -52,7 +52,7 @@ class BurstMeter:
         Args:
             residual: float64 ``[n, 2]`` in m/s^2; frames with NaN are left out.
         """
-        frames = hit.spectra(residual, self._frame)[:, self._kept]
+        frames = impact.spectra(residual, self._frame)[:, self._kept]
         if len(frames) < _LEAST_FRAMES:
             return math.nan
         energies = np.abs(np.einsum("tfi,fi->tf", frames, self._along)) ** 2

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
-from daqsvc.bearing.hit import HealthySpectrum
 from daqsvc.bearing.identify import InnovationsModel, Whiteness
 from daqsvc.bearing.identify_baseline import BearingBaseline
 from daqsvc.bearing.identify_change import BANDS, HealthyResidual
+from daqsvc.bearing.impact import HealthySpectrum
 from daqsvc.bearing.model import BearingParameters
 from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence

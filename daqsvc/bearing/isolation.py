@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from daqsvc.bearing import hit
+from daqsvc.bearing import impact
 from daqsvc.bearing.model import INNER, OUTER, BearingModel, BearingParameters
 from daqsvc.bearing.residual import CORNER_HZ
 
 if TYPE_CHECKING:
-    from daqsvc.bearing.hit import HealthySpectrum
+    from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import Complexes, Floats
     from daqsvc.bearing.ratio_rule import Race
 
@@ -93,7 +93,7 @@ def isolation_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
         ValueError: the residual is too short.
     """
     frame, _, kept = short_lines(rate_hz)
-    return hit.healthy_spectrum(residual, rate_hz, frame, kept, 4 * frame, "isolation")
+    return impact.healthy_spectrum(residual, rate_hz, frame, kept, 4 * frame, "isolation")
 
 
 class IsolationRule:
@@ -146,7 +146,7 @@ class IsolationRule:
     ) -> None:
         """Quadratic forms of the log-likelihood of every race and size, over all lines at once."""
         moments = _moments(model, self.lines_hz, mismatch, rng)
-        dip = hit.power(self.lines_hz, CORNER_HZ)
+        dip = impact.power(self.lines_hz, CORNER_HZ)
         smallest = _SMALLEST * float(np.median(np.trace(noise, axis1=1, axis2=2).real / dip))
         hits = (_SIZES * smallest)[:, None, None, None, None] * dip[:, None, None] * moments[None]
         precision = np.linalg.inv(noise + hits)
@@ -164,7 +164,7 @@ class IsolationRule:
             residual: float64 ``[n, 2]`` in m/s^2, of a window in which a fault was detected; frames with NaN
                 are left out.
         """
-        spectra = hit.spectra(residual, self._frame)[:, self._kept] * self._to_displacement
+        spectra = impact.spectra(residual, self._frame)[:, self._kept] * self._to_displacement
         inner, outer, hits = self._evidence(spectra)
         total = inner + outer
         everything: tuple[Race, ...] = ("inner", "outer", "ball")
@@ -201,7 +201,7 @@ class IsolationRule:
         return float(inner), float(outer), len(ratio)
 
 
-def short_lines(rate_hz: float) -> tuple[int, Floats, hit.Mask]:
+def short_lines(rate_hz: float) -> tuple[int, Floats, impact.Mask]:
     """Samples of a frame as long as a hit, frequencies of the lines that are looked at, and which these."""
     frame = 2 * round(FRAME_S * rate_hz / 2.0)
     frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)

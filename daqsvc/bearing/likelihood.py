@@ -27,12 +27,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import ndtri
 
-from daqsvc.bearing import hit
+from daqsvc.bearing import impact
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.residual import CORNER_HZ
 
 if TYPE_CHECKING:
-    from daqsvc.bearing.hit import HealthySpectrum
+    from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import BearingParameters, Floats
 
 FRAME_S = 384 / 48_000
@@ -85,7 +85,7 @@ def detection_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
         ValueError: the residual is too short.
     """
     frame, _, kept = _lines(rate_hz)
-    return hit.healthy_spectrum(residual, rate_hz, frame, kept, LEAST_FRAMES, "detection")
+    return impact.healthy_spectrum(residual, rate_hz, frame, kept, LEAST_FRAMES, "detection")
 
 
 class WhittleDetector:
@@ -130,8 +130,8 @@ class WhittleDetector:
                 "bearing detection: the two components of the healthy residual are constant or alike; check "
                 "that both accelerometers are alive and not the same"
             )
-        along, best = hit.best_direction(noise, np.diag(BearingModel(parameters).D))
-        ratio = hit.power(frequency_hz[self._kept], CORNER_HZ) * best
+        along, best = impact.best_direction(noise, np.diag(BearingModel(parameters).D))
+        ratio = impact.power(frequency_hz[self._kept], CORNER_HZ) * best
         shows = ratio >= _COUNTS * ratio.max()
         self._kept[self._kept] = shows
         # A direction that was learnt from k frames finds 2 / k more in others than in its own.
@@ -151,7 +151,7 @@ class WhittleDetector:
         Raises:
             ValueError: there is no whole frame in it.
         """
-        frames = hit.spectra(residual, self._frame)[:, self._kept]
+        frames = impact.spectra(residual, self._frame)[:, self._kept]
         if not len(frames):
             raise ValueError(
                 f"bearing detection: no {self._frame} consecutive residuals among {len(residual)}; "
@@ -163,7 +163,7 @@ class WhittleDetector:
 
     def _nats(self, energies: Floats) -> Floats:
         """Logarithm of the likelihood ratio, float64 ``[sizes]``, of frames of energies ``[t, f]``."""
-        struck = hit.INDEPENDENT * (energies @ self._weights.T - self._costs)
+        struck = impact.INDEPENDENT * (energies @ self._weights.T - self._costs)
         nats = np.log1p(STRUCK * np.expm1(np.minimum(struck, _LARGEST_NATS)))
         return np.asarray((nats + np.maximum(struck - _LARGEST_NATS, 0.0)).sum(axis=0))
 
@@ -184,7 +184,7 @@ class WhittleDetector:
         """Statistics of simulated windows of the healthy machine."""
         rng = np.random.default_rng(frames)
         lines = len(self._along)
-        alike = np.linalg.cholesky(hit.energy_correlation(lines))
+        alike = np.linalg.cholesky(impact.energy_correlation(lines))
         deviation = math.sqrt((1.0 + 2.0 / 36.0) / self._learnt)
         power = 2.0 * (1.0 + _BEFORE**2) * (1.0 + 2.0 * 0.5**2)
         parts = [
@@ -204,7 +204,7 @@ class WhittleDetector:
         return drawn
 
 
-def _lines(rate_hz: float) -> tuple[int, Floats, hit.Mask]:
+def _lines(rate_hz: float) -> tuple[int, Floats, impact.Mask]:
     """Samples of a frame, frequencies of its lines, and which of them are looked at."""
     frame = 2 * round(FRAME_S * rate_hz / 2.0)
     frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)

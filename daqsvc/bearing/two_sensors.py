@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.hit import HealthySpectrum
+    from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import BearingParameters
     from daqsvc.bearing.ratio_rule import Race
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from daqsvc.rotor.detectability.foretell import Detectability
+    from daqsvc.rotor.detectability.prediction import Detectability
     from daqsvc.settings import MachineFile
 
 LEAST_FALSE_ALARMS = 1e-9
@@ -162,7 +162,7 @@ def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector  # noqa: PLC0415
     from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
     from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
-    from daqsvc.rotor.detectability.foretell import detectability  # noqa: PLC0415
+    from daqsvc.rotor.detectability.prediction import detectability  # noqa: PLC0415
 
     (detector,) = (made for made in detectors(machine) if isinstance(made, RotorBankDetector))
     bank = machine.pipeline.table(RotorBank)

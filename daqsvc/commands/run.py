@@ -113,7 +113,7 @@ async def _run_until_stopped(machine: MachineFile, store: Path, guard: ProcessGu
 
     stop = asyncio.Event()
     service = Service(machine, store, on_ending=guard.stopping)
-    guard.protect(service.desk.outbox.close_from_outside)
+    guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)
     running = asyncio.create_task(service.run(stop), name="service")
     ready = asyncio.create_task(service.ready.wait(), name="ready")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.dsp.marks import Edge, EdgeCounts, EdgeFinder, MarkLine
+from daqsvc.dsp.keyphasor_edges import Edge, EdgeCounts, EdgeFinder, EdgeLine
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class ShaftTrack:
 
 
 class KeyphasorTracker:
-    """Follows the shaft over blocks of samples, by the edges up to each sample (`EdgeFinder`, `MarkLine`).
+    """Follows the shaft over blocks of samples, by the edges up to each sample (`EdgeFinder`, `EdgeLine`).
 
     The result does not depend on how the samples are cut into blocks.
 
@@ -63,7 +63,7 @@ class KeyphasorTracker:
         line_edges: int = 8,
     ) -> None:
         self._finder = EdgeFinder(threshold, hysteresis, edge)
-        self._line = MarkLine(period_samples, period_range, line_edges)
+        self._line = EdgeLine(period_samples, period_range, line_edges)
         self._position = 0
         self._start = 0
 

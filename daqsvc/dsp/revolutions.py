@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Protocol
 
-from daqsvc.dsp.marks import AngleMark, Edge, EdgeCounts, EdgeFinder, MarkLine
+from daqsvc.dsp.keyphasor_edges import Edge, EdgeCounts, EdgeFinder, EdgeLine, KeyphasorEdge
 from daqsvc.dsp.orbit_speed import OrbitPhase
 from daqsvc.dsp.shaft import WAIT_REVOLUTIONS, Between, Revolutions, Shaft
 from daqsvc.dsp.steady_edges import SharpEdges, SteadyEdges
@@ -79,14 +79,14 @@ class FixedSpeedCutter:
     def reset(self) -> None:
         """See `RevolutionCutter.reset`."""
         self._shaft = Shaft()
-        self._edge = AngleMark(0, 0.0)
+        self._edge = KeyphasorEdge(0, 0.0)
         self._done = 0
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
         """See `RevolutionCutter.process`; ``marker`` is not looked at."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
-        while (end := AngleMark.at((self._done + 1) * self._period)).index <= self._shaft.position:
+        while (end := KeyphasorEdge.at((self._done + 1) * self._period)).index <= self._shaft.position:
             self._shaft.turn(self._edge, end, 1, bend=0.0, trusted=True)
             self._edge = end
             self._done += 1
@@ -94,7 +94,7 @@ class FixedSpeedCutter:
 
 
 class KeyphasorCutter:
-    """Revolutions between the edges of a keyphasor (`EdgeFinder`, `MarkLine`).
+    """Revolutions between the edges of a keyphasor (`EdgeFinder`, `EdgeLine`).
 
     Between two edges the angle follows the mean of the parabolas through them and the edge before, and
     through them and the edge after: a constant acceleration leaves no error. Edges that lie
@@ -130,7 +130,7 @@ class KeyphasorCutter:
             period_range = (shortest, _SPEED_RATIO * period_samples)
         self._finder = EdgeFinder(threshold, hysteresis, edge)
         self._sharp, self._steady = SharpEdges(), SteadyEdges()
-        self._line = MarkLine(period_samples, period_range)
+        self._line = EdgeLine(period_samples, period_range)
         self._period = period_samples
         self._patience = WAIT_REVOLUTIONS * period_range[1]
         self.reset()
@@ -197,14 +197,14 @@ class OrbitCutter:
         """See `RevolutionCutter.reset`."""
         self._shaft = Shaft()
         self._phase = OrbitPhase(self._period)
-        self._last: AngleMark | None = None
+        self._last: KeyphasorEdge | None = None
 
     def process(self, xy: Floats, marker: Floats | None = None) -> Revolutions:
         """See `RevolutionCutter.process`; ``marker`` is not looked at."""
         _check_samples(xy, marker)
         self._shaft.append(xy)
         for zero in self._phase.process(xy):
-            mark = AngleMark.at(zero.sample)
+            mark = KeyphasorEdge.at(zero.sample)
             if self._last is not None:
                 self._shaft.turn(self._last, mark, 1, bend=0.0, trusted=zero.trusted)
             self._last = mark

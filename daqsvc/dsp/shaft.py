@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.dsp.marks import AngleMark
+from daqsvc.dsp.keyphasor_edges import KeyphasorEdge
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -74,7 +74,9 @@ class Shaft:
         self._held = np.concatenate((self._held, xy))
         self.position += len(xy)
 
-    def turn(self, begin: AngleMark, end: AngleMark, turns: int, *, bend: float, trusted: bool) -> None:
+    def turn(
+        self, begin: KeyphasorEdge, end: KeyphasorEdge, turns: int, *, bend: float, trusted: bool
+    ) -> None:
         """The shaft turned ``turns`` times from ``begin`` to ``end``.
 
         Args:
@@ -139,13 +141,13 @@ class Between:
         self._shaft = shaft
         self._period = period_samples
         self._patience = patience_samples
-        self._edge: AngleMark | None = None
+        self._edge: KeyphasorEdge | None = None
         """Where the revolutions cut so far end."""
-        self._before: AngleMark | None = None
-        self._marks: list[AngleMark] = []
+        self._before: KeyphasorEdge | None = None
+        self._marks: list[KeyphasorEdge] = []
         """Marks of the line from ``_edge`` on."""
 
-    def add(self, mark: AngleMark, period_samples: float) -> None:
+    def add(self, mark: KeyphasorEdge, period_samples: float) -> None:
         """The next mark of the line.
 
         Args:
@@ -161,7 +163,7 @@ class Between:
         if len(self._marks) > 2:
             self._cut(self._marks[2])
 
-    def restart(self, marks: Iterable[AngleMark], period_samples: float) -> None:
+    def restart(self, marks: Iterable[KeyphasorEdge], period_samples: float) -> None:
         """A new line of marks, numbered anew; see `add`."""
         self._finish()
         for mark in marks:
@@ -174,7 +176,7 @@ class Between:
         if last is None:
             if position < self._patience:
                 return
-            last = self._edge = AngleMark(0, 0.0)
+            last = self._edge = KeyphasorEdge(0, 0.0)
         period = self._cut_period()
         if position - last.index < WAIT_REVOLUTIONS * period + 1:
             return
@@ -197,7 +199,7 @@ class Between:
         self._marks.clear()
         self._before = None
 
-    def _cut(self, after: AngleMark | None) -> None:
+    def _cut(self, after: KeyphasorEdge | None) -> None:
         """The revolutions between the two oldest marks."""
         begin, end = self._marks[:2]
         turns = end.revolution - begin.revolution
@@ -218,7 +220,7 @@ class Between:
         self._before = self._marks.pop(0)
         self._edge = end
 
-    def _fill(self, mark: AngleMark) -> None:
+    def _fill(self, mark: KeyphasorEdge) -> None:
         """Guess from where the revolutions end, or from the start, to the first mark of a line."""
         if self._edge is not None and self._edge.index < mark.index:
             turns = max(1, round(self._edge.samples_before(mark) / self._period))
@@ -226,7 +228,7 @@ class Between:
         self._edge = mark
 
 
-def _rate(begin: AngleMark, end: AngleMark) -> tuple[float, int]:
+def _rate(begin: KeyphasorEdge, end: KeyphasorEdge) -> tuple[float, int]:
     """Speed between two marks in revolutions per sample, and the revolutions between them."""
     turns = end.revolution - begin.revolution
     return turns / begin.samples_before(end), turns

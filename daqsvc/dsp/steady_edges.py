@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.marks import AngleMark
+    from daqsvc.dsp.keyphasor_edges import KeyphasorEdge
 
     Floats = NDArray[np.float64]
 
@@ -63,15 +63,15 @@ class SteadyEdges:
     """Places marks that are known to half a sample only."""
 
     def __init__(self) -> None:
-        self._marks: deque[AngleMark] = deque(maxlen=_REACH)
-        self._placed: AngleMark | None = None
+        self._marks: deque[KeyphasorEdge] = deque(maxlen=_REACH)
+        self._placed: KeyphasorEdge | None = None
 
     def reset(self) -> None:
         """Forget the marks before."""
         self._marks.clear()
         self._placed = None
 
-    def place(self, mark: AngleMark, *, sharp: bool) -> AngleMark:
+    def place(self, mark: KeyphasorEdge, *, sharp: bool) -> KeyphasorEdge:
         """The mark, moved by up to half a sample if its edge is sharp and the shaft turns evenly.
 
         The place moves on with the speed and only gently towards the middle of what the edges allow: where

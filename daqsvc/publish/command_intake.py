@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from pydantic import ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.asked import refuse_twice
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
+from daqsvc.alarms.text_validation import refuse_twice
 from daqsvc.outbox.command_ids import REMEMBERED
 from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import stamp_now

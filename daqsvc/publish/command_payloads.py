@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
-from daqsvc.alarms.asked import printable
+from daqsvc.alarms.text_validation import printable
 from daqsvc.publish.payloads import Stamped
 
 _Line = Annotated[

@@ -10,8 +10,8 @@ import numpy as np
 from daqsvc.rotor import kernels, sweep
 from daqsvc.rotor.decision import DecisionRules, Declaration
 from daqsvc.rotor.discretise import BankMode, at_speed, discretise
-from daqsvc.rotor.lanes import FREE, PAPER, BankMemory
-from daqsvc.rotor.likeness import alike
+from daqsvc.rotor.mode_similarity import alike
+from daqsvc.rotor.observer_batch import FREE, PAPER, BankMemory
 from daqsvc.rotor.report import BankReport
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class ModelBank:
     @property
     def decision(self) -> int:
         """Index of the declared mode, -1 while undetermined."""
-        return int(self._memory.desk["paper_decision" if self.rules.rule == "paper" else "decision"])
+        return int(self._memory.header["paper_decision" if self.rules.rule == "paper" else "decision"])
 
     def reseed(self) -> None:
         """Start every observer anew, for instance after a long gap; the decision is held.
@@ -141,8 +141,8 @@ class ModelBank:
 
     def _declaration(self, sample: int) -> Declaration:
         """The change of the decision that is on the desk."""
-        desk = self._memory.desk
-        return Declaration(sample, self.decision, int(desk["changed_from"]), int(desk["changed_onset"]))
+        header = self._memory.header
+        return Declaration(sample, self.decision, int(header["changed_from"]), int(header["changed_onset"]))
 
     def _compare(self) -> None:
         """See which modes look alike at the present speed: there is no change between them."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from numba import njit
 
 from daqsvc.rotor.kernels import UNDETERMINED
-from daqsvc.rotor.lanes import WIDTH
+from daqsvc.rotor.observer_batch import WIDTH
 
 if TYPE_CHECKING:
     from typing import Any
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Lanes = NDArray[np.void]
+    Batch = NDArray[np.void]
     Pairs = NDArray[np.void]
     Group = Any  # one element of Lanes: numba makes a record of it
     Desk = Any
@@ -33,7 +33,7 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
     """One sample's evidence of a group's modes against the declared one.
 
     Args:
-        group: of `lanes.LANES`; its scores are the sample's.
+        group: of `batch.LANES`; its scores are the sample's.
         own: log-likelihood of the sample under the declared mode.
         lead_limit: the lead of the declared mode counts up to here.
         width: lanes that there are modes in.
@@ -55,35 +55,38 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> int:
+def first_verdict(batch: Batch, pairs: Pairs, header: Desk) -> int:
     """One sample's evidence of every mode against every other; a mode that leads all unlike it, or -1.
 
     Args:
-        lanes: memory of the bank; ages go on.
-        pairs: ``[M M]`` of `lanes.PAIR`; the duels go on.
-        desk: of `lanes.DESK`.
+        batch: memory of the bank; ages go on.
+        pairs: ``[M M]`` of `batch.PAIR`; the duels go on.
+        header: of `batch.HEADER`.
     """
-    count = desk.modes
+    count = header.modes
     winner = UNDETERMINED
     for i in range(count):
-        group, lane = lanes[i // WIDTH], i % WIDTH
+        group, lane = batch[i // WIDTH], i % WIDTH
         group.age[lane] += 1
         narrowest = math.inf
         for j in range(count):
             if i != j:
                 pair = pairs[i * count + j]
-                pair.duel = max(0.0, pair.duel + group.score[lane] - lanes[j // WIDTH].score[j % WIDTH])
+                pair.log_ratio = max(
+                    0.0, pair.log_ratio + group.score[lane] - batch[j // WIDTH].score[j % WIDTH]
+                )
                 if pair.threshold < math.inf:
-                    narrowest = min(narrowest, pair.duel)
-        if narrowest >= desk.first_threshold and (
-            winner == UNDETERMINED or pairs[i * count + winner].duel > pairs[winner * count + i].duel
+                    narrowest = min(narrowest, pair.log_ratio)
+        if narrowest >= header.first_threshold and (
+            winner == UNDETERMINED
+            or pairs[i * count + winner].log_ratio > pairs[winner * count + i].log_ratio
         ):
             winner = i
     return winner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def next_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> tuple[int, int]:
+def next_verdict(batch: Batch, pairs: Pairs, header: Desk) -> tuple[int, int]:
     """The mode with a threshold of evidence against the declared one, and the one that takes over, or -1.
 
     A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
@@ -93,15 +96,15 @@ def next_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> tuple[int, int]:
     over from it, and one that looks like the leading one does not hold it up.
 
     Args:
-        lanes: memory of the bank.
-        pairs: ``[M M]`` of `lanes.PAIR`.
-        desk: of `lanes.DESK`.
+        batch: memory of the bank.
+        pairs: ``[M M]`` of `batch.PAIR`.
+        header: of `batch.HEADER`.
     """
-    count = desk.modes
-    row = desk.decision * count
+    count = header.modes
+    row = header.decision * count
     winner, best = UNDETERMINED, 0.0
     for j in range(count):
-        evidence = lanes[j // WIDTH].cusum[j % WIDTH]
+        evidence = batch[j // WIDTH].cusum[j % WIDTH]
         if evidence > best and pairs[row + j].threshold < math.inf:
             winner, best = j, evidence
     if winner == UNDETERMINED or best < pairs[row + winner].threshold:
@@ -114,32 +117,32 @@ def next_verdict(lanes: Lanes, pairs: Pairs, desk: Desk) -> tuple[int, int]:
             and pairs[winner * count + j].threshold < math.inf
             and pairs[row + j].threshold < math.inf
         ):
-            second = max(second, lanes[j // WIDTH].cusum[j % WIDTH])
-    if lanes[winner // WIDTH].age[winner % WIDTH] < desk.settling_wait:
+            second = max(second, batch[j // WIDTH].cusum[j % WIDTH])
+    if batch[winner // WIDTH].age[winner % WIDTH] < header.settling_wait:
         return winner, UNDETERMINED
-    if best - second < desk.identity_nats and best < _PATIENCE * threshold:
+    if best - second < header.identity_nats and best < _PATIENCE * threshold:
         return winner, UNDETERMINED
     return winner, winner
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stand_by(mode: int, lanes: Lanes, pairs: Pairs, desk: Desk) -> None:
+def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Desk) -> None:
     """Make a mode the decision: its lead is what it won by, and the evidence starts anew.
 
     Args:
         mode: index of the mode.
-        lanes: memory of the bank.
-        pairs: ``[M M]`` of `lanes.PAIR`.
-        desk: of `lanes.DESK`.
+        batch: memory of the bank.
+        pairs: ``[M M]`` of `batch.PAIR`.
+        header: of `batch.HEADER`.
     """
-    won = lanes[mode // WIDTH].cusum[mode % WIDTH]
-    for j in range(desk.modes):
-        group, lane = lanes[j // WIDTH], j % WIDTH
-        pair = pairs[mode * desk.modes + j]
-        lead = pair.duel if desk.decision == UNDETERMINED else won - group.cusum[lane]
-        group.lead[lane] = min(desk.lead_limit, lead)
+    won = batch[mode // WIDTH].cusum[mode % WIDTH]
+    for j in range(header.modes):
+        group, lane = batch[j // WIDTH], j % WIDTH
+        pair = pairs[mode * header.modes + j]
+        lead = pair.log_ratio if header.decision == UNDETERMINED else won - group.cusum[lane]
+        group.lead[lane] = min(header.lead_limit, lead)
         group.threshold[lane] = pair.threshold
-    for g in range(len(lanes)):
-        lanes[g].cusum[:] = 0.0
-        lanes[g].age[:] = 0
-    desk.decision = mode
+    for g in range(len(batch)):
+        batch[g].cusum[:] = 0.0
+        batch[g].age[:] = 0
+    header.decision = mode

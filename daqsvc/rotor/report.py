@@ -9,7 +9,7 @@ import numpy as np
 
 from daqsvc.rotor.decision import Departure
 from daqsvc.rotor.kernels import UNDETERMINED
-from daqsvc.rotor.lanes import BankMemory
+from daqsvc.rotor.observer_batch import BankMemory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -114,7 +114,7 @@ class BankReport:
         return Departure(1 - departed, onset, tuple(np.flatnonzero(close).tolist()))
 
     def _figure(self, name: str) -> int:
-        return int(BankMemory.of_bytes(self._memory).desk[name])
+        return int(BankMemory.of_bytes(self._memory).header[name])
 
     def _each(self, name: str) -> Floats:
         return BankMemory.of_bytes(self._memory).each(name)

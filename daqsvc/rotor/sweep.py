@@ -2,7 +2,7 @@
 
 Loops over the lanes of a group become vector instructions; what is rare or branches (contact, a
 declaration, a lost observer) goes mode by mode. numba's cache on disk looks at the file of a function
-alone: after a change in `kernels`, `cusum` or `lanes` this file must be touched, or the cache emptied.
+alone: after a change in `kernels`, `cusum` or `batch` this file must be touched, or the cache emptied.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba import njit
 
 from daqsvc.rotor.cusum import first_verdict, gather, next_verdict, stand_by
 from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
-from daqsvc.rotor.lanes import WIDTH, sections
+from daqsvc.rotor.observer_batch import WIDTH, sections
 
 if TYPE_CHECKING:
     from typing import Any
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Observers = NDArray[np.void]
     Pairs = NDArray[np.void]
-    Lanes = NDArray[np.void]
+    Batch = NDArray[np.void]
     Observer = Any  # one element of Observers: numba makes a record of it
     Group = Any
     Desk = Any
@@ -65,7 +65,7 @@ def _width(group: int, count: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _forget(observers: Observers, lanes: Lanes, pairs: Pairs, desk: Desk) -> None:
+def _forget(observers: Observers, batch: Batch, pairs: Pairs, header: Desk) -> None:
     """Forget estimates and evidence; the decision is held.
 
     Linear observers start on their own orbits, rub observers on the healthy one. The revolution that
@@ -74,17 +74,17 @@ def _forget(observers: Observers, lanes: Lanes, pairs: Pairs, desk: Desk) -> Non
     for m in range(len(observers)):
         # NaN means lost: the guard puts a rub observer onto the healthy orbit at once.
         start = math.nan if observers[m].substeps > 0 else 0.0
-        _set_free(lanes[m // WIDTH], m % WIDTH, (start, start, start, start))
-        _set_paper(lanes[m // WIDTH], m % WIDTH, (start, start, start, start))
-    for g in range(len(lanes)):
-        lanes[g].cusum[:] = 0.0
-        lanes[g].age[:] = 0
-        lanes[g].log_odds[:] = lanes[g].log_prior
+        _set_free(batch[m // WIDTH], m % WIDTH, (start, start, start, start))
+        _set_paper(batch[m // WIDTH], m % WIDTH, (start, start, start, start))
+    for g in range(len(batch)):
+        batch[g].cusum[:] = 0.0
+        batch[g].age[:] = 0
+        batch[g].log_odds[:] = batch[g].log_prior
     for p in range(len(pairs)):
-        pairs[p].duel = 0.0
-    desk.departed = 0
-    desk.paper_age = 0
-    desk.settling = desk.samples_per_rev
+        pairs[p].log_ratio = 0.0
+    header.departed = 0
+    header.paper_age = 0
+    header.settling = header.samples_per_rev
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -92,11 +92,11 @@ def start_anew(memory: Bytes) -> None:
     """Start every observer of a bank anew with the next sample that is usable, as after a long gap.
 
     Args:
-        memory: uint8 ``[n]``, see `lanes.sections`; changed in place.
+        memory: uint8 ``[n]``, see `batch.sections`; changed in place.
     """
-    desks, lanes, observers, pairs = sections(memory)
-    _forget(observers, lanes, pairs, desks[0])
-    desks[0].unusable = desks[0].samples_per_rev + 1
+    headers, batch, observers, pairs = sections(memory)
+    _forget(observers, batch, pairs, headers[0])
+    headers[0].unusable = headers[0].samples_per_rev + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -156,10 +156,10 @@ def _observe_rub(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _coast(observers: Observers, lanes: Lanes, cos: float, sin: float) -> None:
+def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
     """Predict all estimates through a sample that is missing."""
     for m in range(len(observers)):
-        observer, group, lane = observers[m], lanes[m // WIDTH], m % WIDTH
+        observer, group, lane = observers[m], batch[m // WIDTH], m % WIDTH
         free, paper = _free(group, lane), _paper(group, lane)
         if observer.substeps > 0:
             free = guarded(observer, observers[0], cos, sin, free)
@@ -169,14 +169,14 @@ def _coast(observers: Observers, lanes: Lanes, cos: float, sin: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(lanes: Lanes, pairs: Pairs, desk: Desk) -> int:
+def _weigh(batch: Batch, pairs: Pairs, header: Desk) -> int:
     """What the CUSUM makes of evidence that is enough; the mode that it changes its decision to, or -1."""
-    if desk.decision == UNDETERMINED:
-        desk.departed = 0
-        return first_verdict(lanes, pairs, desk)
-    suspect, winner = next_verdict(lanes, pairs, desk)
+    if header.decision == UNDETERMINED:
+        header.departed = 0
+        return first_verdict(batch, pairs, header)
+    suspect, winner = next_verdict(batch, pairs, header)
     departs = suspect != UNDETERMINED and winner == UNDETERMINED
-    desk.departed = desk.departed + 1 if departs else 0
+    header.departed = header.departed + 1 if departs else 0
     return winner
 
 
@@ -194,27 +194,27 @@ def _believe_group(group: Group, top: float, bar: float, width: int) -> tuple[in
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _believe(lanes: Lanes, count: int, desk: Desk) -> int:
+def _believe(batch: Batch, count: int, header: Desk) -> int:
     """The mode that passes the paper's threshold, or -1."""
-    leader = desk.paper_leader
-    top = lanes[leader // WIDTH].log_odds[leader % WIDTH]
+    leader = header.paper_leader
+    top = batch[leader // WIDTH].log_odds[leader % WIDTH]
     for m in range(count):
-        if lanes[m // WIDTH].log_odds[m % WIDTH] > top:
-            leader, top = m, lanes[m // WIDTH].log_odds[m % WIDTH]
+        if batch[m // WIDTH].log_odds[m % WIDTH] > top:
+            leader, top = m, batch[m // WIDTH].log_odds[m % WIDTH]
     total = 0.0
     for m in range(count):
-        total += math.exp(lanes[m // WIDTH].log_odds[m % WIDTH] - top)
+        total += math.exp(batch[m // WIDTH].log_odds[m % WIDTH] - top)
     if top < _DRIFT:
-        for g in range(len(lanes)):
-            lanes[g].log_odds[:] -= top
-    desk.paper_leader = leader
-    return leader if total < desk.largest_total else UNDETERMINED
+        for g in range(len(batch)):
+            batch[g].log_odds[:] -= top
+    header.paper_leader = leader
+    return leader if total < header.largest_total else UNDETERMINED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _hand_over(observers: Observers, lanes: Lanes, cos: float, sin: float, declared: int) -> None:
+def _hand_over(observers: Observers, batch: Batch, cos: float, sin: float, declared: int) -> None:
     """Every observer under the paper's rule takes over the declared one's estimate, and is stepped."""
-    observer, group, lane = observers[declared], lanes[declared // WIDTH], declared % WIDTH
+    observer, group, lane = observers[declared], batch[declared // WIDTH], declared % WIDTH
     dx, du, dy, dv = _paper(group, lane)
     if observer.substeps == 0:
         (dx, du, dy, dv), _ = correct(observer, group.z_x[lane], group.z_y[lane], (dx, du, dy, dv))
@@ -222,9 +222,9 @@ def _hand_over(observers: Observers, lanes: Lanes, cos: float, sin: float, decla
     for m in range(len(observers)):
         tx, tu, ty, tv = orbit(observers[m], cos, sin)
         state = (dx + ox - tx, du + ou - tu, dy + oy - ty, dv + ov - tv)
-        _set_paper(lanes[m // WIDTH], m % WIDTH, predict(observers[m], cos, sin, state))
-    for g in range(len(lanes)):
-        lanes[g].log_odds[:] = lanes[g].log_prior
+        _set_paper(batch[m // WIDTH], m % WIDTH, predict(observers[m], cos, sin, state))
+    for g in range(len(batch)):
+        batch[g].log_odds[:] = batch[g].log_prior
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -243,81 +243,81 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
         cos: float64 ``[n]``, cosine of the shaft angle; NaN: not known.
         sin: float64 ``[n]``, its sine.
         begin: sample to begin at; not 0 to go on with a block after a change.
-        memory: uint8 ``[n]``, the bank's, see `lanes.sections`; changed in place.
+        memory: uint8 ``[n]``, the bank's, see `batch.sections`; changed in place.
 
     Returns:
         ``-1 - k`` if the decision changed at sample k, which is taken in; else n.
     """
-    desks, lanes, observers, pairs = sections(memory)
-    desk, count = desks[0], len(observers)
+    headers, batch, observers, pairs = sections(memory)
+    header, count = headers[0], len(observers)
     if begin == 0:
-        desk.paper_declarations = 0
+        header.paper_declarations = 0
     for k in range(begin, len(xy)):
         x, y, c, s = xy[k, 0], xy[k, 1], cos[k], sin[k]
-        usable = x * x + y * y < desk.usable_squared and math.isfinite(c + s)
+        usable = x * x + y * y < header.usable_squared and math.isfinite(c + s)
         if usable:
-            if desk.unusable > desk.samples_per_rev:
-                _forget(observers, lanes, pairs, desk)
-            desk.unusable = 0
-            for g in range(len(lanes)):
-                _observe(lanes[g], x, y, c, s, _width(g, count))
-            for r in range(desk.rubs):
-                m = lanes[r // WIDTH].rub[r % WIDTH]
-                _observe_rub(observers[m], observers[0], lanes[m // WIDTH], m % WIDTH, c, s)
+            if header.unusable > header.samples_per_rev:
+                _forget(observers, batch, pairs, header)
+            header.unusable = 0
+            for g in range(len(batch)):
+                _observe(batch[g], x, y, c, s, _width(g, count))
+            for r in range(header.rubs):
+                m = batch[r // WIDTH].rub[r % WIDTH]
+                _observe_rub(observers[m], observers[0], batch[m // WIDTH], m % WIDTH, c, s)
         else:
-            desk.unusable += 1
-            _coast(observers, lanes, c, s)
-        counts = usable and desk.settling == 0
-        desk.settling = max(0, desk.settling - 1)
+            header.unusable += 1
+            _coast(observers, batch, c, s)
+        counts = usable and header.settling == 0
+        header.settling = max(0, header.settling - 1)
         if not counts:
-            for g in range(len(lanes)):
-                lanes[g].score[:] = 0.0
+            for g in range(len(batch)):
+                batch[g].score[:] = 0.0
 
-        previous, paper_previous = desk.decision, desk.paper_decision
+        previous, paper_previous = header.decision, header.paper_decision
         enough = int(previous == UNDETERMINED)
         if previous != UNDETERMINED:
-            own = lanes[previous // WIDTH].score[previous % WIDTH]
-            for g in range(len(lanes)):
-                enough += gather(lanes[g], own, desk.lead_limit, _width(g, count))
+            own = batch[previous // WIDTH].score[previous % WIDTH]
+            for g in range(len(batch)):
+                enough += gather(batch[g], own, header.lead_limit, _width(g, count))
         winner, onset = UNDETERMINED, 0
         if enough:
-            winner = _weigh(lanes, pairs, desk)
+            winner = _weigh(batch, pairs, header)
         else:
-            desk.departed = 0
+            header.departed = 0
         if winner != UNDETERMINED:
-            onset = k + 1 - lanes[winner // WIDTH].age[winner % WIDTH]
-            stand_by(winner, lanes, pairs, desk)
+            onset = k + 1 - batch[winner // WIDTH].age[winner % WIDTH]
+            stand_by(winner, batch, pairs, header)
 
         declared = UNDETERMINED
         if counts:
-            group, lane = lanes[desk.paper_leader // WIDTH], desk.paper_leader % WIDTH
+            group, lane = batch[header.paper_leader // WIDTH], header.paper_leader % WIDTH
             top = group.log_odds[lane] + group.paper_score[lane]
             near, above = 0, 0
-            for g in range(len(lanes)):
-                more = _believe_group(lanes[g], top, desk.odds_bar, _width(g, count))
+            for g in range(len(batch)):
+                more = _believe_group(batch[g], top, header.odds_bar, _width(g, count))
                 near, above = near + more[0], above + more[1]
             # One other mode close to the leader keeps it below the threshold: no need for exponentials.
             if above or near <= 1 or top < _DRIFT:
-                declared = _believe(lanes, count, desk)
-        desk.paper_age += 1
-        paper_onset = k + 1 - desk.paper_age
+                declared = _believe(batch, count, header)
+        header.paper_age += 1
+        paper_onset = k + 1 - header.paper_age
         if declared != UNDETERMINED:
-            desk.paper_declarations += 1
-            desk.paper_decision = declared
-            desk.paper_age = 0
-            _hand_over(observers, lanes, c, s, declared)
+            header.paper_declarations += 1
+            header.paper_decision = declared
+            header.paper_age = 0
+            _hand_over(observers, batch, c, s, declared)
         elif usable:
-            for g in range(len(lanes)):
-                _step_paper(lanes[g], _width(g, count))
-            for r in range(desk.rubs):
-                m = lanes[r // WIDTH].rub[r % WIDTH]
-                group, lane = lanes[m // WIDTH], m % WIDTH
+            for g in range(len(batch)):
+                _step_paper(batch[g], _width(g, count))
+            for r in range(header.rubs):
+                m = batch[r // WIDTH].rub[r % WIDTH]
+                group, lane = batch[m // WIDTH], m % WIDTH
                 _set_paper(group, lane, predict_rub(observers[m], c, s, _paper(group, lane)))
 
-        if desk.by_paper and declared not in (UNDETERMINED, paper_previous):
-            desk.changed_from, desk.changed_onset = paper_previous, paper_onset
+        if header.by_paper and declared not in (UNDETERMINED, paper_previous):
+            header.changed_from, header.changed_onset = paper_previous, paper_onset
             return -1 - k
-        if not desk.by_paper and winner != UNDETERMINED:
-            desk.changed_from, desk.changed_onset = previous, onset
+        if not header.by_paper and winner != UNDETERMINED:
+            header.changed_from, header.changed_onset = previous, onset
             return -1 - k
     return len(xy)

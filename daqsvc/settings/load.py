@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from daqsvc.settings.checks import check
+from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin
@@ -20,7 +21,6 @@ from daqsvc.settings.registry import broken_detectors, driver_of_layout
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
-from daqsvc.settings.words import Words, dotted, is_secret, suggested_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -142,7 +142,7 @@ class _Reading:
         return meant
 
     def _say(self, errors: Iterable[ErrorDetails], document: dict[str, Any]) -> None:
-        words = Words(MachineFile, document)
+        words = ErrorFormatter(MachineFile, document)
         for error in islice(errors, _MOST_PROBLEMS):
             path = tuple(step for step in error["loc"] if step != "[key]")
             message, remedy = words.say(error, path)

@@ -10,8 +10,8 @@ import re
 import tomllib
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.locate import Spot, TooMuchError, locate
-from daqsvc.settings.words import dotted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

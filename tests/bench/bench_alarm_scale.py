@@ -24,7 +24,7 @@ from nothing_lost.broker import LOOPBACK, Broker, mosquitto_program
 from targets import Targets
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.flood import FloodLimit
@@ -69,7 +69,7 @@ def rules(count: int) -> list[Rule]:
     return [*levels, *(VotingRule(f"vote-{three[0]}", three, 2, "rms", SETPOINT) for three in voters)]
 
 
-def speakers(count: int) -> dict[str, tuple[str, ...]]:
+def active_detectors(count: int) -> dict[str, tuple[str, ...]]:
     """The detectors of so many sensors."""
     return {f"levels/probe-{i}": (f"probe-{i}",) for i in range(count)}
 
@@ -99,7 +99,7 @@ def statement(number: int, count: int) -> Diagnosis:
 def cost_us(count: int) -> tuple[float, float]:
     """Time of the processor for one diagnosis among so many sensors, in us, and events that it makes."""
     manager = AlarmManager(RIG, rules(count), CLOCK, handling=HANDLING)
-    manager.resume([], speakers(count))
+    manager.resume([], active_detectors(count))
     for number in range(count):
         manager.take(statement(number, count))
     turns = max(LEAST_DIAGNOSES // count, 2)
@@ -137,7 +137,7 @@ class Rig:
         mqtt = MqttSettings(
             LOOPBACK, port, "bench", home_assistant=HomeAssistantSettings("rig", alarms=names)
         )
-        self.desk = AlarmDesk(RIG, rules(count), store, CLOCK, mqtt, handling=HANDLING)
+        self.alarms = AlarmService(RIG, rules(count), store, CLOCK, mqtt, handling=HANDLING)
         self.lag = LoopLag()
         self._count = count
         self._said = 0
@@ -145,24 +145,24 @@ class Rig:
     async def flood(self, events_per_s: float, seconds: float) -> None:
         """So many events a second for so long; of how many diagnoses, the alarms decide."""
         begun_s = time.perf_counter()
-        counters = self.desk.manager.counters
+        counters = self.alarms.manager.counters
         before, told_s = counters.events, 0
         while (elapsed_s := time.perf_counter() - begun_s) < seconds:
             while counters.events - before < elapsed_s * events_per_s:
-                self.desk.take(statement(self._said, self._count))
+                self.alarms.take(statement(self._said, self._count))
                 self._said += 1
             if elapsed_s > told_s:
                 told_s += 1
-                status_payload("lab", "edge-1", {"alarms": self.desk.figures()}, CLOCK).to_json()
+                status_payload("lab", "edge-1", {"alarms": self.alarms.figures()}, CLOCK).to_json()
             await asyncio.sleep(0.01)
 
 
 async def to_the_broker(directory: Path, port: int, seconds: float, targets: Targets) -> None:
     """A flood of 1000 alarms: share of a core, lag of the loop, and whether it is kept up with."""
     rig = Rig(FLOOD_ALARMS, directory / "store", port)
-    desk, counters = rig.desk, rig.desk.outbox.counters
+    desk, counters = rig.alarms, rig.alarms.outbox.counters
     await desk.open()
-    await desk.resume(speakers(FLOOD_ALARMS))
+    await desk.resume(active_detectors(FLOOD_ALARMS))
     running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
     helpers = [asyncio.create_task(desk.keep_time()), asyncio.create_task(rig.lag.watch())]
     try:

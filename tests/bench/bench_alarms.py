@@ -25,7 +25,7 @@ from nothing_lost.broker import LOOPBACK, Broker, mosquitto_program
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis, Severity
@@ -73,15 +73,15 @@ def p99(values: list[float]) -> float:
 class Decider:
     """Decides on alarms: each call changes the one alarm of the desk."""
 
-    def __init__(self, desk: AlarmDesk) -> None:
-        self.desk = desk
+    def __init__(self, desk: AlarmService) -> None:
+        self.alarms = desk
         self.taken = 0
 
     def take(self) -> None:
         """One diagnosis, one event."""
         severity = SEVERITIES[self.taken % 2]
         self.taken += 1
-        self.desk.take(
+        self.alarms.take(
             Diagnosis("rig", "rotor-bank", CLOCK.monotonic_ns(), "shaft", 0, 64, severity, severity=severity)
         )
 
@@ -89,7 +89,7 @@ class Decider:
 class Timed(Decider):
     """The same with a stop watch: from the decision to the disk, and to the PUBACK."""
 
-    def __init__(self, desk: AlarmDesk) -> None:
+    def __init__(self, desk: AlarmService) -> None:
         super().__init__(desk)
         self.to_disk_ms: list[float] = []
         self.to_puback_ms: list[float] = []
@@ -123,9 +123,9 @@ class Timed(Decider):
 
 
 @contextlib.asynccontextmanager
-async def running_desk(store: Path, port: int) -> AsyncIterator[AlarmDesk]:
+async def running_desk(store: Path, port: int) -> AsyncIterator[AlarmService]:
     """A desk that publishes to the broker at ``port``."""
-    desk = AlarmDesk(
+    desk = AlarmService(
         RIG, [DiagnosisRule("rotor-fault", "rotor-bank")], store, CLOCK, MqttSettings(LOOPBACK, port, "bench")
     )
     await desk.open()

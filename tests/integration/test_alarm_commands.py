@@ -15,9 +15,9 @@ from brokers import Consumer, eventually, running_mosquitto
 from can_gateway import MACHINE, CanGateway
 from live_service import running
 
-from daqsvc import alarm_desk, audit
+from daqsvc import alarm_service, audit
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
@@ -40,10 +40,10 @@ ACK = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=RUB, by="ann")
 @contextlib.asynccontextmanager
 async def desk_in(
     store: Path, clock: DrivenClock | None = None, mqtt: MqttSettings | None = None
-) -> AsyncIterator[AlarmDesk]:
+) -> AsyncIterator[AlarmService]:
     """A desk with latching alarms on what detectors of the same names find."""
     rules = [DiagnosisRule(name, name, latching=True) for name in (RUB, *OTHERS)]
-    desk = AlarmDesk(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), mqtt)
+    desk = AlarmService(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), mqtt)
     await desk.open()
     try:
         await desk.resume({})
@@ -53,12 +53,12 @@ async def desk_in(
         await desk.close(2.0)
 
 
-def find(desk: AlarmDesk, severity: str, alarm: str = RUB) -> None:
+def find(desk: AlarmService, severity: str, alarm: str = RUB) -> None:
     t_ns = desk._clock.monotonic_ns()
     desk.take(Diagnosis("pump", alarm, t_ns, "shaft", 0, 1, severity, severity=severity))  # type: ignore[arg-type]
 
 
-def state(desk: AlarmDesk, alarm: str = RUB) -> AlarmState:
+def state(desk: AlarmService, alarm: str = RUB) -> AlarmState:
     return desk.manager.alarms[alarm].state
 
 
@@ -66,7 +66,7 @@ def log(store: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (store / "audit.jsonl").read_text().splitlines()]
 
 
-async def kinds(desk: AlarmDesk) -> list[str]:
+async def kinds(desk: AlarmService) -> list[str]:
     return [json.loads(message.payload)["kind"] for message in await desk.outbox.pending(0, 1000)]
 
 
@@ -85,7 +85,7 @@ async def test_a_command_is_in_the_log_before_it_is_obeyed_and_on_disk_before_it
 
         monkeypatch.setattr(audit, "_append_durably", look)
         await eventually(lambda: desk.outbox.counters.appended == 1, "the raising is on disk")
-        outcome = await desk.obey(ACK, "test")
+        outcome = await desk.execute(ACK, "test")
         (message,) = [m for m in await desk.outbox.pending(0, 9) if b'"acknowledged"' in m.payload]
     assert seen == [
         ("asked", AlarmState.ACTIVE_UNACKNOWLEDGED, "1"),
@@ -118,7 +118,7 @@ async def test_what_cannot_be_done_is_refused_counted_logged_and_changes_nothing
     async with desk_in(tmp_path) as desk:
         find(desk, "danger")
         before = dict(desk.manager.alarms)
-        outcome = await desk.obey(command, "test")
+        outcome = await desk.execute(command, "test")
         assert dict(desk.manager.alarms) == before
         assert await kinds(desk) == ["raised"]
         assert (desk.commands.accepted, desk.commands.refused) == (0, 1)
@@ -134,7 +134,7 @@ async def test_a_command_that_cannot_be_written_down_is_not_obeyed(tmp_path: Pat
     (tmp_path / "audit.jsonl").mkdir()
     async with desk_in(tmp_path, DrivenClock()) as desk:
         find(desk, "alert")
-        outcome = await desk.obey(ACK, "test")
+        outcome = await desk.execute(ACK, "test")
         assert not outcome.accepted
         assert "audit.jsonl cannot be written" in outcome.reason
         assert state(desk) is AlarmState.ACTIVE_UNACKNOWLEDGED
@@ -157,7 +157,7 @@ async def test_a_command_whose_outcome_cannot_be_written_down_has_been_obeyed_an
     monkeypatch.setattr(audit, "_append_durably", full)
     async with desk_in(tmp_path) as desk:
         find(desk, "alert")
-        assert (await desk.obey(ACK, "test")).accepted
+        assert (await desk.execute(ACK, "test")).accepted
         assert state(desk) is AlarmState.ACTIVE_ACKNOWLEDGED
         assert desk.commands.unanswered_in_log == 1
     assert [line["outcome"] for line in log(tmp_path)] == ["asked"]
@@ -166,7 +166,7 @@ async def test_a_command_whose_outcome_cannot_be_written_down_has_been_obeyed_an
 async def test_an_event_that_the_disk_does_not_take_is_not_called_committed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alarm_desk, "COMMIT_S", 0.2)
+    monkeypatch.setattr(alarm_service, "COMMIT_S", 0.2)
     async with desk_in(tmp_path) as desk:
         find(desk, "alert")
         await desk.settle(5.0)
@@ -177,7 +177,7 @@ async def test_an_event_that_the_disk_does_not_take_is_not_called_committed(
             raise OSError(28, os.strerror(28))
 
         monkeypatch.setattr(Journal, "write", full)
-        outcome = await desk.obey(ACK, "test")
+        outcome = await desk.execute(ACK, "test")
         assert outcome.accepted
         assert outcome.events == ()
         assert outcome.reason.startswith("done, but the journal cannot be written yet")
@@ -206,7 +206,7 @@ async def test_commands_are_obeyed_one_after_the_other_in_the_order_they_came(
         for name in OTHERS:
             find(desk, "alert", name)
         commands = [AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=name, by="ann") for name in OTHERS]
-        outcomes = await asyncio.gather(*(desk.obey(command, "test") for command in commands))
+        outcomes = await asyncio.gather(*(desk.execute(command, "test") for command in commands))
         assert all(outcome.accepted for outcome in outcomes)
         assert list(outcomes) == sorted(outcomes, key=lambda outcome: outcome.events)
     assert [line["alarm"] for line in log(tmp_path)] == [name for name in OTHERS for _ in range(2)]
@@ -221,9 +221,9 @@ async def test_a_flood_of_refused_commands_is_summed_up_and_hides_nothing_that_w
             if number % 50 == 0:
                 find(desk, "danger" if number % 100 else "alert", OTHERS[number % 3])
                 command = AlarmCommand(verb=Verb.SHELVE, alarm=RUB, by="ann", duration_s=60.0)
-                assert (await desk.obey(command, "local")).accepted
+                assert (await desk.execute(command, "local")).accepted
                 obeyed.append(number)
-            refused = await desk.obey(
+            refused = await desk.execute(
                 AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="nobody", by="mallory", reason="x" * 500), "mqtt t"
             )
             assert "no alarm is named 'nobody'" in refused.reason
@@ -243,9 +243,9 @@ async def test_a_flood_of_refused_commands_is_summed_up_and_hides_nothing_that_w
 async def test_more_commands_than_can_wait_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alarm_desk, "MOST_COMMANDS", 2)
+    monkeypatch.setattr(alarm_service, "MOST_COMMANDS", 2)
     async with desk_in(tmp_path) as desk:
-        outcomes = await asyncio.gather(*(desk.obey(ACK, "test") for _ in range(5)))
+        outcomes = await asyncio.gather(*(desk.execute(ACK, "test") for _ in range(5)))
         assert sum("wait for the disk already" in outcome.reason for outcome in outcomes) == 3
         assert desk.commands.refused == 5
     assert len(log(tmp_path)) == 4
@@ -254,14 +254,14 @@ async def test_more_commands_than_can_wait_are_refused(
 async def test_a_command_is_carried_out_to_its_end_although_nobody_waits_any_more(tmp_path: Path) -> None:
     async with desk_in(tmp_path) as desk:
         find(desk, "alert")
-        asking = asyncio.create_task(desk.obey(ACK, "test"))
+        asking = asyncio.create_task(desk.execute(ACK, "test"))
         await asyncio.sleep(0)
         asking.cancel()
         with pytest.raises(asyncio.CancelledError):
             await asking
         await desk.settle(5.0)
         assert await kinds(desk) == ["raised", "acknowledged"]
-        late = await desk.obey(ACK, "test")
+        late = await desk.execute(ACK, "test")
         assert late.reason == "the service is stopping; ask again when it runs"
     assert [line["outcome"] for line in log(tmp_path)] == ["asked", "accepted"]
 
@@ -271,7 +271,7 @@ async def test_shelving_ends_by_itself_and_survives_a_restart(tmp_path: Path) ->
     shelve = AlarmCommand(verb=Verb.SHELVE, alarm=RUB, by="ann", duration_s=10.0)
     async with desk_in(tmp_path, clock) as desk:
         find(desk, "alert")
-        assert (await desk.obey(shelve, "test")).accepted
+        assert (await desk.execute(shelve, "test")).accepted
         assert desk.figures()["shelved"] == 1
         clock.advance_to(clock.monotonic_ns() + 4 * 10**9)
     async with desk_in(tmp_path, clock) as desk:
@@ -297,7 +297,7 @@ async def test_a_certificate_that_ends_soon_is_an_alarm_until_it_is_renewed(tmp_
             desk.tick()
         assert state(desk, "certificate/client") is AlarmState.ACTIVE_UNACKNOWLEDGED
         acknowledge = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="certificate/client", by="ann")
-        assert (await desk.obey(acknowledge, "test")).accepted
+        assert (await desk.execute(acknowledge, "test")).accepted
         desk.publisher._expiry["client"] += 90 * NS_PER_DAY
         desk.tick()
         assert state(desk, "certificate/client") is AlarmState.NORMAL
@@ -359,7 +359,10 @@ async def test_commands_over_mqtt_reach_the_alarms_and_the_audit_log(tmp_path: P
                 too_long = await ask("shelve", "shaking", "c4", duration_s=61)
                 assert "state a time above 0 and up to 1m" in too_long["reason"]
                 assert not (await ask("bypass", "shaking", "c5"))["accepted"]
-                assert (service.desk.commands.accepted, service.desk.commands.refused) == (1, 3)
+                assert (service.alarms.commands.accepted, service.alarms.commands.refused) == (
+                    1,
+                    3,
+                )
     told = [(line["source"], line["verb"], line["outcome"]) for line in log(tmp_path / "store")][1::2]
     assert told == [
         (f"mqtt {base}/reset", "reset", "refused"),

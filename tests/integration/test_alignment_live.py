@@ -141,9 +141,9 @@ async def test_probes_on_two_buses_give_the_diagnosis_of_one(shaft, tmp_path: Pa
     assert decisions[0][-2:] == ["departure", "unbalance"]
     assert {d.stream for d in said[1]} == {"shaft-y+shaft-x"}
     for service in (one, two):
-        assert "unbalance" in service.desk.manager.alarms["rotor-changed"].message
+        assert "unbalance" in service.alarms.manager.alarms["rotor-changed"].message
         # Nobody is alarmed because clocks must be learnt first.
-        assert "detector-ok/rotor-synchronous" not in service.desk.manager.alarms
+        assert "detector-ok/rotor-synchronous" not in service.alarms.manager.alarms
     # The healthy state too: 1X forward and backward, and the mean position, in um.
     baselines = []
     for service in (one, two):

@@ -22,7 +22,7 @@ MOTOR = MACHINES / "motor-accelerometer.toml"
 
 
 def how(service: Service, alarm: str) -> tuple[Level, str]:
-    status = service.desk.manager.alarms[alarm]
+    status = service.alarms.manager.alarms[alarm]
     return status.level, status.message
 
 
@@ -31,21 +31,21 @@ async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -
     machine = parse_machine_file(text.partition("[mqtt]")[0], MOTOR)
     async with running(machine, tmp_path / "store") as service:
         driver: CanDriver = service.drivers[0]  # type: ignore[assignment]
-        service.desk.tick()
-        assert "bus-overrun/can0" not in service.desk.manager.alarms, "nothing has happened"
+        service.alarms.tick()
+        assert "bus-overrun/can0" not in service.alarms.manager.alarms, "nothing has happened"
         driver.take(DecodedBatch(notes={"frames_overrun": 3}))
         driver.take(DecodedBatch(errors=ErrorCounts({"bus_off": 1}, "bus-off")))
-        service.desk.tick()
+        service.alarms.tick()
         level, message = how(service, "bus-overrun/can0")
         assert level is Level.ALERT
         assert "what bus can0 carries is lost" in message
         assert how(service, "bus-controller/can0")[0] is Level.DANGER
-        assert "bus-recording/can0" not in service.desk.manager.alarms
+        assert "bus-recording/can0" not in service.alarms.manager.alarms
         driver.counters.frames_unrecorded += 1
-        service.desk.tick()
+        service.alarms.tick()
         level, message = how(service, "bus-recording/can0")
         assert level is Level.ALERT
         assert "frames of bus can0 are missing from its recording" in message
         driver.take(DecodedBatch(errors=ErrorCounts({"restarts": 1}, "error-active")))
-        service.desk.tick()
+        service.alarms.tick()
         assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"

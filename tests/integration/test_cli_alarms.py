@@ -356,10 +356,10 @@ async def test_what_the_disk_has_not_got_is_told(tmp_path: Path) -> None:
     await outbox.open()
     await outbox.close()
 
-    async def obey(command: AlarmCommand, source: str) -> CommandOutcome:
+    async def execute(command: AlarmCommand, source: str) -> CommandOutcome:
         return CommandOutcome(accepted=True, reason="done, but the journal cannot be written yet", events=())
 
-    server = ControlServer(tmp_path, "rig", obey, lambda: 3)
+    server = ControlServer(tmp_path, "rig", execute, lambda: 3)
     await server.open()
     try:
         code, _, err = await daqsvc("alarms", "--store", tmp_path)

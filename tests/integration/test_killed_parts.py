@@ -189,7 +189,7 @@ async def test_all_at_once(tmp_path: Path, mosquitto: Mosquitto) -> None:
         await there.check("the end of all threads but the journal's")
         failures = there.service.figures()["failures"]
         assert {"mqtt", "sparkplug", "alarm times", "status", "pipeline", "driver can0"} <= set(failures)
-        assert there.service.desk.outbox.counters.telemetry.restarts == 1
+        assert there.service.alarms.outbox.counters.telemetry.restarts == 1
 
 
 @pytest.mark.long

@@ -46,7 +46,7 @@ class Heard:
     def __init__(self, service: Service) -> None:
         self.said = []
         self.events = []
-        manager, take = service.desk.manager, service.desk.manager.take
+        manager, take = service.alarms.manager, service.alarms.manager.take
 
         def heard(diagnosis):
             events = take(diagnosis)

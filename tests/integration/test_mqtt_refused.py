@@ -11,7 +11,7 @@ from brokers import Consumer, eventually, running_mosquitto
 from mqtt_publishing import CLOCK, publishing
 from picky_broker import PickyBroker
 
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -251,7 +251,7 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
         return Diagnosis("rig", detector, CLOCK.monotonic_ns(), "shaft", 0, 1, "bad", severity="alert")
 
     async def desk_at(port):
-        desk = AlarmDesk(
+        desk = AlarmService(
             Identity("lab", "edge-1", "rig"), rules, store, CLOCK, MqttSettings("127.0.0.1", port, "c")
         )
         await desk.open()

@@ -6,7 +6,7 @@ import json
 import shutil
 
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -15,7 +15,7 @@ from daqsvc.diagnosis.record import Diagnosis
 async def told_by(store, site="lab"):
     """The ids of the events of a box without a clock of its own, from one start to its end."""
     clock = DrivenClock(wall_start_ns=0)
-    desk = AlarmDesk(
+    desk = AlarmService(
         Identity(site, "edge-1", "rig"), [DiagnosisRule("rotor-fault", "rotor-bank")], store, clock, None
     )
     await desk.open()

@@ -13,7 +13,7 @@ from live_service import play, running
 from small_disks import mounted
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.alarms.states import AlarmState
@@ -45,7 +45,7 @@ def disk(tmp_path):
 @contextlib.asynccontextmanager
 async def desk_in(store, limits=LIMITS):
     """The alarms of a service from its start to its stop."""
-    desk = AlarmDesk(Identity("lab", "edge-1", "rig"), LATCHING, store, CLOCK, None, limits=limits)
+    desk = AlarmService(Identity("lab", "edge-1", "rig"), LATCHING, store, CLOCK, None, limits=limits)
     await desk.open()
     try:
         await desk.resume({})
@@ -198,13 +198,13 @@ async def test_the_whole_service_watches_on_a_full_disk(disk):
     )
     disk.fill()
     async with running(machine, disk.directory / "store") as service:
-        outbox = service.desk.outbox
+        outbox = service.alarms.outbox
         assert outbox.counters.shut == 1
         await play(service, samples[:, None], 2000.0)
         await eventually(
-            lambda: service.desk.manager.alarms["vibration-accel"].state.is_active, "it is judged"
+            lambda: service.alarms.manager.alarms["vibration-accel"].state.is_active, "it is judged"
         )
-        await eventually(lambda: service.desk.manager.alarms["store/disk"].state.is_active, "it is said")
+        await eventually(lambda: service.alarms.manager.alarms["store/disk"].state.is_active, "it is said")
         disk.free()
         await eventually(lambda: not outbox.counters.waiting, "there is room")
         names = [json.loads(message.payload)["alarm"] for message in await outbox.pending(0, 100)]

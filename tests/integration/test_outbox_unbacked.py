@@ -14,7 +14,7 @@ from brokers import Consumer, eventually, free_port, running_mosquitto
 from small_disks import failing, mounted
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -44,7 +44,7 @@ def disk(tmp_path):
 async def desk_at(store, port, *, stop_s=2.0):
     """The alarms of a service with a broker, from its start to its stop."""
     mqtt = MqttSettings("127.0.0.1", port, "daqsvc-test")
-    desk = AlarmDesk(Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, mqtt, limits=LIMITS)
+    desk = AlarmService(Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, mqtt, limits=LIMITS)
     await desk.open()
     await desk.resume({})
     running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]

@@ -44,8 +44,10 @@ async def shake(service: Service, rms: float) -> None:
 
 async def heard(service: Service, alarm: str, state: str) -> None:
     def is_so() -> bool:
-        status = service.desk.manager.alarms.get(alarm)
-        return status is not None and status.state.value == state and not service.desk.outbox.counters.waiting
+        status = service.alarms.manager.alarms.get(alarm)
+        return (
+            status is not None and status.state.value == state and not service.alarms.outbox.counters.waiting
+        )
 
     await eventually(is_so, f"{alarm} is {state}")
 
@@ -78,7 +80,7 @@ async def test_what_cleared_while_the_service_was_dead_does_not_stay_active_at_t
         async with running(file, killed) as service:
             await shake(service, QUIET)
             await heard(service, ALARM, "returned_unacknowledged")
-            await eventually(lambda: service.desk.outbox.counters.depth == 0, "the broker has it all")
+            await eventually(lambda: service.alarms.outbox.counters.depth == 0, "the broker has it all")
         async with Consumer(broker.port) as late:
             await eventually(lambda: late.on(f"/alarms/{ALARM}"), "the retained state comes")
             (state,) = late.on(f"/alarms/{ALARM}")
@@ -110,7 +112,7 @@ async def test_a_sensor_that_came_back_while_the_service_was_down_is_told(tmp_pa
     async with running(file, tmp_path) as service:
         await heard(service, "sensor-ok/accel", "active_unacknowledged")
     async with running(file, tmp_path) as service:
-        assert service.desk.manager.alarms["sensor-ok/accel"].state.is_active
+        assert service.alarms.manager.alarms["sensor-ok/accel"].state.is_active
         await shake(service, QUIET)
         await heard(service, "sensor-ok/accel", "returned_unacknowledged")
     told = of(await journal(tmp_path), "sensor-ok/accel")
@@ -126,7 +128,7 @@ async def test_an_alarm_that_the_machine_file_no_longer_has_is_returned(tmp_path
         await heard(service, ALARM, "active_unacknowledged")
     for _ in range(2):
         async with running(machine(port, name=name), tmp_path) as service:
-            assert set(service.desk.manager.alarms) == {name}
+            assert set(service.alarms.manager.alarms) == {name}
     told = of(await journal(tmp_path), ALARM)
     assert [event["kind"] for event in told] == ["raised", "returned"]
     assert told[1]["state"] == told[1]["level"] == "normal"

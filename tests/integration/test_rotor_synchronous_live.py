@@ -112,13 +112,14 @@ async def test_a_silent_bus_does_not_clear_the_alarm(tmp_path: Path) -> None:
         async with running(machine_file(broker.url), tmp_path) as service:
             await play(service, samples_of(machine), machine.rate_hz)
             await eventually(
-                lambda: "unbalance" in service.desk.manager.alarms["rotor-changed"].message,
+                lambda: "unbalance" in service.alarms.manager.alarms["rotor-changed"].message,
                 "the change is named",
             )
             await eventually(
-                lambda: "detector-ok/rotor-synchronous" in service.desk.manager.alarms, "the silence is told"
+                lambda: "detector-ok/rotor-synchronous" in service.alarms.manager.alarms,
+                "the silence is told",
             )
-            alarms = service.desk.manager.alarms
+            alarms = service.alarms.manager.alarms
             assert alarms["detector-ok/rotor-synchronous"].level.label == "alert"
             assert "no samples of shaft" in alarms["detector-ok/rotor-synchronous"].message
             assert alarms["rotor-changed"].level.label == "danger"

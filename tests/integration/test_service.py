@@ -41,12 +41,12 @@ async def test_alarms_raised_without_a_broker_go_out_after_a_restart(tmp_path: P
     machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{port}")
     async with running(machine, tmp_path) as service:
         await shake(service, 1.0)
-        await eventually(lambda: service.desk.outbox.counters.appended == 1, "the alarm is on disk")
+        await eventually(lambda: service.alarms.outbox.counters.appended == 1, "the alarm is on disk")
     async with EmbeddedBroker(port) as broker, Consumer(broker.port) as consumer:
         async with running(machine, tmp_path) as service:
             await eventually(lambda: consumer.on("/alarms/"), "the alarm arrives")
             await eventually(
-                lambda: service.desk.outbox.counters.depth == 0, "the broker has acknowledged it"
+                lambda: service.alarms.outbox.counters.depth == 0, "the broker has acknowledged it"
             )
         async with running(machine, tmp_path):
             pass
@@ -97,7 +97,7 @@ async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Pat
             await shake(service, 1.0)
             await eventually(lambda: consumer.on("/alarms/vibration-accel"), "the alarm is raised")
             await eventually(lambda: consumer.on("/alarms/sensor-ok/accel"), "the silence is told")
-            assert service.desk.manager.alarms["vibration-accel"].level.label == "alert"
+            assert service.alarms.manager.alarms["vibration-accel"].level.label == "alert"
             told = consumer.on("/alarms/sensor-ok/accel")[0].payload
             assert "no samples of recording for" in told["message"]
             assert told["cause"]["decision"] == "alert"

@@ -13,7 +13,7 @@ from brokers import LOOPBACK, eventually
 from sparkplug_edge import BOOLEAN, CLOCK, NODE, born, rebirth, said
 from sparkplug_host import Host
 
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
@@ -36,7 +36,7 @@ NCMD, DCMD = NODE.format("NCMD"), f"{NODE.format('DCMD')}/rig"
 
 
 @contextlib.asynccontextmanager
-async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -> AsyncIterator[AlarmDesk]:
+async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -> AsyncIterator[AlarmService]:
     """A desk whose alarm latches, at a broker, as an edge node."""
     sparkplug = SparkplugSettings(
         group="lab",
@@ -49,7 +49,7 @@ async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -
         alarms=("rotor-fault",),
     )
     commands = None if allow is None else CommandSettings(("rig",), allow)
-    desk = AlarmDesk(
+    desk = AlarmService(
         Identity("lab", "edge-1", "rig"),
         [DiagnosisRule("rotor-fault", "bank", latching=True)],
         tmp_path / "store",
@@ -81,7 +81,7 @@ def audited(tmp_path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (tmp_path / "store" / "audit.jsonl").read_text().splitlines()]
 
 
-def state(desk: AlarmDesk) -> AlarmState:
+def state(desk: AlarmService) -> AlarmState:
     return desk.manager.alarms["rotor-fault"].state
 
 

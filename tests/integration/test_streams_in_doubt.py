@@ -42,7 +42,7 @@ class Events:
 
     def __init__(self, service: Service) -> None:
         self.all: list[AlarmEvent] = []
-        manager, take = service.desk.manager, service.desk.manager.take
+        manager, take = service.alarms.manager, service.alarms.manager.take
 
         def heard(diagnosis):  # type: ignore[no-untyped-def]
             events = take(diagnosis)

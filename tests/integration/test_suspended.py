@@ -83,19 +83,19 @@ async def test_a_wall_clock_that_steps_moves_no_alarm(step_ns: int, tmp_path: Pa
         service = Service(machine, tmp_path, clock)
 
         def state() -> AlarmState:
-            return service.desk.manager.alarms["vibration-accel"].state
+            return service.alarms.manager.alarms["vibration-accel"].state
 
         async with running(service):
             await shake(service, 1.0)
             await eventually(lambda: state().is_active, "the alarm is raised")
             shelve = AlarmCommand(verb=Verb.SHELVE, alarm="vibration-accel", by="ann", duration_s=1800.0)
-            assert (await service.desk.obey(shelve, "test")).accepted
+            assert (await service.alarms.execute(shelve, "test")).accepted
             await eventually(lambda: len(consumer.on("/alarms/vibration-accel")) == 2, "both events are out")
             clock.ahead_ns = step_ns
             await shake(service, 1.0)
             assert state() is AlarmState.SHELVED, "half an hour is not over because a clock was set"
             unshelve = AlarmCommand(verb=Verb.UNSHELVE, alarm="vibration-accel", by="ann")
-            assert (await service.desk.obey(unshelve, "test")).accepted
+            assert (await service.alarms.execute(unshelve, "test")).accepted
             assert state() is AlarmState.ACTIVE_UNACKNOWLEDGED
             await shake(service, 0.1)
             await eventually(lambda: not state().is_active, "the alarm returns")

@@ -83,7 +83,7 @@ async def watched(folder):
     sensor.unit.put("holding", 35, struct.pack(">h", 900))
     with sensor.plugged_in():
         async with running(machine, folder / "store") as service:
-            manager = service.desk.manager
+            manager = service.alarms.manager
             counters = service.pipeline.counters["trends/drive-end"]
             await eventually(lambda: counters.windows > 0, "the first value is judged")
             yield sensor, lambda name: manager.alarms.get(name, UNHEARD)
@@ -169,7 +169,7 @@ async def test_the_simulator_plays_a_trend_that_raises_an_alarm_and_returns_it(t
             output, _ = await sim.communicate()
         assert sim.returncode == 0
         assert json.loads(output)["complete"]
-        alarm = lambda: service.desk.manager.alarms["nde-vibration"]  # noqa: E731
+        alarm = lambda: service.alarms.manager.alarms["nde-vibration"]  # noqa: E731
         await eventually(
             lambda: alarm().state is AlarmState.RETURNED_UNACKNOWLEDGED, "the alarm has come and gone"
         )

@@ -25,7 +25,7 @@ from nothing_lost.script import RULES, SENSORS, Script
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.supervisor import Backoff
-from daqsvc.alarm_desk import AlarmDesk
+from daqsvc.alarm_service import AlarmService
 from daqsvc.outbox.messages import event_id
 from daqsvc.publish.mqtt import MqttSettings
 
@@ -97,7 +97,7 @@ def settled_to(path: Path) -> int:
 class Teller:
     """Takes the script's diagnoses to the desk and writes down what becomes of them."""
 
-    def __init__(self, desk: AlarmDesk, clock: SteppedClock, witness: Path) -> None:
+    def __init__(self, desk: AlarmService, clock: SteppedClock, witness: Path) -> None:
         self._desk = desk
         self._clock = clock
         self._witness = os.open(witness, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -190,7 +190,7 @@ async def run(arguments: argparse.Namespace) -> None:
         protocol=arguments.protocol,
     )
     bypassed = arguments.mutation == "bypass"
-    desk = AlarmDesk(script.identity, RULES, arguments.store, clock, None if bypassed else mqtt)
+    desk = AlarmService(script.identity, RULES, arguments.store, clock, None if bypassed else mqtt)
     if desk.publisher is not None:
         assert hasattr(desk.publisher, "_backoff")
         desk.publisher._backoff = QUICK_RETRY

@@ -18,7 +18,7 @@ from daqsvc.alarms.events import Doubt, Identity
 from daqsvc.alarms.flood import FloodLimit
 from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
-from daqsvc.alarms.quality import Doubts, Touched, quality_alarm
+from daqsvc.alarms.quality import SensorHealth, Touched, quality_alarm
 from daqsvc.alarms.rules import Circumstances
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
@@ -52,7 +52,7 @@ HANDLING = AlarmHandling(
 )
 
 
-class WalkingDoubts(Doubts):
+class WalkingDoubts(SensorHealth):
     """One table, searched from end to end."""
 
     def __init__(self):
@@ -190,7 +190,7 @@ class Twins:
         for manager in self.both:
             try:
                 asked = AlarmCommand(verb=verb, alarm=alarm, by="ann", duration_s=duration_s)
-                said.append(manager.obey(asked))
+                said.append(manager.execute(asked))
             except CommandNotAllowedError as refusal:
                 said.append([])
                 reason = f"{refusal}"

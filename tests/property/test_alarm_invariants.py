@@ -213,7 +213,7 @@ class Alarms(RuleBasedStateMachine):
             verb=verb, alarm=alarm, by="ann", duration_s=duration_s, occurrence=occurrence, reason="why not"
         )
         try:
-            events = self.manager.obey(asked)
+            events = self.manager.execute(asked)
         except CommandNotAllowedError:
             assert dict(self.manager.alarms) == before
             return
@@ -227,7 +227,7 @@ class Alarms(RuleBasedStateMachine):
     def see_everything(self):
         for name, status in self.manager.alarms.items():
             if status.state.value.endswith("_unacknowledged"):
-                self.tell(self.manager.obey(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=name, by="bob")))
+                self.tell(self.manager.execute(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=name, by="bob")))
 
     @rule(seconds=st.sampled_from([0, 1, 4, 35]))
     def wait(self, seconds):

@@ -71,7 +71,7 @@ class Box:
             )
         else:
             with contextlib.suppress(CommandNotAllowedError):
-                events = self.manager.obey(AlarmCommand(verb=what, alarm=which, by="ann"))
+                events = self.manager.execute(AlarmCommand(verb=what, alarm=which, by="ann"))
         for event in events:
             self.journal.pop(event.alarm, None)
             self.journal[event.alarm] = alarm_payload(event, 1, "series").to_json()

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from daqsvc.rotor import kernels
-from daqsvc.rotor.detectability.foretell import detectability
+from daqsvc.rotor.detectability.prediction import detectability
 from daqsvc.rotor.discretise import BankMode, discretise
 from daqsvc.rotor.model import NormalisedRotor
 from sim_hw.plants import rotor as plant

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from daqsvc.alarms.quality import Doubts
+from daqsvc.alarms.quality import SensorHealth
 from daqsvc.diagnosis.record import Diagnosis
 
 SILENCE = "no samples of s for {} s; check bus and device"
@@ -10,7 +10,7 @@ RATE = "the device sends {} Hz, the file says 50"
 
 
 def test_a_wrong_rate_takes_over_from_silence() -> None:
-    doubts = Doubts()
+    doubts = SensorHealth()
     found = []
     for reason in (SILENCE.format(2.0), SILENCE.format(7.5), RATE.format(100.1), RATE.format(99)):
         doubts.take(

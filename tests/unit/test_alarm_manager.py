@@ -47,7 +47,7 @@ class Desk:
         )
 
     def ask(self, verb, alarm, by="", **more):
-        events = self.manager.obey(AlarmCommand(verb=verb, alarm=alarm, by=by, **more))
+        events = self.manager.execute(AlarmCommand(verb=verb, alarm=alarm, by=by, **more))
         return events[0]
 
     def acknowledge(self, alarm, by=""):

@@ -16,7 +16,7 @@ from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import OutboxMessage
 from daqsvc.publish.payloads import alarm_event, alarm_payload
-from daqsvc.publish.recall import recall
+from daqsvc.publish.restore import restore_alarms
 from daqsvc.publish.topics import Topics
 
 RIG = Identity("lab", "edge-1", "rig")
@@ -190,7 +190,7 @@ def test_what_cannot_be_read_is_left_out_and_logged_once(caplog):
     ]
     messages = [OutboxMessage(n, *row, retain=True) for n, row in enumerate(rows)]
     with caplog.at_level(logging.WARNING):
-        assert recall(messages, topics) == [event]
+        assert restore_alarms(messages, topics) == [event]
     (record,) = caplog.records
     assert record.getMessage().startswith("4 alarm states of the journal cannot be read")
     assert alarm_event(good) == event

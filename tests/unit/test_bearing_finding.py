@@ -9,7 +9,7 @@ from daqsvc.bearing.identify_change import BANDS, ResidualChange
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence, RaceVerdict
 from daqsvc.detectors.bearing.direction import Direction
 from daqsvc.detectors.bearing.finding import WORDS, find
-from daqsvc.detectors.bearing.standing import CLEAR_LOOKS, CONFIRM_LOOKS, Steadfast
+from daqsvc.detectors.bearing.persistence import CLEAR_LOOKS, CONFIRM_LOOKS, PersistenceFilter
 
 
 def evidence(severity: float) -> PartEvidence:
@@ -128,46 +128,46 @@ def test_of_two_bearings_without_lines_the_one_whose_residual_shows_more_decides
     assert (found.verdict, found.where) == ("outer", "b")
 
 
-def looks(steadfast: Steadfast, *words: str) -> list[str]:
+def looks(filtered: PersistenceFilter, *words: str) -> list[str]:
     said = []
     for word in words:
         group = ("inner", "outer") if word == "inner_or_outer" else (word,)
-        steadfast.look(find({"a": race(word, group)}, None, 1e-3))
-        said.append(steadfast.standing.decision)
+        filtered.update(find({"a": race(word, group)}, None, 1e-3))
+        said.append(filtered.standing.decision)
     return said
 
 
 def test_faults_need_two_looks_and_health_eight() -> None:
-    steadfast = Steadfast()
-    assert looks(steadfast, "normal", "outer", "normal", "outer") == ["normal"] * 4
-    assert looks(steadfast, "outer") == ["outer"]
-    assert steadfast.standing.where == "a"
-    assert looks(steadfast, *["normal"] * (CLEAR_LOOKS - 1), "outer") == ["outer"] * CLEAR_LOOKS
-    assert looks(steadfast, *["normal"] * CLEAR_LOOKS) == ["outer"] * (CLEAR_LOOKS - 1) + ["normal"]
+    filtered = PersistenceFilter()
+    assert looks(filtered, "normal", "outer", "normal", "outer") == ["normal"] * 4
+    assert looks(filtered, "outer") == ["outer"]
+    assert filtered.standing.where == "a"
+    assert looks(filtered, *["normal"] * (CLEAR_LOOKS - 1), "outer") == ["outer"] * CLEAR_LOOKS
+    assert looks(filtered, *["normal"] * CLEAR_LOOKS) == ["outer"] * (CLEAR_LOOKS - 1) + ["normal"]
     assert CONFIRM_LOOKS == 2
 
 
 def test_two_names_of_a_fault_are_a_fault() -> None:
-    assert looks(Steadfast(), "normal", "changed", "outer") == ["normal", "normal", "outer"]
+    assert looks(PersistenceFilter(), "normal", "changed", "outer") == ["normal", "normal", "outer"]
 
 
 def test_a_part_once_named_is_not_blurred_but_may_be_renamed() -> None:
-    steadfast = Steadfast()
-    assert looks(steadfast, "inner", "inner", *["changed"] * 20) == ["undetermined"] + ["inner"] * 21
-    assert looks(steadfast, "outer", "ball", "ball") == ["inner", "inner", "ball"]
+    filtered = PersistenceFilter()
+    assert looks(filtered, "inner", "inner", *["changed"] * 20) == ["undetermined"] + ["inner"] * 21
+    assert looks(filtered, "outer", "ball", "ball") == ["inner", "inner", "ball"]
 
 
 def test_a_gap_breaks_a_row_of_looks() -> None:
-    steadfast = Steadfast()
-    looks(steadfast, "normal", "outer")
-    steadfast.interrupt()
-    assert looks(steadfast, "outer", "outer") == ["normal", "outer"]
+    filtered = PersistenceFilter()
+    looks(filtered, "normal", "outer")
+    filtered.interrupt()
+    assert looks(filtered, "outer", "outer") == ["normal", "outer"]
 
 
 def test_the_last_look_of_a_short_recording_counts_by_itself() -> None:
-    steadfast = Steadfast()
-    assert steadfast.look(find({"a": race("outer")}, None, 1e-3), last=True)
-    assert steadfast.standing.decision == "outer"
-    steadfast = Steadfast()
-    looks(steadfast, "normal")
-    assert not steadfast.look(find({"a": race("outer")}, None, 1e-3), last=True)
+    filtered = PersistenceFilter()
+    assert filtered.update(find({"a": race("outer")}, None, 1e-3), last=True)
+    assert filtered.standing.decision == "outer"
+    filtered = PersistenceFilter()
+    looks(filtered, "normal")
+    assert not filtered.update(find({"a": race("outer")}, None, 1e-3), last=True)

@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.commands.alarm_commands import user_name
 from daqsvc.commands.alarm_journal import AlarmView
-from daqsvc.commands.alarm_orders import user_name
 from daqsvc.commands.alarm_table import ago, current
 from daqsvc.commands.option_types import duration
 

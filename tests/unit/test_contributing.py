@@ -41,7 +41,7 @@ def test_every_target_of_make_that_is_named_is_there(name: str) -> None:
 
 def test_every_name_of_the_code_that_is_named_is_there() -> None:
     named = set(re.findall(r"`((?:daqsvc|drivers)\.[\w.]+\.[A-Z]\w+)`", (ROOT / TEXTS[0]).read_text("utf-8")))
-    assert len(named) >= 5
+    assert len(named) >= 4
     for name in named:
         module, _, attribute = name.rpartition(".")
         assert hasattr(importlib.import_module(module), attribute), name

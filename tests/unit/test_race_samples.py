@@ -10,13 +10,13 @@ from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 from scipy.signal import butter, sosfiltfilt
 
 from daqsvc.bearing.race import RaceInputError, race_test
-from daqsvc.bearing.race.doubt import MOST_MARGIN, doubted
-from daqsvc.bearing.race.knocks import blanked, knocks, levelled, merged
+from daqsvc.bearing.race.confidence import MOST_MARGIN, doubted
+from daqsvc.bearing.race.prewhitening import Prewhitening
 from daqsvc.bearing.race.quality import checked
-from daqsvc.bearing.race.robust import RobustWhitening
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.spikes import despiked
 from daqsvc.bearing.race.stuck import stuck
+from daqsvc.bearing.race.transients import blanked, find_transients, levelled, merged
 
 REVOLUTION = round(60.0 * RATE_HZ / SPEED_RPM)
 BAND_HZ = (400.0, 0.48 * RATE_HZ)
@@ -125,9 +125,9 @@ def test_a_knock_is_left_out(part: str | None, factor: float) -> None:
 def test_strikes_of_every_revolution_are_no_knocks() -> None:
     signal = np.random.default_rng(0).standard_normal(60_000)
     signal[150::REVOLUTION] = 40.0
-    assert knocks(signal, RATE_HZ, REVOLUTION) == []
+    assert find_transients(signal, RATE_HZ, REVOLUTION) == []
     signal[30_000:30_020] = 200.0
-    ((first, last),) = knocks(signal, RATE_HZ, REVOLUTION)
+    ((first, last),) = find_transients(signal, RATE_HZ, REVOLUTION)
     assert 29_900 < first <= 30_000
     assert 30_020 <= last < 30_120
 
@@ -209,7 +209,7 @@ def test_doubt_grows_with_what_is_against_the_samples_and_takes_nothing_from_a_p
 
 def test_a_shape_is_a_wrong_sample_only_if_nothing_else_is_there() -> None:
     noise = np.random.default_rng(15).standard_normal(60_000)
-    whitening = RobustWhitening(noise, RATE_HZ, *BAND_HZ)
+    whitening = Prewhitening(noise, RATE_HZ, *BAND_HZ)
     single, struck = noise.copy(), noise.copy()
     single[30_000] += 60.0
     struck[30_000 : 30_000 + 240] += ringing(60.0)
@@ -224,7 +224,7 @@ def test_a_shape_is_a_wrong_sample_only_if_nothing_else_is_there() -> None:
 def test_whitening_makes_noise_of_unit_deviation_whatever_single_events_do() -> None:
     noise = np.convolve(np.random.default_rng(16).standard_normal(60_000), [1.0, 1.6, 0.8], mode="same")
     noise[7_000:7_050] += 1e4
-    whitened = RobustWhitening(noise, RATE_HZ, *BAND_HZ)(noise)[20_000:]
+    whitened = Prewhitening(noise, RATE_HZ, *BAND_HZ)(noise)[20_000:]
     assert whitened.std() == pytest.approx(1.0, abs=0.1)
     density = np.abs(np.fft.rfft(whitened[: 2**15]).reshape(-1)[2**11 : 15_000]) ** 2
     thirds = [part.mean() for part in np.array_split(density, 3)]

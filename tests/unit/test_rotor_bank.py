@@ -11,8 +11,8 @@ import pytest
 from daqsvc.rotor.bank import UNDETERMINED, ModelBank
 from daqsvc.rotor.decision import DecisionRules
 from daqsvc.rotor.discretise import BankMode
-from daqsvc.rotor.lanes import FREE, PAPER
 from daqsvc.rotor.model import NormalisedRotor
+from daqsvc.rotor.observer_batch import FREE, PAPER
 
 PER_REV = 64
 DURATION = 2 * math.pi / PER_REV

@@ -18,7 +18,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
     class Service:
         def __init__(self, *_, **__):
             self.ready = asyncio.Event()
-            self.desk = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
+            self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
 
         async def run(self, stop):
             frozen.append(gc.get_freeze_count())

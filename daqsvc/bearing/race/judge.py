@@ -15,17 +15,18 @@ import scipy.fft
 
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
+from daqsvc.bearing.race.confidence import MOST_DOUBT, MOST_MARGIN, doubted
 from daqsvc.bearing.race.decision import RACES, decide
-from daqsvc.bearing.race.doubt import MOST_DOUBT, MOST_MARGIN, doubted
 from daqsvc.bearing.race.harmonics import slow_series
-from daqsvc.bearing.race.knocks import levelled
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
 from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.rules import RaceRules
+from daqsvc.bearing.race.scoring import EnvelopeView, Scales, view_of
 from daqsvc.bearing.race.speed import shaft_rate
 from daqsvc.bearing.race.track import shaft_track
+from daqsvc.bearing.race.transients import levelled
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
@@ -35,7 +36,6 @@ from daqsvc.bearing.race.verdict import (
     RaceLine,
     RaceVerdict,
 )
-from daqsvc.bearing.race.weigh import EnvelopeView, Scales, view_of
 from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
 
 if TYPE_CHECKING:

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.race.knocks import blanked, merged, runs
 from daqsvc.bearing.race.repair import repaired
 from daqsvc.bearing.race.stuck import stuck
+from daqsvc.bearing.race.transients import blanked, merged, runs
 from daqsvc.bearing.race.verdict import RaceInputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.race.knocks import Stretch
     from daqsvc.bearing.race.rules import RaceRules
+    from daqsvc.bearing.race.transients import Stretch
 
     Real = NDArray[np.float64]
 

@@ -13,15 +13,15 @@ import numpy as np
 import scipy.fft
 from scipy.ndimage import median_filter
 
-from daqsvc.bearing.race.knocks import blanked, knocks, merged
-from daqsvc.bearing.race.robust import RobustWhitening
+from daqsvc.bearing.race.prewhitening import Prewhitening
 from daqsvc.bearing.race.spikes import despiked
+from daqsvc.bearing.race.transients import blanked, find_transients, merged
 from daqsvc.bearing.race.verdict import RaceInputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.race.knocks import Stretch
+    from daqsvc.bearing.race.transients import Stretch
 
     Real = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
     Raises:
         RaceInputError: too much is wrong.
     """
-    whitening = RobustWhitening(samples, rate_hz, *band_hz)
+    whitening = Prewhitening(samples, rate_hz, *band_hz)
     values = samples
     spikes: set[int] = set()
     steps: list[tuple[int, float]] = []
@@ -82,7 +82,12 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
             steps += clean.steps
         values, told = _steadied(values, revolution)
         wandered = wandered or told
-        found = merged([*knocks(whitened, rate_hz, revolution), *knocks(_unit(values), rate_hz, revolution)])
+        found = merged(
+            [
+                *find_transients(whitened, rate_hz, revolution),
+                *find_transients(_unit(values), rate_hz, revolution),
+            ]
+        )
         if not found:
             break
         stretches = merged([*stretches, *found])

@@ -15,7 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.race.robust import RobustWhitening
+    from daqsvc.bearing.race.prewhitening import Prewhitening
 
     Real = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Despiked:
     steps: tuple[tuple[int, float], ...]
 
 
-def despiked(samples: Real, whitened: Real, whitening: RobustWhitening, revolution: int) -> Despiked:
+def despiked(samples: Real, whitened: Real, whitening: Prewhitening, revolution: int) -> Despiked:
     """Take out single wrong samples and steps.
 
     Args:
@@ -123,7 +123,7 @@ def _jumps(samples: Real, revolution: int, apart: int) -> list[tuple[int, float]
 class _Shapes:
     """What a wrong sample and a step look like in the whitened channel, at the places that they may have."""
 
-    def __init__(self, whitening: RobustWhitening) -> None:
+    def __init__(self, whitening: Prewhitening) -> None:
         half = whitening.half
         reach = max(SPIKE_REACH, int(STEP_REACH * half))
         around = int(LOOKED_AT * half)

@@ -12,19 +12,19 @@ from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
 from daqsvc.detectors.bearing.direction import Direction, RaceDirection
-from daqsvc.detectors.bearing.finding import SOUND, find
-from daqsvc.detectors.bearing.learning import HealthyGathering
-from daqsvc.detectors.bearing.look import (
+from daqsvc.detectors.bearing.evaluation import (
     LARGE,
-    Look,
+    Evaluation,
     evidence_of,
     figures_of,
     thresholds_of,
     units_of,
 )
+from daqsvc.detectors.bearing.finding import SOUND, find
+from daqsvc.detectors.bearing.learning import HealthyGathering
+from daqsvc.detectors.bearing.persistence import ConfirmedState, PersistenceFilter
 from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
-from daqsvc.detectors.bearing.standing import Standing, Steadfast
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 
 if TYPE_CHECKING:
@@ -121,17 +121,17 @@ class BearingDetector:
         self._keep = keep
         self._watches, self._directions = self._new_watches(), self._new_directions()
         self._pending: list[NDArray[np.float32]] = []
-        self._steadfast = Steadfast()
-        self.seen: Look | None = None
+        self._persistence = PersistenceFilter()
+        self.seen: Evaluation | None = None
         """The last look at good samples."""
         self._large = False
         self._end_index = 0
         self._speed_unknown = self._has_looked = False
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> ConfirmedState:
         """What it stands by."""
-        return self._steadfast.standing
+        return self._persistence.standing
 
     def warm(self) -> None:
         """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
@@ -159,8 +159,8 @@ class BearingDetector:
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
-        look = Look({}, {}, "missing", silence_reason(self.stream, silence_s), None)
-        return [self._statement(look, self._end_index, t_ns, changed=False)]
+        evaluated = Evaluation({}, {}, "missing", silence_reason(self.stream, silence_s), None)
+        return [self._statement(evaluated, self._end_index, t_ns, changed=False)]
 
     def finish(self, rest: NDArray[np.float32], t_ns: int) -> Diagnosis | None:
         """A last look, at the end of a recording.
@@ -192,8 +192,8 @@ class BearingDetector:
                 f"a block of {self.stream} is {length_s:.3g} s long, and a bearing is judged by {least:g} s "
                 "or more; make the device take longer blocks"
             )
-            look = Look({}, {}, "missing", reason, None)
-            return self._statement(look, window.first_index, window.t_end_ns, changed=False)
+            evaluated = Evaluation({}, {}, "missing", reason, None)
+            return self._statement(evaluated, window.first_index, window.t_end_ns, changed=False)
         # What follows is another block: a row without samples keeps them apart.
         apart = np.full((1, window.samples.shape[1]), np.nan, np.float32)
         self._pending = [window.samples]
@@ -204,22 +204,22 @@ class BearingDetector:
         samples = np.concatenate(self._pending)
         self._pending = []
         first_index = self._end_index - len(samples)
-        look = self._judge(samples.astype(np.float64))
+        evaluated = self._judge(samples.astype(np.float64))
         share = self._missing_share(samples)
-        if look.quality != "good":
-            self._steadfast.interrupt()
-            return self._statement(look, first_index, t_ns, changed=False, missing_share=share)
-        assert look.finding is not None  # noqa: S101 - good
-        self.seen = look
-        changed = self._steadfast.look(look.finding, last=last)
+        if evaluated.quality != "good":
+            self._persistence.interrupt()
+            return self._statement(evaluated, first_index, t_ns, changed=False, missing_share=share)
+        assert evaluated.finding is not None  # noqa: S101 - good
+        self.seen = evaluated
+        changed = self._persistence.update(evaluated.finding, last=last)
         if self.baseline is None:
             learnt_from = samples if apart is None else np.concatenate((samples, apart))
-            self.baseline = self._learning.take(learnt_from, look.finding, self._speed_rpm)
+            self.baseline = self._learning.take(learnt_from, evaluated.finding, self._speed_rpm)
             if self.baseline is not None:
                 self._watches, self._directions = self._new_watches(), self._new_directions()
                 if self._keep is not None:
                     self._keep(self.baseline)
-        return self._statement(look, first_index, t_ns, changed=changed, missing_share=share)
+        return self._statement(evaluated, first_index, t_ns, changed=changed, missing_share=share)
 
     def _missing_share(self, samples: NDArray[np.float32]) -> float:
         """Share of the samples that lack a value of any sensor that the look rests on."""
@@ -228,7 +228,7 @@ class BearingDetector:
             columns.append(self.keyphasor.column)
         return float((~np.isfinite(samples[:, columns])).any(axis=1).mean())
 
-    def _judge(self, samples: Floats) -> Look:
+    def _judge(self, samples: Floats) -> Evaluation:
         """What the bearings show, one by one and together."""
         samples = np.where(np.isfinite(samples), samples, np.nan)
         unfit = list(self._follow_speed(samples))
@@ -264,8 +264,8 @@ class BearingDetector:
         reason = "; ".join(why for _, why in unfit)
         if unfit and (finding is None or finding.verdict in SOUND):
             # What one bearing does not show says nothing about another that cannot be seen.
-            return Look(races, changes, unfit[0][0], reason, finding, directions)
-        return Look(races, changes, "good", reason, finding, directions)
+            return Evaluation(races, changes, unfit[0][0], reason, finding, directions)
+        return Evaluation(races, changes, "good", reason, finding, directions)
 
     def _follow_speed(self, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
         """Measure the speed; begin anew where it has changed. Yields what is against the look."""
@@ -367,19 +367,19 @@ class BearingDetector:
     def _begin_anew(self) -> None:
         """The speed is another one."""
         self._learning.forget()
-        self._steadfast.interrupt()
+        self._persistence.interrupt()
         self._watches = self._new_watches()
 
     def _forget(self) -> None:
         """Samples are missing: evidence from before and after does not belong together."""
         self._pending = []
         self._learning.forget()
-        self._steadfast.interrupt()
+        self._persistence.interrupt()
         for watch in self._watches.values():
             watch.forget()
 
     def _severity(self, change: ResidualChange | None) -> Severity:
-        if self._steadfast.standing.sound:
+        if self._persistence.standing.sound:
             self._large = False
             return "normal"
         if change is not None:
@@ -387,12 +387,18 @@ class BearingDetector:
         return "danger" if self._large else "alert"
 
     def _statement(
-        self, look: Look, first_index: int, t_ns: int, *, changed: bool, missing_share: float | None = None
+        self,
+        evaluated: Evaluation,
+        first_index: int,
+        t_ns: int,
+        *,
+        changed: bool,
+        missing_share: float | None = None,
     ) -> Diagnosis:
-        standing = self._steadfast.standing
-        where = standing.where or (look.finding.where if look.finding is not None else "")
-        good = look.quality == "good"
-        figures = figures_of(look, where)
+        standing = self._persistence.standing
+        where = standing.where or (evaluated.finding.where if evaluated.finding is not None else "")
+        good = evaluated.quality == "good"
+        figures = figures_of(evaluated, where)
         said = Diagnosis(
             machine=self._machine,
             detector=self.name,
@@ -402,22 +408,24 @@ class BearingDetector:
             end_index=self._end_index,
             decision=standing.decision,
             changed=changed,
-            severity=self._severity(look.change),
-            probabilities={str(k): p for k, p in look.finding.probabilities.items()} if look.finding else {},
+            severity=self._severity(evaluated.change),
+            probabilities={str(k): p for k, p in evaluated.finding.probabilities.items()}
+            if evaluated.finding
+            else {},
             group=standing.group,
             statistics=figures,
             units=units_of(figures),
-            thresholds=thresholds_of(look, where),
-            evidence=evidence_of(look, where),
-            quality=look.quality,
-            reason=look.reason,
+            thresholds=thresholds_of(evaluated, where),
+            evidence=evidence_of(evaluated, where),
+            quality=evaluated.quality,
+            reason=evaluated.reason,
             sensors=tuple(bearing.sensor for bearing in self.bearings if bearing.name == standing.where)
             or tuple(bearing.sensor for bearing in self.bearings),
             model=MODEL,
             where=standing.where,
             missing_share=missing_share,
         )
-        if good and not look.reason and self.baseline is None:
+        if good and not evaluated.reason and self.baseline is None:
             return replace(said, reason=self._learning.reason)
         return said
 

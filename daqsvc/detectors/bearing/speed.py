@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.dsp.marks import EdgeFinder
+from daqsvc.dsp.keyphasor_edges import EdgeFinder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,7 +9,12 @@ import numpy as np
 
 from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes, fault_of
 from daqsvc.detectors.rotor_bank.orbit_checks import OrbitWatch
-from daqsvc.detectors.rotor_bank.statements import DEPARTURE, UNDETERMINED_DECISION, BankStater, Moment
+from daqsvc.detectors.rotor_bank.statements import (
+    DEPARTURE,
+    UNDETERMINED_DECISION,
+    BankDiagnosisBuilder,
+    Moment,
+)
 from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe, Verdict, stands_still
 from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
 from daqsvc.dsp.keyphasor import KeyphasorTracker
@@ -137,7 +142,7 @@ class RotorBankDetector:
             rub_process_noise=rub_process_noise,
             ac_coupled=ac_coupled,
         )
-        self._stater = BankStater(
+        self._stater = BankDiagnosisBuilder(
             machine=machine,
             detector=name,
             stream=stream,

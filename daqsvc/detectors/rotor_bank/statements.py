@@ -51,7 +51,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BankStater:
+class BankDiagnosisBuilder:
     """Puts a bank's reports into words.
 
     Attributes:

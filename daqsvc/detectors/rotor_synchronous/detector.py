@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.detectors.rotor_synchronous.revolutions import Revolution, RevolutionStream, SpeedReference
 from daqsvc.detectors.rotor_synchronous.statements import DEPARTURE, UNDETERMINED, Standing, Stater
-from daqsvc.detectors.rotor_synchronous.turns import SpeedReference, Turn, Turns
 from daqsvc.detectors.rotor_synchronous.vector_checks import (
     VectorChecks,
     speed_verdict,
@@ -121,7 +121,7 @@ class RotorSynchronousDetector:
         listener: Callable[[WatchReport, SynchronousVectors], None] | None = None,
         keep: Callable[[Calibration], None] | None = None,
     ) -> None:
-        self._turns = Turns(
+        self._turns = RevolutionStream(
             machine=machine, rate_hz=rate_hz, speed_rpm=speed_rpm, probes=probes, reference=reference
         )
         self.name = name
@@ -183,7 +183,10 @@ class RotorSynchronousDetector:
         if abs(window.first_index - self._turns.end_index) > self._turns.period:
             self._judge.reset()
             self._checks.reset()
-        said = [self._turn(turn) for turn in self._turns.process(window.samples, window.first_index)]
+        said = [
+            self._revolution(revolution)
+            for revolution in self._turns.process(window.samples, window.first_index)
+        ]
         said.append(self._blind())
         return [diagnosis for diagnosis in said if diagnosis is not None]
 
@@ -229,18 +232,18 @@ class RotorSynchronousDetector:
             rules = replace(rules, probe_drift_um=_NO_MEAN_UM, naming=naming)
         return RotorWatch(rotor, self._rate_hz, calibration=calibration, rules=rules)
 
-    def _turn(self, turn: Turn) -> Diagnosis | None:
+    def _revolution(self, revolution: Revolution) -> Diagnosis | None:
         """One revolution: what it is worth, what the watch makes of it, and what is worth saying."""
         if self.ac_coupled:
-            turn = turn.without_mean()
-        self._speed_rpm = 60.0 * self._rate_hz / float(turn.vector.period_samples[0])
-        verdict = self._judge_turn(turn)
+            revolution = revolution.without_mean()
+        self._speed_rpm = 60.0 * self._rate_hz / float(revolution.vector.period_samples[0])
+        verdict = self._judge_revolution(revolution)
         self._verdicts.append(verdict)
         if verdict.quality != "good":
-            turn = turn.unusable()
+            revolution = revolution.unusable()
         calibrating = self._watch.calibration is None
-        reports = self._watch.take(turn.vector, turn.orbit)
-        self._ends.append(self._turns.origin + int(turn.vector.end_index[0]))
+        reports = self._watch.take(revolution.vector, revolution.orbit)
+        self._ends.append(self._turns.origin + int(revolution.vector.end_index[0]))
         if calibrating and self._watch.calibration is not None:
             self._look_at_baseline(self._watch.calibration)
         rejected = calibrating and self._watch.calibration is None and bool(self._refused)
@@ -249,30 +252,30 @@ class RotorSynchronousDetector:
         for report in [] if rejected else reports:
             self._report = report
             if self._listener is not None:
-                self._listener(report, turn.vector)
+                self._listener(report, revolution.vector)
         return self._stating(
             self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
         )
 
-    def _judge_turn(self, turn: Turn) -> Verdict:
+    def _judge_revolution(self, revolution: Revolution) -> Verdict:
         """What a revolution is worth, the cheapest and clearest reason first."""
         calibration = self._watch.calibration
         least_um = 0.0
         if self._refused and not self._rules.retry:
             return Verdict("not_ok", self._refused)
-        if not turn.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
+        if not revolution.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
             return Verdict("missing", self._angle_unknown())
         if calibration is not None:
             verdict = speed_verdict(self._speed_rpm, calibration)
             if verdict.quality != "good":
                 return verdict
             least_um = _DEAD * math.hypot(calibration.noise_um, calibration.amplitude_um / math.sqrt(2.0))
-        verdict = self._judge.judge(turn.raw, least_um)
+        verdict = self._judge.judge(revolution.raw, least_um)
         if verdict.quality != "good":
             return verdict
-        if not turn.vector.usable[0]:
-            return Verdict("missing", _cannot_fit(turn))
-        self._checks.add(turn.vector.vectors[0])
+        if not revolution.vector.usable[0]:
+            return Verdict("missing", _cannot_fit(revolution))
+        self._checks.add(revolution.vector.vectors[0])
         return Verdict() if calibration is None else self._checks.judge(calibration)
 
     def _look_at_baseline(self, calibration: Calibration) -> None:
@@ -343,12 +346,12 @@ class RotorSynchronousDetector:
         return end_index, self._t_end_ns - round((self._turns.end_index - end_index) * self._period_ns)
 
 
-def _cannot_fit(turn: Turn) -> str:
+def _cannot_fit(revolution: Revolution) -> str:
     """Why the samples of a revolution do not tell its harmonics."""
-    missing = int((~np.isfinite(turn.raw).all(axis=1)).sum())
+    missing = int((~np.isfinite(revolution.raw).all(axis=1)).sum())
     if missing:
         return (
-            f"{missing} of {len(turn.raw)} samples of a revolution are missing, too many or too close "
+            f"{missing} of {len(revolution.raw)} samples of a revolution are missing, too many or too close "
             "together to tell its harmonics; check the bus and the device"
         )
-    return f"{len(turn.raw)} samples of a revolution are too few to tell its harmonics; sample faster"
+    return f"{len(revolution.raw)} samples of a revolution are too few to tell its harmonics; sample faster"

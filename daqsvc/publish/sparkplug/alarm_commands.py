@@ -82,7 +82,7 @@ class AlarmCommands:
         self._topics = topics
         self._handler = handler
         self._parts = {part: verb for verb, part in WRITABLE.items() if verb in settings.allow}
-        self._intake = CommandIntake(settings, topics, self._obey, clock, ids)
+        self._intake = CommandIntake(settings, topics, self._execute, clock, ids)
         self._topic = ""
 
     def of_node(self, alarm: str) -> list[Metric]:
@@ -133,7 +133,7 @@ class AlarmCommands:
             log.info("%s of %s by Sparkplug is refused: %s", wish.verb, wish.alarm[:200], told["reason"])
         return bool(told["accepted"])
 
-    async def _obey(self, command: AlarmCommand, source: str) -> CommandOutcome:  # noqa: ARG002  it came another way
+    async def _execute(self, command: AlarmCommand, source: str) -> CommandOutcome:  # noqa: ARG002  it came another way
         return await self._handler(command, f"sparkplug {self._topic}")
 
     def _metrics(self, base: str) -> list[Metric]:

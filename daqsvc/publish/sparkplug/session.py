@@ -158,7 +158,7 @@ class EdgeSession:
         heard: asyncio.Queue[Incoming] = asyncio.Queue(HEARD)
         wanted = [self._node.commands, self._node.device_commands]
         self._ungranted = await self._connection.watch(*wanted, *(self._host.topics if self._host else ()))
-        obeying = asyncio.create_task(self._obey(), name="sparkplug-commands")
+        obeying = asyncio.create_task(self._execute(), name="sparkplug-commands")
         listening = asyncio.create_task(self._listen(heard), name="sparkplug-listen")
         stopped = asyncio.create_task(stopping.wait(), name="sparkplug-stop")
         try:
@@ -274,7 +274,7 @@ class EdgeSession:
             f"hosts at this broker are {there}" if there else "there is no other host at this broker",
         )
 
-    async def _obey(self) -> None:
+    async def _execute(self) -> None:
         """Carry out what hosts have written to alarms, one after the other."""
         while self._commands is not None:
             wish = await self._wishes.get()

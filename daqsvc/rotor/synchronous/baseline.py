@@ -15,9 +15,9 @@ from daqsvc.rotor.synchronous.steadiness import (
     UNREST_NATS,
     VECTOR_NATS,
     most_restless_stretch,
+    nonstationarity,
     oddest_stretch,
     turn_per_revolution,
-    unrest,
 )
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -66,7 +66,7 @@ class Calibration:
         revolutions: revolutions that went in.
         baseline: complex128 ``[5]``, mean synchronous vector in um.
         variance: float64 ``[5]``, complex variance of one revolution's vector, as it counts in long means.
-        noise: variance of a complex sample that does not repeat with the shaft (`unrest`), um^2.
+        noise: variance of a complex sample that does not repeat with the shaft (`nonstationarity`), um^2.
         noise_variance: relative variance of that from revolution to revolution.
         samples_per_rev: usable samples in a revolution.
         fit_error: what a Laval rotor leaves unexplained of a run-up, relative; None if there was none.
@@ -233,7 +233,7 @@ def calibrate(
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
     _refuse_no_orbit(vectors.vectors, white)
-    restless = unrest(
+    restless = nonstationarity(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
     _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)

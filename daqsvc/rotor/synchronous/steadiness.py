@@ -55,7 +55,7 @@ class Stretch:
     by: float
 
 
-def unrest(
+def nonstationarity(
     vectors: Complexes,
     noise: Floats,
     samples: Floats,

@@ -25,7 +25,7 @@ from daqsvc.rotor.synchronous.baseline import (
 from daqsvc.rotor.synchronous.departure import DepartureEvidence, DepartureTest, Spread, threshold_for
 from daqsvc.rotor.synchronous.identify import Identification, NamingRules, identify
 from daqsvc.rotor.synchronous.segments import JudgedRevolution, lasting_energy, noise_scatter, scatter
-from daqsvc.rotor.synchronous.steadiness import unrest
+from daqsvc.rotor.synchronous.steadiness import nonstationarity
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
@@ -181,7 +181,9 @@ class RotorWatch:
         if self.calibration is None:
             return self._calibrate(one)
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
-        restless = float(unrest(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0])
+        restless = float(
+            nonstationarity(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0]
+        )
         self._previous = np.vstack((self._previous[-1:], moved))
         row = JudgedRevolution(
             self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0])

@@ -30,7 +30,7 @@ _MIN_PROBE_SPREAD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class Revolution:
     """One revolution of the shaft.
 
     Attributes:
@@ -46,7 +46,7 @@ class Turn:
     vector: SynchronousVectors
     trusted: bool
 
-    def unusable(self) -> Turn:
+    def unusable(self) -> Revolution:
         """The same revolution without anything that could be judged."""
         nothing = np.full((1, 5), np.nan, dtype=np.complex128)
         return replace(
@@ -55,7 +55,7 @@ class Turn:
             vector=replace(self.vector, vectors=nothing, noise=np.full(1, np.nan)),
         )
 
-    def without_mean(self) -> Turn:
+    def without_mean(self) -> Revolution:
         """The same revolution about its mean position."""
         vectors = self.vector.vectors.copy()
         mean = complex(vectors[0, 0])
@@ -67,7 +67,7 @@ class Turn:
         )
 
 
-class Turns:
+class RevolutionStream:
     """Cuts a stream into revolutions, over gaps as well.
 
     A shaft that turns clockwise is looked at from its other end (x mirrored): its whirl is then forward, and
@@ -133,7 +133,7 @@ class Turns:
         """Samples that no revolution has come out of yet."""
         return len(self._held)
 
-    def process(self, samples: NDArray[np.float32], first_index: int) -> list[Turn]:
+    def process(self, samples: NDArray[np.float32], first_index: int) -> list[Revolution]:
         """Take in samples; the revolutions that they complete.
 
         A gap of up to a revolution is bridged as missing samples. After a longer one, and where the index
@@ -173,7 +173,7 @@ class Turns:
         self._cutter_index = self._held_index = first_index
         self._held = np.empty((0, 2))
 
-    def _cut(self, values: Floats) -> Iterator[Turn]:
+    def _cut(self, values: Floats) -> Iterator[Revolution]:
         probes = values[:, :2] * self._um_per_unit
         marker = values[:, 2] if isinstance(self._reference, KeyphasorProbe) else None
         revolutions = self._cutter.process(probes @ self._to_xy, marker)
@@ -201,4 +201,4 @@ class Turns:
                 trusted=revolutions.trusted[i : i + 1],
             )
             trusted = bool(revolutions.trusted[i])
-            yield Turn(raw[begin + start : begin + end], orbit, vectors[i : i + 1], trusted)
+            yield Revolution(raw[begin + start : begin + end], orbit, vectors[i : i + 1], trusted)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from daqsvc.bearing.race.robust import loudest_by_revolution
+from daqsvc.bearing.race.prewhitening import loudest_by_revolution
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -34,7 +34,7 @@ EVENT_S = 5e-3
 TAPER_S = 1e-3
 
 
-def knocks(signal: Real, rate_hz: float, revolution: int) -> list[Stretch]:
+def find_transients(signal: Real, rate_hz: float, revolution: int) -> list[Stretch]:
     """Where somebody knocks.
 
     Strikes of a damaged bearing, and rubs, come back in every revolution or every few of them: they set the

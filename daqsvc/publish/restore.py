@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def recall(messages: Iterable[OutboxMessage], topics: Topics) -> list[AlarmEvent]:
+def restore_alarms(messages: Iterable[OutboxMessage], topics: Topics) -> list[AlarmEvent]:
     """The events that the alarm messages of a box tell of, in their order.
 
     Messages below other topics are left alone. What cannot be read is left out and logged, once for all.

@@ -19,7 +19,7 @@ CLEAR_LOOKS = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class ConfirmedState:
     """What is stood by.
 
     Attributes:
@@ -33,7 +33,7 @@ class Standing:
     where: str = ""
 
     @classmethod
-    def of(cls, finding: BearingFinding) -> Standing:
+    def of(cls, finding: BearingFinding) -> ConfirmedState:
         """What a finding says by itself."""
         group = finding.group if len(finding.group) > 1 else ()
         where = "" if finding.verdict in SOUND else finding.where
@@ -45,20 +45,20 @@ class Standing:
         return self.decision in {UNDETERMINED, "normal"}
 
 
-class Steadfast:
-    """Follows findings look by look, without flicker.
+class PersistenceFilter:
+    """Follows findings evaluation by evaluation, without flicker.
 
     Attributes:
         standing: what is stood by.
     """
 
     def __init__(self) -> None:
-        self.standing = Standing()
-        self._candidate = Standing()
+        self.standing = ConfirmedState()
+        self._candidate = ConfirmedState()
         self._looks = 0
 
-    def look(self, finding: BearingFinding, *, last: bool = False) -> bool:
-        """Take in the finding of one look.
+    def update(self, finding: BearingFinding, *, last: bool = False) -> bool:
+        """Take in the finding of one evaluation.
 
         Args:
             finding: what was found.
@@ -67,7 +67,7 @@ class Steadfast:
         Returns:
             Whether the standing has changed.
         """
-        found = Standing.of(finding)
+        found = ConfirmedState.of(finding)
         if found == self.standing or (not self.standing.sound and found.decision == "changed"):
             # A part once named is a change, too; that its lines come and go takes nothing back.
             self._looks = 0
@@ -88,7 +88,7 @@ class Steadfast:
         """Looks before a gap do not count with those after it; what is stood by stays."""
         self._looks = 0
 
-    def _needed(self, found: Standing) -> int:
+    def _needed(self, found: ConfirmedState) -> int:
         if found.sound:
             return 1 if self.standing.decision == UNDETERMINED else CLEAR_LOOKS
         return CONFIRM_LOOKS

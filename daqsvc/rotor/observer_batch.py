@@ -1,7 +1,7 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
 All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a desk
-(`DESK`), groups of lanes (`LANES`), constants of the observers, and evidence of pairs of modes (`PAIR`). A
+(`HEADER`), groups of lanes (`LANES`), constants of the observers, and evidence of pairs of modes (`PAIR`). A
 group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane m % WIDTH of
 group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop over lanes into
 vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
     Floats = NDArray[np.float64]
     Observers = NDArray[np.void]
-    Lanes = NDArray[np.void]
-    Desks = NDArray[np.void]
+    Batch = NDArray[np.void]
+    Headers = NDArray[np.void]
     Pairs = NDArray[np.void]
 
 WIDTH = 8
@@ -66,7 +66,7 @@ LANES = np.dtype(
 )
 """A group of observers and the evidence for their modes."""
 
-DESK = np.dtype(
+HEADER = np.dtype(
     [
         # what else there is: modes, groups of lanes, rub observers
         ("modes", np.int64), ("groups", np.int64), ("rubs", np.int64),
@@ -84,34 +84,34 @@ DESK = np.dtype(
 )  # fmt: skip
 """What a bank knows besides its modes: an array of one."""
 
-PAIR = np.dtype([("threshold", np.float64), ("duel", np.float64)])
+PAIR = np.dtype([("threshold", np.float64), ("log_ratio", np.float64)])
 """Of one mode against another: nats that change the decision to the other, infinite where they look alike;
 and the one's evidence over the other, as long as there is no decision."""
 
-_DESK_BYTES = DESK.itemsize
+_DESK_BYTES = HEADER.itemsize
 _LANES_BYTES = LANES.itemsize
 _OBSERVER_BYTES = OBSERVER.itemsize
 _PAIR_BYTES = PAIR.itemsize
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sections(memory: Bytes) -> tuple[Desks, Lanes, Observers, Pairs]:
+def sections(memory: Bytes) -> tuple[Headers, Batch, Observers, Pairs]:
     """The parts of a bank's memory.
 
     Args:
         memory: uint8 ``[n]``.
 
     Returns:
-        Views: ``[1]`` of `DESK`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER` and, row by row,
+        Views: ``[1]`` of `HEADER`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER` and, row by row,
         ``[M M]`` of `PAIR`.
     """
-    desks = memory[:_DESK_BYTES].view(DESK)
-    lanes = _DESK_BYTES + desks[0]["groups"] * _LANES_BYTES
-    observers = lanes + desks[0]["modes"] * _OBSERVER_BYTES
+    headers = memory[:_DESK_BYTES].view(HEADER)
+    batch = _DESK_BYTES + headers[0]["groups"] * _LANES_BYTES
+    observers = batch + headers[0]["modes"] * _OBSERVER_BYTES
     return (
-        desks,
-        memory[_DESK_BYTES:lanes].view(LANES),
-        memory[lanes:observers].view(OBSERVER),
+        headers,
+        memory[_DESK_BYTES:batch].view(LANES),
+        memory[batch:observers].view(OBSERVER),
         memory[observers:].view(PAIR),
     )
 
@@ -144,11 +144,11 @@ class BankMemory:
         rubs = np.flatnonzero(observers["substeps"])
         size = _DESK_BYTES + groups * _LANES_BYTES + count * _OBSERVER_BYTES + count**2 * _PAIR_BYTES
         memory = np.zeros(size, dtype=np.uint8)
-        desk = memory[:_DESK_BYTES].view(DESK)
-        desk["modes"], desk["groups"], desk["rubs"] = count, groups, len(rubs)
+        header = memory[:_DESK_BYTES].view(HEADER)
+        header["modes"], header["groups"], header["rubs"] = count, groups, len(rubs)
         subject = cls(memory)
         subject.put("rub", rubs)
-        subject.lanes["threshold"] = math.inf
+        subject.batch["threshold"] = math.inf
         subject.put("log_prior", log_prior, -math.inf)
         subject.put("log_odds", log_prior, -math.inf)
         subject.set_observers(observers)
@@ -160,26 +160,26 @@ class BankMemory:
         return cls(np.frombuffer(memory, dtype=np.uint8))
 
     @property
-    def desk(self) -> np.void:
-        """The desk, one of `DESK`."""
-        desk: np.void = np.ndarray(1, DESK, self.memory)[0]
-        return desk
+    def header(self) -> np.void:
+        """The desk, one of `HEADER`."""
+        header: np.void = np.ndarray(1, HEADER, self.memory)[0]
+        return header
 
     @property
-    def lanes(self) -> Lanes:
+    def batch(self) -> Batch:
         """Observers and evidence, ``[G]`` of `LANES`."""
-        return np.ndarray(int(self.desk["groups"]), LANES, self.memory, _DESK_BYTES)
+        return np.ndarray(int(self.header["groups"]), LANES, self.memory, _DESK_BYTES)
 
     def each(self, name: str) -> Floats:
         """A figure of each mode, float64 ``[M]`` (int64 for ``age``), copied."""
-        return np.array(self.lanes[name].reshape(-1)[: int(self.desk["modes"])])
+        return np.array(self.batch[name].reshape(-1)[: int(self.header["modes"])])
 
     def put(self, name: str, values: NDArray[Any], rest: float = 0.0) -> None:
         """Set a figure of each mode, float64 ``[M]``; lanes without a mode get ``rest``."""
-        lanes = self.lanes
-        padded = np.full(len(lanes) * WIDTH, rest)
+        batch = self.batch
+        padded = np.full(len(batch) * WIDTH, rest)
         padded[: len(values)] = values
-        lanes[name] = padded.reshape(len(lanes), WIDTH)
+        batch[name] = padded.reshape(len(batch), WIDTH)
 
     def states(self, fields: tuple[str, ...]) -> Floats:
         """Deviations of the estimates, float64 ``[M, 4]``, of `FREE` or `PAPER`; copied."""
@@ -223,22 +223,22 @@ class BankMemory:
             samples_per_rev: samples in a revolution.
             decision: index of the mode that is known to be true at the start, or -1.
         """
-        desk = self.desk
-        desk["usable_squared"] = (ESCAPE_RADIUS + 6.0 * noise) ** 2
-        desk["lead_limit"] = _LEAD_LIMIT * rules.threshold_nats
-        desk["first_threshold"] = rules.threshold_nats
-        desk["identity_nats"] = rules.identity_nats
-        desk["settling_wait"] = round(rules.settle_revolutions * samples_per_rev)
-        desk["samples_per_rev"] = samples_per_rev
+        header = self.header
+        header["usable_squared"] = (ESCAPE_RADIUS + 6.0 * noise) ** 2
+        header["lead_limit"] = _LEAD_LIMIT * rules.threshold_nats
+        header["first_threshold"] = rules.threshold_nats
+        header["identity_nats"] = rules.identity_nats
+        header["settling_wait"] = round(rules.settle_revolutions * samples_per_rev)
+        header["samples_per_rev"] = samples_per_rev
         # P(leader) > p takes odds of p / (1 - p) over every other mode, and all modes' sum below 1 / p.
-        desk["odds_bar"] = math.log(rules.probability_threshold / (1.0 - rules.probability_threshold))
-        desk["largest_total"] = 1.0 / rules.probability_threshold
-        desk["by_paper"] = rules.rule == "paper"
-        desk["decision"] = desk["paper_decision"] = desk["changed_from"] = decision
+        header["odds_bar"] = math.log(rules.probability_threshold / (1.0 - rules.probability_threshold))
+        header["largest_total"] = 1.0 / rules.probability_threshold
+        header["by_paper"] = rules.rule == "paper"
+        header["decision"] = header["paper_decision"] = header["changed_from"] = decision
 
     def set_thresholds(self, thresholds: Floats) -> None:
         """Set what it takes to change the decision, float64 ``[M, M]``, infinite where modes look alike."""
         sections(self.memory)[3]["threshold"] = thresholds.ravel()
-        decision = int(self.desk["decision"])
+        decision = int(self.header["decision"])
         if decision != UNDETERMINED:
             self.put("threshold", thresholds[decision], math.inf)

@@ -1,7 +1,7 @@
-"""The alarm desk: diagnoses and commands in; alarms on disk and at the broker out.
+"""The alarm service: diagnoses and commands in; alarms on disk and at the broker out.
 
 Everything that must not be lost passes here and nowhere else: an event leaves the alarm manager, gets its
-number and its place on disk from the outbox, and is published from there. The desk knows nothing of buses,
+number and its place on disk from the outbox, and is published from there. It knows nothing of buses,
 samples or detectors, so it can be tried by itself.
 """
 
@@ -26,7 +26,7 @@ from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload
-from daqsvc.publish.recall import recall
+from daqsvc.publish.restore import restore_alarms
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.topics import Topics
 from daqsvc.self_check import SelfCheck, Vitals, conditions
@@ -80,10 +80,10 @@ class CommandCounters:
     unanswered_in_log: int = 0
 
 
-class AlarmDesk:
+class AlarmService:
     """Alarms of one machine, from diagnosis to broker.
 
-    Use: `open`, `resume`, then `take` and `obey` as diagnoses and commands come while `tellers` and
+    Use: `open`, `resume`, then `take` and `execute` as diagnoses and commands come while `tellers` and
     `keep_time` run; `settle`, `stop`, `close`.
 
     Args:
@@ -123,13 +123,13 @@ class AlarmDesk:
         self.publisher = (
             None
             if mqtt is None
-            else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock, commands=self.obey)
+            else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock, commands=self.execute)
         )
         self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
         self.sparkplug = (
             None
             if mqtt is None or sparkplug is None
-            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.obey)
+            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.execute)
         )
         self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
@@ -143,7 +143,7 @@ class AlarmDesk:
         self._topic_of: dict[tuple[str, str], str] = {}
         self._untold: dict[tuple[str, str], AlarmEvent] = {}
         """By alarm, its newest event if the outbox has refused that."""
-        self._speakers: Mapping[str, Sequence[str]] = {}
+        self._active_detectors: Mapping[str, Sequence[str]] = {}
         self._knows_journal = True
         """Whether the alarms have taken over what the journal knew when the service ended."""
         self._is_in_step = True
@@ -161,22 +161,22 @@ class AlarmDesk:
         """
         await self.outbox.open()
 
-    async def resume(self, speakers: Mapping[str, Sequence[str]]) -> None:
+    async def resume(self, active_detectors: Mapping[str, Sequence[str]]) -> None:
         """Take over from the journal how the alarms stood when the service ended.
 
         Args:
-            speakers: the detectors that will make statements, with the sensors that these rest on.
+            active_detectors: the detectors that will make statements, with the sensors that these rest on.
         """
-        self._speakers = speakers
+        self._active_detectors = active_detectors
         if self.outbox.counters.shut:
             latest = await self.outbox.glimpse()
             self._knows_journal, self._is_in_step = latest is not None, False
-            told = await asyncio.to_thread(recall, latest or (), self.topics)
+            told = await asyncio.to_thread(restore_alarms, latest or (), self.topics)
             self._take_over(told)
             if self._knows_journal and self.outbox.broker_is_ahead:
                 self._confirm(self._tell_again(told))
             return
-        told = await asyncio.to_thread(recall, await self.outbox.latest(), self.topics)
+        told = await asyncio.to_thread(restore_alarms, await self.outbox.latest(), self.topics)
         self._take_over(told)
         self._damage_seen = self._damage()
         if self.outbox.broker_is_ahead:
@@ -187,7 +187,7 @@ class AlarmDesk:
     def _take_over(self, told: Sequence[AlarmEvent]) -> None:
         for event in told:
             self._newest[event.identity.machine, event.alarm] = event
-        for event in self.manager.resume(told, self._speakers, self._conditions):
+        for event in self.manager.resume(told, self._active_detectors, self._conditions):
             self._post(event)
 
     def _damage(self) -> int:
@@ -254,7 +254,7 @@ class AlarmDesk:
         damage = self._damage()
         before = dict(self._newest)
         try:
-            told = await asyncio.to_thread(recall, await self.outbox.latest(), self.topics)
+            told = await asyncio.to_thread(restore_alarms, await self.outbox.latest(), self.topics)
         finally:
             self._catching_up = False
         if not self._knows_journal:
@@ -310,7 +310,7 @@ class AlarmDesk:
         if self.sparkplug is not None:
             self.sparkplug.observe(diagnosis)
 
-    async def obey(self, command: AlarmCommand, source: str) -> CommandOutcome:
+    async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
         """Carry out a person's command, one after the other: written down, obeyed, committed, answered.
 
         A command that has begun is carried out to its end, even if nobody waits for the answer any more.
@@ -396,7 +396,7 @@ class AlarmDesk:
 
     async def _outcome(self, command: AlarmCommand) -> CommandOutcome:
         try:
-            events = self.manager.obey(command)
+            events = self.manager.execute(command)
         except CommandNotAllowedError as refusal:
             return self._refuse(f"{refusal}")
         self.commands.accepted += 1

@@ -64,7 +64,7 @@ class EdgeCounts:
 
 
 @dataclass(frozen=True, slots=True)
-class AngleMark:
+class KeyphasorEdge:
     """Angle zero at ``index + fraction`` samples since the start.
 
     Attributes:
@@ -77,17 +77,17 @@ class AngleMark:
     fraction: float
     revolution: int = 0
 
-    def samples_before(self, other: AngleMark) -> float:
+    def samples_before(self, other: KeyphasorEdge) -> float:
         """Samples from here to ``other``."""
         return (other.index - self.index) + (other.fraction - self.fraction)
 
-    def later(self, samples: float) -> AngleMark:
+    def later(self, samples: float) -> KeyphasorEdge:
         """The place so many samples after this one (before it, if negative)."""
-        later = AngleMark.at(self.fraction + samples)
-        return AngleMark(self.index + later.index, later.fraction)
+        later = KeyphasorEdge.at(self.fraction + samples)
+        return KeyphasorEdge(self.index + later.index, later.fraction)
 
     @classmethod
-    def at(cls, sample: float) -> AngleMark:
+    def at(cls, sample: float) -> KeyphasorEdge:
         """A place in samples since the start."""
         index = math.ceil(sample)
         return cls(index, sample - index)
@@ -149,7 +149,7 @@ class EdgeFinder:
         return found
 
 
-class MarkLine:
+class EdgeLine:
     """Decides which edges mark a revolution, and where the shaft is after the last of them.
 
     The shaft follows a parabola in time through the last edges, so that a steady acceleration leaves no
@@ -197,11 +197,11 @@ class MarkLine:
         self._range = (shortest, longest)
         self.counts = EdgeCounts()
         self._line_edges = line_edges
-        self.marks: deque[AngleMark] = deque(maxlen=math.floor(_BEND_EDGES * line_edges))
+        self.marks: deque[KeyphasorEdge] = deque(maxlen=math.floor(_BEND_EDGES * line_edges))
         self.number = 0
         self.period = period_samples
         self._nominal_period = period_samples
-        self._crossings: deque[AngleMark] = deque(maxlen=_ALIAS_EDGES + 1)
+        self._crossings: deque[KeyphasorEdge] = deque(maxlen=_ALIAS_EDGES + 1)
         self.reset()
 
     def reset(self) -> None:
@@ -227,7 +227,7 @@ class MarkLine:
 
     def judge(self, index: int, fraction: float) -> bool:
         """Take in an edge; True if it marks a revolution."""
-        mark = AngleMark(index, fraction)
+        mark = KeyphasorEdge(index, fraction)
         self._crossings.append(mark)
         if self.locked and self.marks[-1].samples_before(mark) > _FORGOTTEN_REVOLUTIONS * self.period:
             self._forget()
@@ -247,7 +247,7 @@ class MarkLine:
             self._multiply()
         return True
 
-    def _whole_turns(self, mark: AngleMark) -> int:
+    def _whole_turns(self, mark: KeyphasorEdge) -> int:
         """Revolutions from the last mark to this edge; 0 if it is out of place."""
         since = self.marks[-1].samples_before(mark)
         turns = float(self.turns(np.array([since]))[0])
@@ -261,7 +261,7 @@ class MarkLine:
         lasted = before.samples_before(last) / (last.revolution - before.revolution)
         return int(abs(since / lasted - 1.0) <= _TOLERANCE)
 
-    def _take(self, mark: AngleMark) -> None:
+    def _take(self, mark: KeyphasorEdge) -> None:
         was_locked = self.locked
         self.counts.accepted += 1
         self._proposed.clear()
@@ -269,7 +269,7 @@ class MarkLine:
         self.number += self.locked and not was_locked
         self._fit()
 
-    def _propose(self, mark: AngleMark, enough: int) -> bool:
+    def _propose(self, mark: KeyphasorEdge, enough: int) -> bool:
         """Remember an edge that has no place; enough of them in step start a line."""
         self._proposed.append(mark)
         if len(self._proposed) < enough:
@@ -282,7 +282,7 @@ class MarkLine:
         self._start(self._proposed)
         return True
 
-    def _in_step(self, marks: list[AngleMark], step: float) -> bool:
+    def _in_step(self, marks: list[KeyphasorEdge], step: float) -> bool:
         """Whether the gaps change by at most ``step`` from one to the next, and can be revolutions."""
         gaps = [a.samples_before(b) for a, b in itertools.pairwise(marks)]
         steady = all(max(a / b, b / a) - 1.0 <= step for a, b in itertools.pairwise(gaps))
@@ -303,7 +303,7 @@ class MarkLine:
         if several and self._in_step(last, _STEP):
             self._start(last)
 
-    def _start(self, marks: list[AngleMark]) -> None:
+    def _start(self, marks: list[KeyphasorEdge]) -> None:
         marks = [replace(mark, revolution=revolution) for revolution, mark in enumerate(marks)]
         self._forget()
         self.marks.extend(marks)
@@ -313,7 +313,7 @@ class MarkLine:
     def _forget(self) -> None:
         self.marks.clear()
         self._crossings.clear()
-        self._proposed: list[AngleMark] = []
+        self._proposed: list[KeyphasorEdge] = []
         self._rate, self._bend, self._offset, self._hold = 1.0 / self.period, 0.0, 0.0, 0.0
 
     def _fit(self) -> None:

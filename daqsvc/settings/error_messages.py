@@ -53,7 +53,7 @@ def _shown(limit: float) -> str:
     return f"{limit:g}" if abs(limit) < 1_000_000 else f"{limit:,.0f}"
 
 
-class Words:
+class ErrorFormatter:
     """Turns one error of pydantic into a message and a remedy.
 
     Args:

@@ -28,7 +28,7 @@ class NoSuchAlarmError(Exception):
     """What was named is not exactly one alarm; the text says what there is."""
 
 
-class OrderCommand:
+class AlarmVerb:
     """One verb for one alarm, carried out by the service that runs.
 
     Args:
@@ -110,10 +110,10 @@ class OrderCommand:
         return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
 
 
-def order_commands(load: Load) -> dict[str, OrderCommand]:
+def alarm_verbs(load: Load) -> dict[str, AlarmVerb]:
     """The verbs by the name that they have on the command line."""
     return {
-        name: OrderCommand(verb, help_line, description, load)
+        name: AlarmVerb(verb, help_line, description, load)
         for name, verb, help_line, description in (
             (
                 "ack",

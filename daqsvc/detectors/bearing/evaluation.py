@@ -23,7 +23,7 @@ LARGE = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Evaluation:
     """What one look has found.
 
     Attributes:
@@ -59,28 +59,28 @@ def units_of(figures: Iterable[str]) -> dict[str, str]:
     return {key: unit for key, unit in units.items() if unit}
 
 
-def figures_of(look: Look, where: str) -> dict[str, float]:
+def figures_of(evaluated: Evaluation, where: str) -> dict[str, float]:
     """What was measured: of the bearing that the statement is about, and the size of every other."""
     figures: dict[str, float] = {}
-    if look.change is not None:
+    if evaluated.change is not None:
         figures |= {
-            "residual.ratio": look.change.ratio,
-            "residual.rise": float(look.change.rise_db[0]),
-            "residual.departure": look.change.departure,
+            "residual.ratio": evaluated.change.ratio,
+            "residual.rise": float(evaluated.change.rise_db[0]),
+            "residual.departure": evaluated.change.departure,
         }
-    for name, direction in look.directions.items():
+    for name, direction in evaluated.directions.items():
         figures[f"{name}.direction.change"] = direction.change_nats
         if math.isfinite(direction.bursts):
             figures[f"{name}.direction.bursts"] = direction.bursts
         if math.isfinite(direction.ratio_db):
             figures[f"{name}.direction"] = direction.ratio_db
-    for name, race in look.races.items():
+    for name, race in evaluated.races.items():
         for part in PARTS:
             evidence = race.evidence[part]
             figures[f"{name}.{part}.z"] = evidence.z
             figures[f"{name}.{part}.size"] = evidence.depth
             figures[f"{name}.{part}.severity"] = evidence.severity
-    race_there = look.races.get(where)
+    race_there = evaluated.races.get(where)
     if race_there is not None:
         figures["speed"] = race_there.speed_rpm
         found = [line for line in race_there.lines if line.part in race_there.group]
@@ -89,35 +89,35 @@ def figures_of(look: Look, where: str) -> dict[str, float]:
     return figures
 
 
-def thresholds_of(look: Look, where: str) -> dict[str, float]:
+def thresholds_of(evaluated: Evaluation, where: str) -> dict[str, float]:
     """What the figures are held against."""
     thresholds: dict[str, float] = {}
-    if look.change is not None:
+    if evaluated.change is not None:
         thresholds |= {"residual.departure": 1.0, "residual.ratio.danger": LARGE}
-    if where in look.races:
-        for part, evidence in look.races[where].evidence.items():
+    if where in evaluated.races:
+        for part, evidence in evaluated.races[where].evidence.items():
             thresholds[f"{where}.{part}.z"] = evidence.z_limit
             thresholds[f"{where}.{part}.severity"] = evidence.limit
-    for name, direction in look.directions.items():
+    for name, direction in evaluated.directions.items():
         thresholds[f"{name}.direction.change"] = direction.limit_nats
         if math.isfinite(direction.bursts):
             thresholds[f"{name}.direction.bursts"] = STEADY
     return thresholds
 
 
-def evidence_of(look: Look, where: str) -> dict[str, float]:
+def evidence_of(evaluated: Evaluation, where: str) -> dict[str, float]:
     """Log-likelihood ratio of each part in nats: of its lines against noise, or of its hits if that is more.
 
     A ball's hits are those of both races: the fewer of them speak for it.
     """
-    if where not in look.races:
+    if where not in evaluated.races:
         return {}
-    lines = look.races[where].lines
+    lines = evaluated.races[where].lines
     evidence: dict[str, float] = {
         part: float(sum(line.evidence for line in lines if line.part == part)) for part in PARTS
     }
-    if where in look.directions and look.directions[where].group:
-        direction = look.directions[where]
+    if where in evaluated.directions and evaluated.directions[where].group:
+        direction = evaluated.directions[where]
         inner, outer = direction.inner_nats, direction.outer_nats
         hits = {"inner": inner, "outer": outer, "ball": min(inner, outer)}
         return {part: max(nats, hits[part]) for part, nats in evidence.items()}

@@ -29,7 +29,7 @@ MIRRORED = 1 / 3
 """What the whitened channel counts at its ends: half of it is made of the mirror image."""
 
 
-class RobustWhitening:
+class Prewhitening:
     """A filter without delay that whitens the band of the race test.
 
     Its spectrum is the median over short segments: what happens in less than half of them does not count.
