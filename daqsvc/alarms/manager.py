@@ -411,7 +411,7 @@ class AlarmManager:
         elif ours and name in self._expected.quality:
             self._resume_unruled(event)
             doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
-            self._doubts.resume(doubts, self._clock.monotonic_ns())
+            self._doubts.resume(doubts, self._clock.monotonic_ns(), event.found)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
             self._resume_unruled(event)
             self._conditions.add(name)

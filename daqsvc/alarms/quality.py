@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict, deque
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
+
+_CAUSE = re.compile(r" \(.*\)")
+"""Why samples are missing, as it stands in what an alarm was raised by."""
 
 PREFIXES = ("sensor-ok/", "detector-ok/")
 """How the names of quality alarms begin."""
@@ -178,9 +182,20 @@ class SensorHealth:
         )
         return Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
 
-    def resume(self, doubts: Iterable[Doubt], t_ns: int) -> None:
-        """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted."""
+    def resume(self, doubts: Iterable[Doubt], t_ns: int, found: str = "") -> None:
+        """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted.
+
+        Args:
+            doubts: what stood against the sensors.
+            t_ns: monotonic time now.
+            found: what the alarm was raised by, as `finding` names it: the same is no change.
+        """
+        causes = {
+            part.partition("=")[0]: match[0] for part in found.split("|") if (match := _CAUSE.search(part))
+        }
         for doubt in doubts:
+            if doubt.quality == "missing" and doubt.detector in causes:
+                self._causes[doubt.detector] = causes[doubt.detector]
             if doubt.quality == "missing":
                 self._lacked_at_restart[doubt.detector] = t_ns
             self._forget(doubt.detector)

@@ -17,6 +17,7 @@ from pydantic import Field, create_model
 
 from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
 from daqsvc.settings.pipeline import Pipeline
+from daqsvc.settings.schema import forget_homes
 from daqsvc.settings.section import Kinds, Section, UnusableValueError
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ def forget() -> None:
     """Look for plugins anew: for whoever installs one in a running process."""
     _installed.cache_clear()
     pipeline_model.cache_clear()
+    forget_homes()
 
 
 def detector_tables() -> Mapping[str, DetectorKind[Any]]:

@@ -37,18 +37,18 @@ def value_at(document: Any, path: KeyPath) -> Any:
 
 
 _MOST_HOMES = 2
-_field_types: dict[int, Any] = {}
+_field_types: dict[int, tuple[FieldInfo, Any]] = {}
 _adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}
-"""Both by the identity of what they belong to, fields and types of the models, which live as long as this."""
+"""Both by the identity of what they belong to, which is kept: else it could become that of something else."""
 
 
 def field_type(field: FieldInfo) -> Any:
     """The type of a field with its annotations, as it was declared."""
     known = _field_types.get(id(field))
     if known is None:
-        known = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
-        _field_types[id(field)] = known
-    return known
+        declared = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+        known = _field_types[id(field)] = (field, declared)
+    return known[1]
 
 
 def section_of(declared: Any, value: object) -> type[Section] | None:
@@ -103,6 +103,11 @@ def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
 
     walk(root, "")
     return {name: tuple(places) for name, places in found.items()}
+
+
+def forget_homes() -> None:
+    """Look anew which tables can hold a key: other plugins bring other tables."""
+    _homes.cache_clear()
 
 
 def homes_of(root: type[Section], key: str) -> tuple[str, ...]:

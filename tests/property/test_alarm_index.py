@@ -73,7 +73,7 @@ class WalkingDoubts(SensorHealth):
         names = (name,) if before is None or before[0] == name else (before[0], name)
         return Touched(names, frozenset())
 
-    def resume(self, doubts, t_ns):
+    def resume(self, doubts, t_ns, found=""):
         for doubt in doubts:
             self.table[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
 
