@@ -257,6 +257,8 @@ def _script(
         set_memory(arguments.max_memory)
         recording = load_recording(arguments.recording, arguments.map, arguments.fs)
         stop_reading()
+        for note in recording.notes:
+            logging.getLogger(__name__).warning("%s: %s", recording.source, note)
         signals = RecordedSignals(recording, arguments.duration)
     elif isinstance(scenario, Scenario):
         signals = RotorSignals(scenario, arguments.duration, arguments.seed, arguments.snr_db)

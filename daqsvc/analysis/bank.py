@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, cast
 
-from daqsvc.analysis.quality import complaints, count_bad
+from daqsvc.analysis.quality import complaints, known_against
 from daqsvc.analysis.result import Instant, RotorAnalysis, Step
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def bank_analysis(recording: Recording, said: Statements) -> RotorAnalysis:
         recording: the recording.
         said: all that the bank said, with the fault of each mode.
     """
-    quality = count_bad(recording.names, recording.samples)
+    quality = known_against(recording)
     source = str(recording.source)
     judged = [one for one in said.diagnoses if one.quality == "good"]
     poor = [one for one in said.diagnoses if one.quality != "good"]

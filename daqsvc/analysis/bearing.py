@@ -112,6 +112,7 @@ def analyse_bearings(
 def _quality(recording: Recording, setup: BearingSetup) -> DataQuality:
     """What is known against a recording before it is judged."""
     quality = accelerometer_quality(recording.names, recording.samples, setup.unit)
+    quality = replace(quality, problems=(*recording.notes, *quality.problems))
     orders = dict.fromkeys(ball_order_problem(setup.bearings[name]) for name in recording.names)
     speed = stated_speed_problem(recording, setup.speed_rpm)
     for problem in (speed, *unit_problems(recording, setup.unit), *orders):

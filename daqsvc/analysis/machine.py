@@ -18,7 +18,7 @@ from daqsvc.analysis.bearing_machine import (
 from daqsvc.analysis.bearing_setup import matching
 from daqsvc.analysis.can_logs import is_can_log, load_can_log
 from daqsvc.analysis.many import Outcome
-from daqsvc.analysis.quality import count_bad
+from daqsvc.analysis.quality import known_against
 from daqsvc.analysis.result import RotorAnalysis
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
@@ -157,7 +157,7 @@ class MachineAnalyst:
             if analysis is None:
                 analysis = bank_analysis(loaded, bank)
         if analysis is None and machine.pipeline.table(Bearing) is None:
-            analysis = RotorAnalysis(recording=recording, quality=count_bad(loaded.names, loaded.samples))
+            analysis = RotorAnalysis(recording=recording, quality=known_against(loaded))
         try:
             bearings = self._bearings(machine, loaded, figures)
         except ValueError as error:
@@ -390,7 +390,8 @@ def _outcome(
     first = analysis if analysis is not None or bearings is None else bearings.analysis
     assert first is not None  # noqa: S101 - one of the two is there
     found = first.as_json()
-    found["data_quality"]["problems"] = [*notes, *found["data_quality"]["problems"]]
+    quality = found["data_quality"]
+    quality["problems"] = list(dict.fromkeys([*notes, *quality["problems"]]))
     texts = [first.describe(), *(said.describe() for said in statements)]
     if bearings is not None:
         statements = (*statements, bearings.statements)
@@ -400,5 +401,5 @@ def _outcome(
     found["detectors"] = {said.detector: said.as_json() for said in statements}
     if alarmed := worst(statements):
         texts.insert(1, f"worst of the other detectors: {alarmed}")
-    texts[1:1] = notes
+    texts[1:1] = [note for note in notes if note not in texts[0]]
     return Outcome(found, "\n  ".join(texts), first.refused is not None)

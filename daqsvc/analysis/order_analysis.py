@@ -10,7 +10,7 @@ import numpy as np
 
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.many import Outcome
-from daqsvc.analysis.quality import DataQuality, count_bad
+from daqsvc.analysis.quality import DataQuality, known_against
 from daqsvc.analysis.result import VERDICTS, finite
 from daqsvc.dsp.order_speed import ORDERS
 from daqsvc.dsp.orders import OrderVectors, order_vectors
@@ -195,7 +195,7 @@ def analyse_orders(
         baseline_name: what the healthy run is called.
     """
     name = str(recording.source)
-    quality = count_bad(recording.names, recording.samples)
+    quality = known_against(recording)
     orders: OrderVectors | None = None
     try:
         orders = setup.orders_of(recording)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.keyphasor_edges import EdgeCounts
+    from daqsvc.recording.recording import Recording
 
     Floats = NDArray[np.float64]
 
@@ -98,6 +99,12 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
                 f"{name}: {quality.infinite[name]} infinite samples are taken as missing"
             )
     return quality
+
+
+def known_against(recording: Recording) -> DataQuality:
+    """What is known against a recording before anybody looks at its signals."""
+    quality = count_bad(recording.names, recording.samples)
+    return replace(quality, problems=(*recording.notes, *quality.problems))
 
 
 def refuse_unreadable(names: Sequence[str], samples: Floats) -> None:

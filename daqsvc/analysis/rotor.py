@@ -83,7 +83,7 @@ def analyse(
     Returns:
         The verdict; a recording that cannot be judged has ``refused`` say why. Never raises on bad data.
     """
-    quality = checks.count_bad(recording.names, recording.samples)
+    quality = checks.known_against(recording)
     watched = _Watched()
     try:
         return _judge(recording, setup, quality, watched, progress)

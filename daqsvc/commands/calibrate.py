@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.analysis.calibrating import CalibrationSetup
+    from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.file import CalibrationRecord
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
@@ -146,7 +147,7 @@ class CalibrateCommand:
         except ValueError as error:
             self._parser.error(str(error))
         loaded = [load_recording(path, setup.taken.columns, arguments.fs) for path in recordings]
-        return calibrate_recordings(loaded, setup)
+        return calibrate_recordings(_with_notes_said(loaded), setup)
 
     def _from_machine(
         self, machine: MachineFile, recordings: Sequence[str], arguments: argparse.Namespace
@@ -159,7 +160,16 @@ class CalibrateCommand:
             setup = of_machine.setup(arguments.sweep_rpm)
         except ValueError as error:
             self._parser.error(str(error))
-        return calibrate_recordings([of_machine.load(path) for path in recordings], setup)
+        loaded = [of_machine.load(path) for path in recordings]
+        return calibrate_recordings(_with_notes_said(loaded), setup)
+
+
+def _with_notes_said(loaded: Sequence[Recording]) -> Sequence[Recording]:
+    """Recordings, once what was wrong with them in reading has been said."""
+    for recording in loaded:
+        for note in recording.notes:
+            print(f"daqsvc calibrate: warning: {recording.source}: {note}", file=sys.stderr)  # noqa: T201
+    return loaded
 
 
 def _setup(arguments: argparse.Namespace) -> CalibrationSetup:

@@ -50,6 +50,7 @@ def load(
         "rate_hz": timing.rate_hz,
         "left_out": left_out,
         "rate_source": timing.source,
+        "notes": timing.notes,
         "scalars": contents.scalars(),
         "texts": contents.texts(),
     }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
 from daqsvc.recording.errors import RecordingError
@@ -48,6 +49,13 @@ MOST_OFF_GRID = 0.3
 SHORT_GAP = 20
 """... if it is not longer than so many samples; what was not sampled may have had a clock of its own."""
 
+LEAST_IN_ORDER = 0.75
+"""Part of the stamps, or of the steps, that go forward where a column of time with stamps that go back still
+tells the rate."""
+
+_NEIGHBOURS = 51
+"""Stamps that the one in their middle is held against."""
+
 MOST_STRETCHED = 4
 """A recording is given up whose gaps make it so many times as long."""
 
@@ -60,11 +68,13 @@ class Timing:
         rate_hz: samples per second.
         source: where that comes from, in words.
         rows: int64 ``[n]``, the place of each sample where some are missing between; None if none are.
+        notes: what is wrong with the column of time, in sentences.
     """
 
     rate_hz: float
     source: str
     rows: NDArray[np.int64] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +89,7 @@ class _TimeColumn:
         tolerance: how far the rate may be off by the digits of the column, relative.
         rows: see `Timing`.
         is_even: whether each sample has its place by the column; else only the mean rate is known.
+        backward: how many steps go back in time.
     """
 
     name: str
@@ -88,6 +99,18 @@ class _TimeColumn:
     tolerance: float
     rows: NDArray[np.int64] | None = None
     is_even: bool = True
+    backward: int = 0
+
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong with it, in sentences."""
+        if not self.backward:
+            return ()
+        steps = "a step" if self.backward == 1 else f"{self.backward:,} steps"
+        note = (
+            f"time column {self.name!r} goes back in {steps}: the samples are taken in the order of the "
+            "file; check the logger's clock and the order of the rows"
+        )
+        return (note,)
 
     def agrees(self, hz: float) -> bool:
         """Whether a rate is the column's, as far as its digits tell."""
@@ -138,8 +161,9 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
             f"{LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz with --fs"
         )
     _refuse_contradictions(path, stated, column, given_hz)
-    rows = None if column is None else column.rows
-    return Timing(float(rate_hz), source, rows)
+    if column is None:
+        return Timing(float(rate_hz), source)
+    return Timing(float(rate_hz), source, column.rows, column.notes())
 
 
 def _refuse_contradictions(
@@ -232,6 +256,9 @@ def _read(contents: Contents, name: str) -> _TimeColumn | None:
     median = float(np.median(steps))
     if not (np.isfinite(steps).all() and median > 0.0):
         return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
+    backward = int((steps < 0.0).sum())
+    if backward:
+        steps = np.diff(_in_order(seconds, median))
     ones = np.abs(steps - median) <= MOST_UNEVEN * median
     period = float(steps[ones].mean())
     rows = None
@@ -240,26 +267,66 @@ def _read(contents: Contents, name: str) -> _TimeColumn | None:
         off = np.abs(steps / period - counts)
         short = counts <= SHORT_GAP
         is_gap = (counts > 1) & (~short | (off <= MOST_OFF_GRID))
-        if not by_name or ones.mean() < LEAST_UNBROKEN or not (ones | is_gap).all():
+        # A clock that is set back says nothing of what is missing there.
+        known = ones | is_gap | (steps < 0.0)
+        if not by_name or ones.mean() < LEAST_UNBROKEN or not known.all():
             return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
-        rows = np.concatenate(([0], np.cumsum(np.where(ones, 1.0, counts)))).astype(np.int64)
-    last_row = len(seconds) - 1 if rows is None else int(rows[-1])
-    rate_hz = last_row / (seconds[-1] - seconds[0]) if rows is None else 1.0 / period
+        if is_gap.any():
+            rows = np.concatenate(([0], np.cumsum(np.where(ones, 1.0, counts)))).astype(np.int64)
+    rate_hz = len(steps) / float(steps.sum()) if ones.all() else 1.0 / period
     rounding = float(np.abs(steps[ones] - period).max())
-    return _TimeColumn(
-        name, unit, unit_is_named, float(rate_hz), 2.0 * rounding / (period * ones.sum()), rows
-    )
+    tolerance = 2.0 * rounding / (period * ones.sum())
+    return _TimeColumn(name, unit, unit_is_named, float(rate_hz), tolerance, rows, backward=backward)
+
+
+def _in_order(seconds: Floats, period: float) -> Floats:
+    """Stamps of which those out of order follow the ones before them by even steps.
+
+    A few rows that a logger wrote in another order, or stamped wrongly, are no gaps. Where the clock was set
+    back the stamps are left as they are.
+    """
+    at = np.arange(len(seconds))
+    late = seconds - period * at
+    # A median keeps the edge that a gap makes, and leaves out what lies beside its neighbours.
+    neighbours = median_filter(late, size=_NEIGHBOURS, mode="mirror")
+    fits = np.abs(late - neighbours) <= MOST_UNEVEN * period
+    fits[0] = True
+    in_place = _follow(seconds, fits, period)
+    fits &= in_place == np.maximum.accumulate(in_place)
+    fits &= in_place == np.minimum.accumulate(in_place[::-1])[::-1]
+    fits[0] = True
+    return in_place if fits.mean() < LEAST_IN_ORDER else _follow(seconds, fits, period)
+
+
+def _follow(seconds: Floats, fits: NDArray[np.bool_], period: float) -> Floats:
+    """The stamps that fit, and between them even steps from the last one that does."""
+    at = np.arange(len(seconds))
+    last = np.maximum.accumulate(np.where(fits, at, 0))
+    return np.asarray(seconds[last] + period * (at - last), np.float64)
 
 
 def _mean_rate(name: str, unit: str, seconds: Floats, *, unit_is_named: bool) -> _TimeColumn | None:
-    """What a column with coarse stamps, or without some, says all the same; None if it goes back."""
+    """What a column with coarse stamps, or without some, says all the same; None if it goes back often."""
     there = np.flatnonzero(np.isfinite(seconds))
     steps = np.diff(seconds[there])
-    if len(there) < 2 or steps.min() < 0.0 or steps.max() <= 0.0:
+    if len(there) < 2 or steps.max() <= 0.0:
         return None
-    span_s = float(seconds[there[-1]] - seconds[there[0]])
-    rate_hz = float(there[-1] - there[0]) / span_s
-    return _TimeColumn(name, unit, unit_is_named, rate_hz, 2.0 * float(steps.max()) / span_s, is_even=False)
+    backward = int((steps < 0.0).sum())
+    if not backward:
+        span_s = float(seconds[there[-1]] - seconds[there[0]])
+        rate_hz = float(there[-1] - there[0]) / span_s
+        tolerance = 2.0 * float(steps.max()) / span_s
+        return _TimeColumn(name, unit, unit_is_named, rate_hz, tolerance, is_even=False)
+    if backward > (1.0 - LEAST_IN_ORDER) * len(steps):
+        return None
+    # From the middle of one half to that of the other: a few wrong stamps, even at the ends, move neither.
+    early, late = np.array_split(there, 2)
+    span_s = float(np.median(seconds[late]) - np.median(seconds[early]))
+    if span_s <= 0.0:
+        return None
+    rate_hz = float(np.median(late) - np.median(early)) / span_s
+    tolerance = 2.0 * float(np.median(np.abs(steps[steps != 0.0]))) / span_s
+    return _TimeColumn(name, unit, unit_is_named, rate_hz, tolerance, is_even=False, backward=backward)
 
 
 def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]:
@@ -268,6 +335,8 @@ def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]
         return (values - values[0]) / np.timedelta64(1, "s"), "dates", True
     named = TIME_NAME.fullmatch(name)
     unit = named["unit"] if named else None
+    if values.dtype.kind in "iu":
+        values = values.astype(np.int64)  # the differences of unsigned or short ones wrap
     # Nanoseconds since 1970 have more digits than a float64.
     since_first = (values - values[0]).astype(np.float64)
     if unit in PER_SECOND:

@@ -112,7 +112,7 @@ def load_recording(
     about, (samples,) = _there(
         "load", path, {"channels": None if channels is None else dict(channels), "rate_hz": rate_hz}
     )
-    about["names"] = tuple(about["names"])
+    about["names"], about["notes"] = tuple(about["names"]), tuple(about["notes"])
     return Recording(samples=samples, source=path, **about)
 
 

@@ -326,4 +326,6 @@ def _load(path: Path, channels: Mapping[str, str] | None, rate_hz: float | None,
             f"warning: {path}: left out {left_out}: not as long as the others "
             f"({len(recording.samples)} samples); choose channels with {option}"
         )
+    for note in recording.notes:
+        _say(f"warning: {path}: {note}")
     return recording

@@ -41,3 +41,21 @@ def test_missing_rows_are_gaps(analyze, tmp_path, lost):
         assert found["verdict"] == "inner"
         missing = found["data_quality"]["missing"]["de"]
         assert missing == pytest.approx(lost * len(kept), rel=0.1)
+
+
+def test_stamps_that_go_back_do_not_let_another_rate_in(analyze, tmp_path):
+    rows = np.arange(len(strikes("inner")))
+    path = save(tmp_path / "run.csv", rows)
+    lines = path.read_text().splitlines(keepends=True)
+    stamps = [line.partition(",")[0] for line in lines]
+    stamps[5001:5011] = stamps[5001:5011][::-1]
+    path.write_text("".join(f"{t},{line.partition(',')[2]}" for t, line in zip(stamps, lines, strict=True)))
+    code, (found,), _ = analyze(path, *OPTIONS, "--fs", 48_000)
+    assert (code, found["verdict"]) == (3, None)
+    assert "by the file and 48000 Hz as given" in found["refused"]
+    for given in ((), ("--fs", RATE_HZ)):
+        code, (found,), _ = analyze(path, *OPTIONS, *given)
+        assert (code, found["verdict"]) == (0, "inner")
+        assert any(
+            "time column 'time' goes back in 9 steps" in one for one in found["data_quality"]["problems"]
+        )

@@ -461,3 +461,80 @@ def test_time_alone_is_no_recording(tmp_path):
     np.savez(path, t=np.arange(400) / 500)
     with pytest.raises(RecordingError, match="no channel beside its time column 't'; it holds t"):
         load_recording(path)
+
+
+def set_back(t):
+    """Ten rows in the wrong order."""
+    t[600:610] = t[600:610][::-1].copy()
+
+
+def stamp_wrongly(t):
+    """A few stamps that are far off, the last one too."""
+    t[[3, 700, -1]] = 0.0
+
+
+def restart_clock(t):
+    t[400:] -= t[400]
+
+
+def jitter(t):
+    """Half a sample, and coarse digits."""
+    t += np.random.default_rng(3).uniform(-0.45, 0.45, len(t)) / 12_000
+    t[600:610] = t[600:610][::-1].copy()
+
+
+def coarsen(t):
+    np.floor(t * 1000, out=t)
+    t /= 1000
+    t[600:620] = t[600:620][::-1].copy()
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".mat", ".parquet"])
+@pytest.mark.parametrize("spoil", [set_back, stamp_wrongly, restart_clock, jitter, coarsen])
+def test_a_time_column_that_goes_back_here_and_there_still_tells_the_rate(tmp_path, suffix, spoil):
+    t = np.arange(12_000) / 12_000
+    spoil(t)
+    path = save_with_time(tmp_path / f"rig{suffix}", t)
+    with pytest.raises(RecordingError, match=r"by the file and 48000 Hz as given: leave --fs out"):
+        load_recording(path, {"x": "x"}, 48_000)
+    recording = load_recording(path, {"x": "x"}, 12_000)
+    assert (recording.rate_hz, len(recording.samples), recording.nan_count) == (12_000, 12_000, 0)
+    (note,) = recording.notes
+    assert "time column 't' goes back in " in note
+    if spoil in {set_back, stamp_wrongly, restart_clock}:
+        assert load_recording(path).rate_hz == pytest.approx(12_000, rel=1e-6)
+        assert load_recording(path).names == ("x",)
+    else:
+        with pytest.raises(RecordingError, match="does not state one"):
+            load_recording(path)
+
+
+def test_a_gap_beside_stamps_out_of_order_is_a_gap(tmp_path):
+    t = np.arange(1000) / 500
+    there = np.ones(1000, bool)
+    there[300:420] = False
+    t[600:610] = t[600:610][::-1].copy()
+    recording = load_recording(save_with_time(tmp_path / "rig.csv", t[there]), {"x": "x"})
+    assert np.array_equal(np.isfinite(recording.samples[:, 0]), there)
+    assert "goes back in 9 steps" in recording.notes[0]
+
+
+@pytest.mark.parametrize("dtype", [np.uint32, np.int16])
+def test_differences_of_unsigned_or_short_stamps_do_not_wrap(tmp_path, dtype):
+    t = (np.arange(400) * 150).astype(dtype)  # those of int16 begin anew beyond 32 767, as of a counter
+    t[0], t[50:53] = t[5], t[50:53][::-1].copy()
+    np.savez(tmp_path / "rig.npz", time_us=t, x=X[:400])
+    recording = load_recording(tmp_path / "rig.npz")
+    assert recording.rate_hz == pytest.approx(1e6 / 150)
+    assert (len(recording.samples), recording.nan_count) == (400, 0)
+    assert "goes back in" in recording.notes[0]
+
+
+def test_a_column_that_goes_back_everywhere_tells_nothing(tmp_path):
+    """What is called t is a torque here: the rate has to be given."""
+    t = np.random.default_rng(1).normal(size=4000)
+    path = save_with_time(tmp_path / "rig.csv", t)
+    recording = load_recording(path, {"x": "x"}, 12_000)
+    assert (recording.rate_hz, recording.notes) == (12_000, ())
+    with pytest.raises(RecordingError, match="Give it with --fs"):
+        load_recording(path, {"x": "x"})
