@@ -446,6 +446,7 @@ class AlarmService:
             unwritten=self.commands.unwritten,
             buses=self._bus_health(),
             refused=None if publisher is None else publisher.refused,
+            is_refused_known=publisher is not None and publisher.is_refused_known,
         )
 
     async def _look_at_disk(self) -> None:

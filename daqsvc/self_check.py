@@ -68,12 +68,14 @@ class BusHealth(NamedTuple):
         bus_off: how often its controller took itself off the bus.
         state: state of the controller; None for a bus that has none.
         unrecorded: frames that are missing from its recording.
+        heard: whether anything has come from it since the start: until then nobody knows how it stands.
     """
 
     overruns: int
     bus_off: int
     state: Literal["error-active", "error-warning", "error-passive", "bus-off"] | None
     unrecorded: int = 0
+    heard: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +98,8 @@ class Vitals:
         unwritten: commands so far that were refused because the audit log could not be written.
         buses: how each bus stands, by name.
         refused: by topic, why the broker will not take messages; None without a broker.
+        is_refused_known: whether these are all there are: what an earlier run has left was read, and the
+            broker was asked.
         unbacked: whether the disk takes no alarm events, so that they go out from memory.
         set_aside: whether the damage has left files that are named ``*.corrupt-*``.
     """
@@ -115,6 +119,7 @@ class Vitals:
     unwritten: int
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
     refused: Mapping[str, str] | None = None
+    is_refused_known: bool = False
     unbacked: bool = False
     set_aside: bool = False
 
@@ -146,6 +151,9 @@ def conditions(
 class SelfCheck:
     """Remembers what was seen before, and says how things stand.
 
+    What is not known yet is not said to be normal: an alarm that stood before a restart would return, and
+    come again. What happens now and then is known once it was watched for `QUIET_NS`.
+
     Args:
         store: the store's directory.
         reserve_bytes: free space below which the disk is nearly full.
@@ -164,6 +172,10 @@ class SelfCheck:
         self._unrecorded: defaultdict[str, _Happening] = defaultdict(_Happening)
         self._write_errors = 0
         self._unwritable = False
+        self._begun_ns: dict[str, int] = {}
+        """By condition of what happens now and then, since when it is watched."""
+        self._said: set[str] = set()
+        """Of these, those that were other than normal in this run."""
 
     def free_bytes(self) -> int:
         """Free space for the service on the store's disk; blocks.
@@ -174,7 +186,20 @@ class SelfCheck:
         return shutil.disk_usage(self._store).free
 
     def look(self, vitals: Vitals) -> Iterator[Condition]:
-        """How everything stands, whether that is new or not."""
+        """How everything stands, as far as it is known, whether that is new or not."""
+        yield from self._certificates(vitals)
+        if vitals.free_bytes is not None:
+            yield self._disk(vitals.free_bytes)
+        for now_and_then in (self._journal, self._damage, self._dropped, self._audit):
+            yield from self._once_known(now_and_then(vitals), vitals)
+        if vitals.refused is not None:
+            if vitals.refused or vitals.is_refused_known:
+                yield _refusals(vitals.refused)
+        elif REFUSED in vitals.conditions_told:
+            yield Condition(REFUSED, Level.NORMAL, "there is no broker any more")
+        yield from self._buses(vitals)
+
+    def _certificates(self, vitals: Vitals) -> Iterator[Condition]:
         for name, end_ns in sorted(vitals.certificates_end_ns.items()):
             if not (name == BROKER and vitals.broker_has_expired):
                 yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
@@ -187,28 +212,35 @@ class SelfCheck:
             for name in sorted(vitals.conditions_told - seen):
                 if name.startswith(CERTIFICATE):
                     yield Condition(name, Level.NORMAL, "it is no longer in use")
-        if vitals.free_bytes is not None:
-            yield self._disk(vitals.free_bytes)
-        yield self._journal(vitals)
-        yield self._damage(vitals)
-        yield self._dropped(vitals)
-        yield self._audit(vitals)
-        if vitals.refused is not None:
-            yield _refusals(vitals.refused)
-        elif REFUSED in vitals.conditions_told:
-            yield Condition(REFUSED, Level.NORMAL, "there is no broker any more")
-        yield from self._buses(vitals)
 
     def _buses(self, vitals: Vitals) -> Iterator[Condition]:
         for bus, health in vitals.buses.items():
-            yield self._overrun(bus, health, vitals.now_ns)
+            found = [self._overrun(bus, health, vitals.now_ns)]
             if health.state is not None:
-                yield self._controller(bus, health, vitals.now_ns)
-                yield self._recording(bus, health, vitals.now_ns)
+                found.append(self._controller(bus, health, vitals.now_ns))
+                found.append(self._recording(bus, health, vitals.now_ns))
+            for condition in found:
+                yield from self._once_known(condition, vitals, watched=health.heard)
         of_a_bus = (BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
         for name in sorted(vitals.conditions_told):
             if name.startswith(of_a_bus) and name.partition("/")[2] not in vitals.buses:
                 yield Condition(name, Level.NORMAL, "there is no such bus any more")
+
+    def _once_known(
+        self, condition: Condition, vitals: Vitals, *, watched: bool = True
+    ) -> Iterator[Condition]:
+        """A condition of what happens now and then, unless nobody knows yet whether it still does."""
+        name = condition.name
+        if condition.level is not Level.NORMAL:
+            self._said.add(name)
+        elif name not in self._said and name in vitals.conditions_told:
+            # It stood before a restart.
+            if not watched:
+                return
+            begun_ns = self._begun_ns.setdefault(name, vitals.now_ns)
+            if vitals.now_ns - begun_ns < QUIET_NS:
+                return
+        yield condition
 
     def _certificate(self, name: str, left_ns: int, end_ns: int) -> Condition:
         condition = f"{CERTIFICATE}{name}"

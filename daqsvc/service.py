@@ -326,7 +326,11 @@ class Service:
         for driver in self.drivers:
             counters = driver.counters
             found[driver.name] = BusHealth(
-                counters.overruns, counters.bus_off, counters.controller_state, counters.frames_unrecorded
+                counters.overruns,
+                counters.bus_off,
+                counters.controller_state,
+                counters.frames_unrecorded,
+                _has_heard(driver),
             )
         return found
 
@@ -385,6 +389,13 @@ def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> Sa
     needed = max((4 * d.block for d in detectors if d.stream == grid.name), default=1)
     needed = max(needed, 2 * at_once(machine, grid.name))
     return SampleRing(grid.name, grid.channel_names, max(wanted, needed))
+
+
+def _has_heard(driver: Driver) -> bool:
+    """Whether anything has come from the bus of ``driver``, if only an error."""
+    counters = driver.counters
+    others = counters.frames_unknown + counters.frames_remote + counters.frames_error
+    return others > 0 or any(stream.frames_received for stream, _ in driver.streams.values())
 
 
 def _has_ended(driver: Driver) -> bool:

@@ -64,6 +64,11 @@ class DeadLetters:
         self._loaded = False
 
     @property
+    def is_known(self) -> bool:
+        """Whether the file has been read since the start, so that `reasons` are all there are."""
+        return self._loaded
+
+    @property
     def reasons(self) -> Mapping[str, str]:
         """By topic, why the broker will not take its messages."""
         return MappingProxyType(dict(self._reasons))
@@ -76,7 +81,6 @@ class DeadLetters:
         """
         if not self._loaded:
             await self._do(_nothing)
-            self._loaded = True
 
     async def put(self, message: OutboxMessage, reason: str) -> None:
         """Keep a message that was refused; on disk when this returns.
@@ -163,6 +167,7 @@ class DeadLetters:
         # A whole new one, for the event loop may be reading.
         self._reasons = {topic: reason for topic, reason, _ in found}
         self.waiting = sum(count for _, _, count in found)
+        self._loaded = True
         return result
 
     def _set_aside(self, error: Exception) -> None:

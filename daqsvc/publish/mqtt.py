@@ -122,6 +122,8 @@ class MqttPublisher:
         self._suspects = Suspects()
         self._faults = Faults()
         self._not_available = ""
+        self._not_loaded = ""
+        self._has_ever_lasted = False
         self._exposed: set[Path] = set()
         self._stopping = asyncio.Event()
         self._stop_at_s = 0.0
@@ -189,6 +191,15 @@ class MqttPublisher:
         if self._not_available:
             found[self.topics.availability] = self._not_available
         return self._suspects.barred(time.monotonic()) | found
+
+    @property
+    def is_refused_known(self) -> bool:
+        """Whether `refused` is all there is: what an earlier run has left was read, and the broker was asked.
+
+        A message for which a broker ends the connection, or the box's availability, shows itself only when it
+        is sent: so a connection must have lasted.
+        """
+        return self._has_ever_lasted and self._outbox.dead_letters.is_known
 
     async def run(self) -> None:
         """Publish until `stop`: connect, serve, and connect again after each loss.
@@ -287,7 +298,12 @@ class MqttPublisher:
         try:
             await self._outbox.dead_letters.load()
         except OutboxError as error:
-            self._outage.warn_once(f"{error}; what was refused before waits until it can")
+            # Of the store, not of the broker: it makes no outage.
+            if f"{error}" != self._not_loaded:
+                log.warning("%s; what was refused before waits until it can", error)
+            self._not_loaded = f"{error}"
+        else:
+            self._not_loaded = ""
 
     async def _say_online(self, connection: Connection) -> None:
         try:
@@ -395,6 +411,7 @@ class MqttPublisher:
     def _has_lasted(self, connection: Connection) -> None:
         """A connection has been of use for a while."""
         self._suspects.settled()
+        self._has_ever_lasted = True
         connection.widen(IN_FLIGHT)
 
     def _suspect(self, connection: Connection) -> None:

@@ -60,7 +60,7 @@ class Outage:
             until: what is going on about it.
         """
         reason = in_words(error)
-        still = "still " if self.is_told else ""
+        still = "still " if any(told == broker for told, _ in self._told) else ""
         if self.note(broker, reason):
             self._log.warning("%s is %saway: %s; %s", broker, still, reason, until)
 
@@ -69,11 +69,6 @@ class Outage:
         reason = in_words(error)
         if self.note(broker, reason):
             self._log.warning("%s: %s; connecting again", broker, reason)
-
-    def warn_once(self, sentence: str) -> None:
-        """Say something else about it, unless that has been said."""
-        if self.note("", sentence):
-            self._log.warning("%s", sentence)
 
     def note(self, broker: str, reason: str) -> bool:
         """Take a reason as told; whether it is a new one that may be said."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from functools import partial
 
 import pytest
-from brokers import Consumer, eventually, running_mosquitto
+from brokers import Consumer, eventually, free_port, running_mosquitto
 from mqtt_publishing import CLOCK, publishing
 from picky_broker import PickyBroker
 
 from daqsvc.alarm_service import AlarmService
+from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
@@ -239,10 +241,30 @@ async def test_a_disk_that_takes_no_refused_messages_keeps_them_in_the_journal(
             await eventually(lambda: broker.sequences(BAD) == bad, "tried again, they arrive in their order")
 
 
+@pytest.mark.parametrize("there", [True, False], ids=["a broker", "no broker"])
+async def test_a_store_that_cannot_be_read_makes_no_outage_of_the_broker(outbox, caplog, there):
+    """What was never said to be away is not back, and not still away; the store's fault is said once."""
+    caplog.set_level(logging.INFO, "daqsvc.publish")
+    path = outbox.dead_letters._path
+    path.mkdir()
+    word = "connected to MQTT broker" if there else " is away: "
+    async with (
+        PickyBroker(lambda _topic, _size: True) as broker,
+        publishing(outbox, broker.port if there else free_port()),
+    ):
+        await eventually(lambda: "MQTT broker" in caplog.text, "the first word of the broker")
+    said = [record.getMessage() for record in caplog.records]
+    (fault,) = [at for at, line in enumerate(said) if "what was refused before waits until it can" in line]
+    first = next(at for at, line in enumerate(said) if "MQTT broker" in line)
+    assert fault < first
+    assert word in said[first]
+
+
 @pytest.mark.mosquitto
 async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_path, monkeypatch):
     """Also where its own topic is among the refused."""
     monkeypatch.setattr("daqsvc.publish.delivery.TRY_AGAIN_S", 0.1)
+    monkeypatch.setattr("daqsvc.publish.mqtt.STABLE_S", 0.3)
     store = tmp_path / "store"
     alarm = f"{BASE}/rig/alarms/broker/refused"
     rules = [DiagnosisRule(name, name) for name in ("rotor-fault", "sensor")]
@@ -281,8 +303,25 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
                 told = live.messages[-1].payload
                 assert (told["kind"], told["level"]) == ("raised", "alert")
                 assert f"{sensor} (the broker refuses messages: Not authorized)" in told["message"]
+                acknowledge = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="broker/refused", by="Anna")
+                assert (await desk.execute(acknowledge, "test")).accepted
             finally:
                 await closed(desk, running)
+            for port in (strict.port, free_port()):
+                # A restart knows nothing at first, and without a broker for long: it says nothing new.
+                desk, running = await desk_at(port)
+                try:
+                    letters, publisher = desk.outbox.dead_letters, desk.publisher
+                    await ticking(desk, partial(getattr, letters, "is_known"), "the file was read")
+                    if port == strict.port:
+                        await ticking(desk, partial(getattr, publisher, "is_refused_known"), "it was asked")
+                    desk.tick()
+                finally:
+                    await closed(desk, running)
+                status = desk.manager.alarms["broker/refused"]
+                assert status.state.value == "active_acknowledged"
+            # The acknowledgement was the last word; a new connection tells it once more.
+            assert {one.payload["kind"] for one in live.messages} == {"raised", "acknowledged"}
     with running_mosquitto(tmp_path, acl=f"{ACL}topic write {BASE}/#\n") as kinder:
         async with Consumer(kinder.port, f"{BASE}/rig/alarms/#") as live:
             desk, running = await desk_at(kinder.port)

@@ -22,6 +22,8 @@ from daqsvc.publish.sparkplug import session
 
 pytestmark = pytest.mark.mosquitto
 
+IS_THERE = "is online; births, alarms and figures go out"
+
 
 async def test_tck_id_topics_nbirth_bdseq_matching(mosquitto, outbox, tmp_path) -> None:
     """The will of each session carries the number of its birth, and the next session has the next number."""
@@ -148,8 +150,30 @@ async def test_a_host_that_never_comes_is_said_with_those_that_are_there(
             async with Host(mosquitto.port, "scada1") as wanted:
                 wanted.say_state(online=True, timestamp=1)
                 await born(host)
-            assert not edge.counters.waiting_for_host
+                await eventually(lambda: IS_THERE in caplog.text, "it is said that it is there")
+                assert not edge.counters.waiting_for_host
+                wanted.say_state(online=False, timestamp=2)
+                await eventually(lambda: "scada1 has left this broker" in caplog.text, "it has gone")
+                assert caplog.text.count(IS_THERE) == 1
+                wanted.say_state(online=True, timestamp=3)
+                await born(host, 2)
+                await eventually(lambda: caplog.text.count(IS_THERE) == 2, "and is there again")
     assert caplog.text.count("Sparkplug tells nothing yet") == 1
+
+
+async def test_a_host_that_is_there_at_once_and_a_broker_that_comes_late_are_said_rightly(
+    mosquitto, outbox, tmp_path, caplog
+) -> None:
+    """Nothing of a host that nobody has missed; of each broker that it is away, and one where it goes on."""
+    dead = free_port()
+    async with Host(mosquitto.port) as host:
+        host.say_state(online=True, timestamp=1000)
+        async with edge_node(outbox, tmp_path, dead, mosquitto.port, primary_host="scada"):
+            await born(host)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+        f"Sparkplug broker 127.0.0.1:{dead} is away: nothing listens there; trying again until one is there",
+        f"Sparkplug is connected to broker 127.0.0.1:{mosquitto.port}",
+    ]
 
 
 async def test_tck_id_operational_behavior_edge_node_termination_host_offline(

@@ -74,6 +74,14 @@ def test_each_reason_is_said_once_in_an_outage_and_anew_in_the_next(caplog):
     ]
 
 
+def test_of_a_broker_that_nobody_called_away_it_is_not_said_that_it_still_is(caplog):
+    outage = Outage(logging.getLogger("outage"))
+    for broker in ("a:1", "b:1", "a:1"):
+        outage.tell(f"Sparkplug broker {broker}", MqttError(f"closed by {broker}"), "trying again")
+    outage.tell("Sparkplug broker a:1", ConnectionRefusedError(), "trying again")
+    assert [" still " in record.getMessage() for record in caplog.records] == [False, False, True]
+
+
 def test_a_reason_that_is_another_every_time_does_not_fill_the_log(caplog):
     outage = Outage(logging.getLogger("outage"))
     for number in range(100):

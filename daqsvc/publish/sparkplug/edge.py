@@ -22,6 +22,7 @@ from daqsvc.publish.errors import MqttError
 from daqsvc.publish.faults import Faults
 from daqsvc.publish.outage import Outage
 from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands
+from daqsvc.publish.sparkplug.host import HostReports
 from daqsvc.publish.sparkplug.memory import Memory
 from daqsvc.publish.sparkplug.metrics import (
     NS_PER_MS,
@@ -108,6 +109,7 @@ class SparkplugEdge:
             for server in settings.servers
         }
         self._outage = Outage(log)
+        self._host_reports = HostReports()
         self._faults = Faults()
         self._stopping = asyncio.Event()
         self._running: asyncio.Future[None] | None = None
@@ -163,7 +165,7 @@ class SparkplugEdge:
             await session.run(self._stopping, lambda: self._there)
             await session.leave(GOODBYE_S)
         except HostAwayError as away:
-            log.warning("Sparkplug at %s:%d: %s", server.host, server.port, away)
+            self._host_reports.missing(f"Sparkplug at {server.host}:{server.port}: {away}")
             await session.leave(GOODBYE_S)
             self._walk()
             await self._wait()
@@ -209,6 +211,8 @@ class SparkplugEdge:
             raise
         self.counters.connections += 1
         self.counters.connected = True
+        if self._outage.is_told:
+            log.warning("Sparkplug is connected to broker %s:%d", server.host, server.port)
         self._outage.end()
         session = EdgeSession(
             connection,
@@ -221,6 +225,7 @@ class SparkplugEdge:
             topics=self._topics,
             clock=self._clock,
             counters=self.counters,
+            reports=self._host_reports,
             commands=self._commands,
         )
         return connection, session

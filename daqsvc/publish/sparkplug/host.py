@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import dataclass
 
 from daqsvc.publish.sparkplug.codec import PayloadError
@@ -10,6 +11,8 @@ from daqsvc.publish.sparkplug.node import NAMESPACE
 
 STATES = (f"{NAMESPACE}/STATE/", "STATE/")
 """What the topics of hosts' states begin with: of Sparkplug 3.0, and of 2.2."""
+
+log = logging.getLogger(__name__)
 
 _WORDS = {b"ONLINE": True, b"OFFLINE": False}
 
@@ -68,3 +71,22 @@ class PrimaryHost:
             return False
         self.online = online
         return True
+
+
+class HostReports:
+    """What the log says of the primary host, over all sessions: that it is missing, and that it is there."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def missing(self, sentence: str) -> None:
+        """Say that the host is missing, each sentence once until it is there."""
+        if sentence not in self._said:
+            self._said.add(sentence)
+            log.warning("%s", sentence)
+
+    def there(self, host_id: str) -> None:
+        """Say that the host is there, if it was said to be missing."""
+        if self._said:
+            self._said.clear()
+            log.warning("Sparkplug: primary host %s is online; births, alarms and figures go out", host_id)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.publish.errors import MqttError
 from daqsvc.publish.sparkplug.alarm_commands import MOST_AT_A_TIME
 from daqsvc.publish.sparkplug.codec import PayloadError
-from daqsvc.publish.sparkplug.host import STATES, PrimaryHost
+from daqsvc.publish.sparkplug.host import STATES, HostReports, PrimaryHost
 from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ class EdgeSession:
         topics: by which alarms are known in the outbox.
         clock: for time stamps.
         counters: what is counted here.
+        reports: what is said of the primary host; goes on over sessions.
         commands: takes what hosts write to alarms; None if they may not.
     """
 
@@ -120,6 +121,7 @@ class EdgeSession:
         topics: Topics,
         clock: Clock,
         counters: SparkplugCounters,
+        reports: HostReports,
         commands: AlarmCommands | None = None,
     ) -> None:
         self._connection = connection
@@ -135,6 +137,7 @@ class EdgeSession:
         self._topics = topics
         self._clock = clock
         self._counters = counters
+        self._reports = reports
         self._commands = commands
         self._wishes: asyncio.Queue[HostCommand] = asyncio.Queue(MOST_AT_A_TIME)
         self._ungranted: list[str] = []
@@ -170,6 +173,8 @@ class EdgeSession:
             for message in present:
                 self._board.put(None, self._all_metrics_of(message))
             self._be_born()
+            if self._host is not None:
+                self._reports.there(self._host.host_id)
             await self._tell_history(max((message.sequence for message in present), default=0))
             await self._tell(heard, listening, stopped)
             await self._tell_alarms(await self._outbox.following(self._cursor, READ_AHEAD))
@@ -264,14 +269,12 @@ class EdgeSession:
         word = "says that it is offline" if offline else "has told no state that can be read"
         closed = [topic for topic in self._ungranted if topic in wanted]
         there = ", ".join(repr(name) for name in sorted(others))
-        log.warning(
-            "Sparkplug tells nothing yet: primary host %s %s on %s%s; %s. Correct primary_host in "
-            "[mqtt.sparkplug], or have that host connect to this broker",
-            self._host.host_id,
-            word,
-            " or ".join(wanted),
-            f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else "",
-            f"hosts at this broker are {there}" if there else "there is no other host at this broker",
+        barred = f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else ""
+        found = f"hosts at this broker are {there}" if there else "there is no other host at this broker"
+        self._reports.missing(
+            f"Sparkplug tells nothing yet: primary host {self._host.host_id} {word} on "
+            f"{' or '.join(wanted)}{barred}; {found}. Correct primary_host in [mqtt.sparkplug], or have that "
+            "host connect to this broker"
         )
 
     async def _execute(self) -> None:
