@@ -333,8 +333,8 @@ async def test_a_low_terminal_shows_loss_lag_and_the_newest_alarm() -> None:
     assert "0 lost" in text
     assert "event loop lag" in text
     assert " now " in text
-    newest = view._alarms[0]
-    assert newest["sequence"] == max(alarm["sequence"] for alarm in view._alarms)
+    newest = view._alarms[0][1]
+    assert newest["sequence"] == max(alarm["sequence"] for _, alarm in view._alarms)
     assert f"{newest['level']:<7} {newest['kind']:<9} {newest['alarm']}" in text
 
 

@@ -192,7 +192,7 @@ def looks(watch, samples):
 
 
 def rotor_samples(noise_um, revolutions=200.0):
-    return channels_of(plant.simulate(plant.RotorParameters(), [], revolutions=revolutions), noise_um)
+    return channels_of(plant.simulate(plant.PlantParameters(), [], revolutions=revolutions), noise_um)
 
 
 @pytest.mark.parametrize(("share", "frame"), [(0.1, 1), (0.3, 20), (0.5, 20), (0.2, 64)])
