@@ -29,6 +29,12 @@ class BearingPlant(ScenarioTable):
     """A machine by its masses, stiffnesses and dampings, in SI units.
 
     Those not given have the mode of its rolling elements at 4.2 kHz (the set ``S3`` of the bearing's model).
+    Noise and unbalance are measured by the damage, so its depth scales all levels.
+
+    Attributes:
+        snr_db: power of the damage over the sensors' noise.
+        spall_depth_um: how deep a rolling element dips into a spall.
+        unbalance_ratio: amplitude of 1X at the rotor's sensor over the r.m.s. value of the damage there.
     """
 
     kind: Literal["bearing"]
@@ -37,6 +43,8 @@ class BearingPlant(ScenarioTable):
     stiffnesses_n_per_m: tuple[float, float, float] = (1.7765e8, 3.5531e8, 1.7765e8)
     dampings_n_s_per_m: tuple[float, float, float] = (753.98, 2513.27, 1256.64)
     snr_db: float = Field(default=10.0, allow_inf_nan=False)
+    spall_depth_um: float = Field(default=2.0, gt=0, allow_inf_nan=False)
+    unbalance_ratio: float = Field(default=3.0, ge=0, allow_inf_nan=False)
 
     @property
     def machine(self) -> BearingMachine:
@@ -100,12 +108,13 @@ class BearingScenario(ScenarioTable):
             snr_db: instead of the plant's.
         """
         seed = self.seed if seed is None else seed
-        signal = FaultSignal(shaft_hz=self.plant.speed_rpm / 60.0)
+        signal = FaultSignal(shaft_hz=self.plant.speed_rpm / 60.0, depth_m=1e-6 * self.plant.spall_depth_um)
         level = levels(
             self.plant.machine,
             signal,
             snr_db=self.plant.snr_db if snr_db is None else snr_db,
             rate_hz=rate_hz,
+            unbalance_ratio=self.plant.unbalance_ratio,
         )
         calm, *of_damage = (
             np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(1 + len(self.damage))

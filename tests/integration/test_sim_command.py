@@ -26,6 +26,7 @@ from sim_processes import (
     summary_of,
 )
 
+from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file
 from drivers.can.build import frame_layout
 from sim_hw.bus_socket import UnixBus
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from brokers import Mosquitto
+
+MOTOR_ALARMS = ("drive-end-rms", "drive-end-peak")
 
 
 def documented(verb: str, places: dict[str, Path]) -> list[str]:
@@ -207,7 +210,7 @@ def test_a_recording_is_played_by_the_names_of_the_sensors(tmp_path: Path) -> No
 @pytest.mark.long
 async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) -> None:
     path, damage = tmp_path / "can0", tmp_path / "damage.toml"
-    damage.write_text((SCENARIOS / "bearing-damage.toml").read_text().replace("at_s = 10.0", "at_s = 1.0"))
+    damage.write_text((SCENARIOS / "bearing-damage.toml").read_text().replace("at_s = 10.0", "at_s = 2.5"))
     text = MOTOR.read_text().partition("[mqtt]")[0]
     text = text.replace('"socketcan"', '"unixbus"').replace('channel = "can0"', f'channel = "{path}"')
     file = tmp_path / "motor.toml"
@@ -215,16 +218,22 @@ async def test_a_bearing_that_is_damaged_arrives_value_by_value(tmp_path: Path) 
     machine = parse_machine_file(text, file)
     async with running(machine, tmp_path / "store") as service:
         await eventually(lambda: service.drivers[0].link.state == "up", "the bus is up")
-        with process("sim", file, "--scenario", damage, "--seed", 7, "--duration", 3) as sim:
+        alarms, ring = service.alarms.manager.alarms, service.rings["drive-end"]
+        with process("sim", file, "--scenario", damage, "--seed", 7, "--duration", 6) as sim:
+            await eventually(lambda: ring.end_index > 28_000, "2.3 s of a healthy bearing have come")
+            before = {name: alarms[name].level for name in MOTOR_ALARMS if name in alarms}
             summary = await summary_of(sim)
         sent = summary["streams"]["drive-end"]["samples_sent"]
-        ring = service.rings["drive-end"]
         await eventually(lambda: ring.end_index == sent, "every sample has come")
+        await eventually(
+            lambda: all(alarms[name].level is Level.ALERT for name in MOTOR_ALARMS), "both alarms stand"
+        )
         counted = service.figures()["streams"]["drive-end"]
         received = ring.read(0, sent)[:, 0]
-    assert sent == 36_000
+    assert set(before.values()) <= {Level.NORMAL}
+    assert sent == 72_000
     assert (counted["samples_received"], counted["samples_lost"]) == (sent, 0)
-    played = BearingSignals(load_any_scenario(damage), 3.0, 7).of(machine.sensor("accel-de"), 12_000.0)
+    played = BearingSignals(load_any_scenario(damage), 6.0, 7).of(machine.sensor("accel-de"), 12_000.0)
     largest_g = 2**15 * 0.0005
     np.testing.assert_allclose(received, np.clip(played, -largest_g, largest_g), atol=0.00051)
 

@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from machine_files import MACHINES
 
+from daqsvc.settings import load_machine_file
 from daqsvc.settings.sensors import Accelerometer
 from sim_hw.link_faults import LinkFaults
-from sim_hw.scenario import ScenarioError, builtin_scenarios, load_scenario
+from sim_hw.scenario import ScenarioError, builtin_scenarios, load_any_scenario, load_scenario
 from sim_hw.scenario_bearing import BearingScenario, RaceDamage
 from sim_hw.sim_command_signals import BearingSignals
 
+SCENARIOS = MACHINES.parent / "scenarios"
 ACCELEROMETER = Accelerometer(name="a", stream="s", channel="c", type="accelerometer", unit="m/s2")
 PLANT = '[plant]\nkind = "rotor"\n'
 SHORT = f"""
@@ -185,3 +188,30 @@ def test_a_bearing_that_stays_healthy_and_one_whose_damage_lies_beyond_the_end()
     assert np.array_equal(spalled.rotor_m_s2[:onset], run.rotor_m_s2[:onset])
     assert not np.array_equal(spalled.rotor_m_s2[onset:], run.rotor_m_s2[onset:])
     assert len(BearingSignals(damaged, 0.3).of(ACCELEROMETER, 2000.0)) == onset, "played to before the damage"
+
+
+@pytest.mark.parametrize("seed", [1, 7])
+def test_the_example_of_a_damaged_bearing_fits_the_machine_file_that_it_names(seed):
+    """No alarm while the bearing is healthy; with the damage both, and nothing is clipped."""
+    file = SCENARIOS / "bearing-damage.toml"
+    scenario = load_any_scenario(file)
+    played = next(line for line in file.read_text().splitlines() if "daqsvc sim" in line).split()
+    assert played[-1] == "config/scenarios/bearing-damage.toml"
+    machine = load_machine_file(MACHINES.parents[1] / played[3])
+    sensor, stream = machine.sensor("accel-de"), machine.streams["drive-end"]
+    signal = BearingSignals(scenario, seed=seed).of(sensor, stream.rate_hz)
+    (channel,) = stream.layout.channels
+    assert np.abs(signal).max() < 0.1 * 2**15 * channel.scale
+    assert machine.pipeline.levels is not None
+    windows = signal.reshape(-1, round(machine.pipeline.levels.window_s * stream.rate_hz))
+    (damage,) = scenario.damage
+    healthy = round(damage.at_s / machine.pipeline.levels.window_s)
+    measured = {
+        "rms": np.sqrt(np.square(windows - windows.mean(axis=1, keepdims=True)).mean(axis=1)),
+        "peak": np.abs(windows - windows.mean(axis=1, keepdims=True)).max(axis=1),
+    }
+    assert sorted(alarm.measure for alarm in machine.alarms) == sorted(measured)
+    for alarm in machine.alarms:
+        of_measure = measured[alarm.measure]
+        assert of_measure[:healthy].max() < 0.9 * alarm.alert
+        assert of_measure[healthy:].min() > 1.05 * alarm.alert
