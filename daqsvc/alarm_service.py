@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import json
 import logging
 from collections import Counter
 from dataclasses import dataclass
@@ -27,9 +28,10 @@ from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
 from daqsvc.publish.payloads import alarm_payload
 from daqsvc.publish.restore import restore_alarms
+from daqsvc.publish.session import EarlierState
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.topics import Topics
-from daqsvc.self_check import SelfCheck, Vitals, conditions
+from daqsvc.self_check import JOURNAL, SelfCheck, Vitals, conditions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.handling import AlarmHandling
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.mqtt import MqttSettings
     from daqsvc.publish.sparkplug.settings import SparkplugSettings
     from daqsvc.self_check import BusHealth
@@ -120,12 +123,24 @@ class AlarmService:
         self.audit = AuditLog(store / "audit.jsonl", clock, limits.audit_max_bytes)
         self._refusals = Refusals(clock)
         self.commands = CommandCounters()
+        self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
+        self._witness = self.topics.alarm(identity.machine, JOURNAL)
+        """Every run that cannot write its disk tells the broker so, here."""
+        self._witness_known: int | None = None
+        """The last number on it that the journal knew at the start; None if it need not be compared."""
         self.publisher = (
             None
             if mqtt is None
-            else MqttPublisher(mqtt, identity.site, identity.box, self.outbox, clock, commands=self.execute)
+            else MqttPublisher(
+                mqtt,
+                identity.site,
+                identity.box,
+                self.outbox,
+                clock,
+                commands=self.execute,
+                earlier=EarlierState(self._witness, self._take_witness),
+            )
         )
-        self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
         self.sparkplug = (
             None
             if mqtt is None or sparkplug is None
@@ -171,15 +186,21 @@ class AlarmService:
         if self.outbox.counters.shut:
             latest = await self.outbox.glimpse()
             self._knows_journal, self._is_in_step = latest is not None, False
+            if latest is not None:
+                self._witness_known = self._last_on_witness(latest)
             told = await asyncio.to_thread(restore_alarms, latest or (), self.topics)
             self._take_over(told)
             if self._knows_journal and self.outbox.broker_is_ahead:
+                self._witness_known = None  # all of it is told anyway
                 self._confirm(self._tell_again(told))
             return
-        told = await asyncio.to_thread(restore_alarms, await self.outbox.latest(), self.topics)
+        latest = await self.outbox.latest()
+        self._witness_known = self._last_on_witness(latest)
+        told = await asyncio.to_thread(restore_alarms, latest, self.topics)
         self._take_over(told)
         self._damage_seen = self._damage()
         if self.outbox.broker_is_ahead:
+            self._witness_known = None
             self._confirm(self._tell_again(told))
         elif self._damage_seen:
             self._confirm(self._forget(told))
@@ -220,6 +241,33 @@ class AlarmService:
             *(self._submit(event) for event in again),
             *(self._post(event) for event in self.manager.begin_anew(told, UNJOURNALLED)),
         ]
+
+    def _last_on_witness(self, latest: Iterable[OutboxMessage]) -> int:
+        return max((message.sequence for message in latest if message.topic == self._witness), default=0)
+
+    def _take_witness(self, payload: bytes) -> None:
+        """See whether the broker was told of a run that the disk never heard of.
+
+        Such a run leaves nothing on the disk, but what it has said of the journal is retained at the broker.
+        """
+        try:
+            told = json.loads(payload)
+            number, series = int(told["sequence"]), str(told["id"])
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            logger.warning("what the broker keeps on %s cannot be read: %s", self._witness, error)
+            return
+        if self._witness_known is None or number <= self._witness_known:
+            return
+        if series.startswith(self.outbox.series):
+            return
+        logger.warning(
+            "the broker was told by an earlier run what the disk never got, so it is told of every alarm how "
+            "it stands"
+        )
+        for event in [*self._newest.values()]:
+            self._submit(event)
+        for event in self.manager.begin_anew([*self._newest.values()], UNJOURNALLED):
+            self._post(event)
 
     def _topic(self, event: AlarmEvent) -> str:
         alarm = (event.identity.machine, event.alarm)
@@ -440,7 +488,10 @@ class AlarmService:
             write_errors=outbox.write_errors,
             lost=outbox.refused + outbox.lost,
             unbacked=bool(outbox.shut or outbox.unbacked),
-            damaged=outbox.quarantined + outbox.vanished + outbox.telemetry.quarantined,
+            damaged=outbox.quarantined
+            + outbox.vanished
+            + outbox.telemetry.quarantined
+            + self.outbox.command_ids_lost,
             set_aside=self.outbox.has_set_aside,
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
 
 SCHEMA = "daqsvc.audit/1"
-MODE = 0o640
-"""Whoever reads the machine's logs may read this one; nobody but the service writes it."""
+MODE = 0o600
+"""As of the other files of a store: whoever else is to read it, is let by ``chmod g+r``."""
 QUOTA_BYTES = 32 * 1024 * 1024
 PARTS = 8
 """Files that make up the quota: the one that is written is at most one part of it."""

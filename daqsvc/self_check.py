@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 NS_PER_DAY = 86_400 * NS_PER_S
 MIB = 1024 * 1024
 
-STORE = ("store/disk", "store/journal", "store/damage", "store/telemetry", "store/audit-log")
+JOURNAL = "store/journal"
+STORE = ("store/disk", JOURNAL, "store/damage", "store/telemetry", "store/audit-log")
 """The conditions of the store."""
 
 BUS_OVERRUN = "bus-overrun/"
@@ -273,15 +274,15 @@ class SelfCheck:
         self._unwritable = vitals.unbacked or (vitals.waiting > 0 and (failed or self._unwritable))
         if self._lost.goes_on(vitals.lost, vitals.now_ns):
             sentence = f"{vitals.lost} alarm events are lost: the journal in {self._store} cannot be written"
-            return Condition("store/journal", Level.DANGER, sentence)
+            return Condition(JOURNAL, Level.DANGER, sentence)
         if self._unwritable:
             sentence = (
                 f"the journal in {self._store} cannot be written: delivery of alarms is not backed by the "
                 "disk, they go out from memory, and what the broker does not get before the process ends is "
                 "lost: make room on the disk"
             )
-            return Condition("store/journal", Level.ALERT, sentence)
-        return Condition("store/journal", Level.NORMAL, f"the journal in {self._store} takes what comes")
+            return Condition(JOURNAL, Level.ALERT, sentence)
+        return Condition(JOURNAL, Level.NORMAL, f"the journal in {self._store} takes what comes")
 
     def _damage(self, vitals: Vitals) -> Condition:
         if not self._damaged.goes_on(vitals.damaged, vitals.now_ns):

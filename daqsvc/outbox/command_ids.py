@@ -2,18 +2,20 @@
 
 A broker that has not seen our acknowledgement sends a command again, after a restart of the service too.
 Each id is a line of a small file, with a checksum; the file is written anew when it has grown to twice what
-is needed.
+is needed. It is there from the first start on, with one line at least. So a file that is missing, empty or
+has a damaged line has lost ids, and commands that were issued before the start are refused.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import zlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Literal
 
-from daqsvc.outbox.files import MODE, replace_durably, restrict, sync_directory
+from daqsvc.outbox.files import NEW_MODE, replace_durably, sync_directory
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,6 +25,11 @@ REMEMBERED = 4096
 
 _READ_AT_MOST = 4 * 1024 * 1024
 """Far more than twice so many lines have; of a longer file the end counts."""
+
+_HEAD = ("-", "-")
+"""What the first line names, so that a file without an id is not an empty one."""
+
+log = logging.getLogger(__name__)
 
 
 class CommandIds:
@@ -38,7 +45,48 @@ class CommandIds:
         self._path = path
         self._until_ns: OrderedDict[tuple[str, str], int] = OrderedDict()
         self._lines: int | None = None
+        self._lost_until_ns = 0
         self._one_at_a_time = threading.Lock()
+
+    def open(self, begun_ns: int, *, is_new: bool) -> bool:
+        """Read the file at the start of the service. Blocks.
+
+        If ids that were there are gone, nobody knows which commands have come: all that were issued before
+        this start are refused, see `is_from_before`.
+
+        Args:
+            begun_ns: the start, wall clock.
+            is_new: whether the store is new, so that there need not be a file.
+
+        Returns:
+            Whether ids that were there are gone.
+        """
+        with self._one_at_a_time:
+            try:
+                is_whole = self._read()
+                if is_whole is None and is_new:
+                    self._rewrite()
+            except OSError as error:
+                log.warning("the ids of commands in %s cannot be read or written: %s", self._path, error)
+                is_whole = None
+            lost = not is_whole and not (is_whole is None and is_new)
+            if not lost:
+                return False
+            self._lost_until_ns = begun_ns
+            log.error(
+                "the list of commands that have come, %s, is missing or damaged: commands that were issued "
+                "before this start are refused, for they may have been obeyed already",
+                self._path,
+            )
+            try:
+                self._rewrite()
+            except OSError as error:
+                log.warning("the ids of commands in %s cannot be written: %s", self._path, error)
+            return True
+
+    def is_from_before(self, issued_ns: int) -> bool:
+        """Whether a command of that time may have come before, with its id lost; wall clock."""
+        return issued_ns <= self._lost_until_ns
 
     def remember(
         self, machine: str, identifier: str, *, until_ns: int, now_ns: int
@@ -63,8 +111,8 @@ class CommandIds:
     def _remember(
         self, machine: str, identifier: str, until_ns: int, now_ns: int
     ) -> Literal["new", "known", "full"]:
-        if self._lines is None:
-            self._read()
+        if self._lines is None and self._read() is None:
+            self._lines = 0
         key = machine, identifier
         if self._until_ns.get(key, now_ns) > now_ns:
             return "known"
@@ -84,30 +132,34 @@ class CommandIds:
             del self._until_ns[key]
         return bool(old)
 
-    def _read(self) -> None:
+    def _read(self) -> bool | None:
+        """Read the file; whether it tells all that it was given, None if it is not there."""
         try:
             handle = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         except FileNotFoundError:
-            self._lines = 0
-            return
+            return None
         with os.fdopen(handle, "rb") as file:
             file.seek(max(os.fstat(handle).st_size - _READ_AT_MOST, 0))
             lines = file.read(_READ_AT_MOST).split(b"\n")
         self._until_ns.clear()
+        is_whole = any(lines)
         for line in lines:
             found = _parsed(line)
-            if found is not None:
+            if found is None:
+                is_whole &= not line
+            elif found[0] != _HEAD:
                 key, until_ns = found
                 self._until_ns[key] = until_ns
                 self._until_ns.move_to_end(key)
         while len(self._until_ns) > REMEMBERED:
             self._until_ns.popitem(last=False)
         self._lines = len(lines)
+        return is_whole
 
     def _append(self, line: bytes) -> None:
         is_new = self._lines == 0
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-        handle = os.open(self._path, flags, MODE)
+        handle = os.open(self._path, flags, NEW_MODE)
         try:
             # A line that a full disk has cut ends where the next one begins.
             written = os.write(handle, b"\n" + line)
@@ -117,13 +169,13 @@ class CommandIds:
         finally:
             os.close(handle)
         if is_new:
-            restrict(self._path)
             sync_directory(self._path.parent)
         self._lines = (self._lines or 0) + 1
 
     def _rewrite(self) -> None:
-        replace_durably(self._path, b"\n".join(_line(key, until) for key, until in self._until_ns.items()))
-        self._lines = len(self._until_ns)
+        lines = [_line(_HEAD, 0), *(_line(key, until) for key, until in self._until_ns.items())]
+        replace_durably(self._path, b"\n".join(lines))
+        self._lines = len(lines)
 
 
 def _line(key: tuple[str, str], until_ns: int) -> bytes:

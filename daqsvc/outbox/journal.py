@@ -29,7 +29,7 @@ from daqsvc.outbox.log_copy import LogCopy
 from daqsvc.outbox.messages import OutboxAwayError, OutboxError, OutboxMessage, checksum, is_sound
 from daqsvc.outbox.reading import opened_to_read
 from daqsvc.outbox.renewal import Damage, Renewal
-from daqsvc.outbox.safety import refuse_link, refuse_unsafe
+from daqsvc.outbox.safety import refuse_link, refuse_unsafe, restrict_files
 from daqsvc.outbox.salvage import LARGEST, readable
 from daqsvc.outbox.sequence import SequenceMark, place_of
 from daqsvc.outbox.tables import (
@@ -182,6 +182,7 @@ class Journal:
         try:
             make_directory(self.path.parent)
             refuse_unsafe(self.path.parent)
+            restrict_files(self.path.parent)
             self._lock = take_possession(self.path.with_name(self.path.name + ".lock"))
         except OSError as error:
             raise self._unusable(error) from error
@@ -494,7 +495,8 @@ class Journal:
         """Begin with numbers though the journal cannot be opened."""
         if self._lock is None:
             raise OutboxError(f"outbox {self.path} is not open; call open() first")
-        self._next = self._mark.first_unread(self._wall_ns())
+        is_new = not self.path.exists() or not self.path.stat().st_size
+        self._next = self._mark.first_unread(self._wall_ns(), is_new=is_new)
         self._mark.begin(self._next)
 
     def acknowledge(self, numbers: Iterable[int]) -> Acknowledged:

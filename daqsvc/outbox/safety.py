@@ -11,10 +11,14 @@ import pwd
 import stat
 from pathlib import Path
 
+from daqsvc.outbox.files import restrict
 from daqsvc.outbox.messages import OutboxError
 
 JOURNAL, BESIDE = "outbox", ("audit.jsonl", "control.sock")
 """How the names of the files begin that nobody else may have put there."""
+
+_OURS = (JOURNAL, "audit", "command-ids", "sparkplug.", "mqtt-", "home-assistant")
+"""How the names of the files of a store begin."""
 
 _MOST_LINKS = 40
 """Symbolic links in one path, as the kernel has it."""
@@ -36,6 +40,17 @@ def refuse_unsafe(store: Path) -> None:
             refuse_link(path)
         elif path.name.startswith(BESIDE) and (owner := path.lstat().st_uid) not in _trusted():
             raise OutboxError(_belongs(f"{path}", owner, path))
+
+
+def restrict_files(store: Path) -> None:
+    """Take from the files of a store what they allow to others than their owner and group.
+
+    Raises:
+        OSError: it cannot be looked at.
+    """
+    for path in store.iterdir():
+        if path.name.startswith(_OURS):
+            restrict(path)
 
 
 def refuse_link(path: Path) -> None:

@@ -15,9 +15,10 @@ They are written one after the other, in place, so that a torn or a damaged one 
 disk stops neither. A disk that takes no writes at all stops both: then numbers may be given up to
 `UNRECORDED` above the ceiling, for messages in memory.
 
-Numbers go on without a gap after a proper end. After any other end they go on above all of these and above
-the wall clock in ms; above the wall clock as well after another boot, in a copy, or for a new file; and far
-ahead when a side file is damaged or missing.
+Every run begins above all of these and above the wall clock in ms, also one that can write nothing: a run
+gives far fewer than a thousand numbers a second, so the next one begins above it though no disk knows of it.
+After an end that was not a proper one some more are skipped if the clock is not ahead of them; and a run
+begins far ahead when a side file is damaged or missing.
 """
 
 from __future__ import annotations
@@ -43,8 +44,11 @@ LEAP = 10_000_000
 """How far numbers jump where nobody knows any more what was used: hours of the worst flood of alarms."""
 
 UNRECORDED = 10_000_000
-"""Numbers above the ceiling that may be given while no side file can be written; an end that was not a proper
-one skips them, used or not."""
+"""Numbers above the ceiling that may be given while no side file can be written. A run whose wall clock is so
+far behind that it is not set skips them after an end that was not a proper one, used or not."""
+
+MARGIN = 10_000
+"""Numbers that a run may be ahead of the wall clock with none of them recorded: so many come in a burst."""
 
 UNKNOWN_BOOT = "-"
 
@@ -89,7 +93,9 @@ class SequenceMark:
         self._here = _NOTHING
         self._damaged = False
         self._ended = False
-        self._skipped = 0
+        self._is_unsure = False
+        self._is_copy = False
+        self._has_begun = False
         self._first = 0
         self._noted = True
 
@@ -122,7 +128,9 @@ class SequenceMark:
             ahead=any(told.ahead for told in sound),
         )
         self._ended = not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
-        self._skipped = UNRECORDED if self._told.ceiling and not self._told.ended else 0
+        self._is_unsure = bool(self._told.ceiling) and not self._told.ended
+        self._is_copy = bool(self._told.place) and self._told.place != place
+        self._has_begun = False
 
     @property
     def ended(self) -> bool:
@@ -151,25 +159,34 @@ class SequenceMark:
             stored: the highest number that the journal knows; None for a new file.
             wall_ns: the wall clock, ns since the Unix epoch.
         """
-        known = max(stored or 0, self._told.ceiling, self._told.used) + self._skipped
-        clock = max(known, wall_ns // NS_PER_MS)
+        known = max(stored or 0, self._told.ceiling, self._told.used)
+        wall_ms = wall_ns // NS_PER_MS
         if self._damaged or (stored is not None and not self._told.ceiling):
-            return clock + LEAP + 1
-        is_same = (self._told.boot, self._told.place) == (self._here.boot, self._here.place)
-        if stored is None or not is_same or self._skipped or self._here.boot == UNKNOWN_BOOT:
-            return clock + 1
-        return known + 1
+            return max(known, wall_ms) + LEAP + 1
+        if stored is not None and self._has_begun:
+            return known + 1
+        if _is_unset(wall_ms, known):
+            known += UNRECORDED if self._is_unsure or self._is_copy else 0
+        elif self._is_unsure:
+            known += 2 * MARGIN  # twice: a run that could not be recorded may have begun above the first
+        return max(known, wall_ms) + 1
 
-    def first_unread(self, wall_ns: int) -> int:
+    def first_unread(self, wall_ns: int, *, is_new: bool) -> int:
         """The number to begin with while the journal cannot be read, above whatever that may hold.
 
         Args:
             wall_ns: the wall clock, ns since the Unix epoch.
+            is_new: whether there is no journal yet.
         """
         known = max(self._told.ceiling, self._told.used)
-        if self._damaged or not known:
-            return max(known, wall_ns // NS_PER_MS) + LEAP + 1
-        return max(known + UNRECORDED, wall_ns // NS_PER_MS) + 1
+        wall_ms = wall_ns // NS_PER_MS
+        if self._damaged or not (known or is_new):
+            return max(known, wall_ms) + LEAP + 1
+        if _is_unset(wall_ms, known):
+            known += UNRECORDED
+        elif self._is_unsure:
+            known += MARGIN
+        return max(known, wall_ms) + 1
 
     def vanished(self, stored: int | None) -> int:
         """How many messages the journal knew and does not know any more, at least.
@@ -189,7 +206,8 @@ class SequenceMark:
             waiting: the first number of those that wait in memory; None if none do.
         """
         self._first = first if waiting is None else min(first, waiting)
-        self._skipped = 0
+        self._is_unsure = self._is_copy = False
+        self._has_begun = True
         here = self._here
         ceiling = max(self._told.ceiling, first - 1)
         self._told = replace(self._told, ceiling=ceiling, boot=here.boot, place=here.place, ended=False)
@@ -281,6 +299,11 @@ class SequenceMark:
         for failure in errors:
             log.warning("one of the outbox marks %s cannot be written: %s", self._sides[0].path, failure)
         self._told = told
+
+
+def _is_unset(wall_ms: int, known: int) -> bool:
+    """Whether the wall clock is so far behind the numbers that it can tell nothing of them."""
+    return wall_ms <= known - UNRECORDED
 
 
 class _Side:

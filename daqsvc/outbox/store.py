@@ -68,12 +68,15 @@ class Outbox:
     Attributes:
         counters: what was done so far.
         series: what the ids of new messages begin with (see `outbox.messages.event_id`).
+        command_ids_lost: whether ids of commands that had come were gone at the start.
     """
 
     def __init__(self, path: Path, clock: Clock, limits: OutboxLimits | None = None) -> None:
         self.series = new_series()
         self.counters = OutboxCounters()
         self.directory = path.parent
+        self.command_ids_lost = False
+        self._clock = clock
         self.command_ids = CommandIds(path.with_name("command-ids"))
         self.dead_letters = DeadLetters(path.with_name(f"{path.stem}-refused{path.suffix}"), clock.wall_ns)
         self._limits = OutboxLimits() if limits is None else limits
@@ -104,8 +107,11 @@ class Outbox:
         Raises:
             OutboxError: the directory or the alarms' file cannot be used, and that will not pass by itself.
         """
+        is_new = not self._journal.path.exists()
+        begun_ns = self._clock.wall_ns()
         opened, self._ended = self._writer.start()
         unsent = await opened
+        self.command_ids_lost = await asyncio.to_thread(self.command_ids.open, begun_ns, is_new=is_new)
         if unsent is None:
             self.counters.shut = 1
         else:

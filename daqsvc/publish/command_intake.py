@@ -61,7 +61,7 @@ class IntakeCounters:
         malformed: too large, not JSON, not a command of a known version, or on a topic without a verb.
         unauthorised: for a machine or a verb that the machine file does not allow.
         stale: too old, from the future, retained at the broker, here for the second time, or so many that
-            a second time could not be told.
+            a second time could not be told; or from before a start that found the ids of commands lost.
         unwritten: refused because their id could not be written down.
         unanswered: answers that the broker did not take.
     """
@@ -243,6 +243,12 @@ class CommandIntake:
 
     async def _check_new(self, machine: str, told: CommandPayload) -> None:
         """Write down that this command has come; before it is obeyed, for afterwards may be too late."""
+        if self._ids.is_from_before(round(told.issued_at.timestamp() * NS_PER_S)):
+            self.counters.stale += 1
+            raise CommandRefusedError(
+                "it was issued before the service started, and the list of commands that had come by then is "
+                "lost, so it might be obeyed twice: look at the alarm, and ask again with a new id"
+            )
         too_old_s = told.issued_at.timestamp() + self._settings.max_age_s
         try:
             known = await asyncio.to_thread(

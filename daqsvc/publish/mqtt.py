@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.credentials import Credentials
+    from daqsvc.publish.session import EarlierState
 
 __all__ = ["MqttPublisher", "MqttSettings", "PublishCounters"]
 
@@ -85,6 +86,7 @@ class MqttPublisher:
         outbox: what must reach the broker; open while `run` runs.
         clock: for the time in what the publisher itself says, and the age of commands and telemetry.
         commands: carries out the commands that `MqttSettings.commands` allows; None takes none.
+        earlier: a state of an earlier run that the broker is asked for before anything is delivered.
     """
 
     def __init__(
@@ -96,12 +98,14 @@ class MqttPublisher:
         clock: Clock,
         *,
         commands: CommandHandler | None = None,
+        earlier: EarlierState | None = None,
     ) -> None:
         self.counters = PublishCounters()
         self.topics = Topics(settings.topic_root, site, box)
         self._settings = settings
         self._outbox = outbox
         self._clock = clock
+        self._earlier = earlier
         self._intake: CommandIntake | None = None
         if settings.commands is not None and commands is not None:
             self._intake = CommandIntake(settings.commands, self.topics, commands, clock, outbox.command_ids)
@@ -379,6 +383,7 @@ class MqttPublisher:
             told=self._told,
             ends_soon=self._ends_soon,
             stopping=self._stopping,
+            earlier=self._earlier,
         )
         loop = asyncio.get_running_loop()
         since_s = loop.time()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.credentials import read_credentials, stamp_of
 from daqsvc.publish.delivery import Delivery
 from daqsvc.publish.errors import MqttError, PublishRefusedError
+from daqsvc.publish.stopping import unless
 from daqsvc.publish.telemetry_delivery import TelemetryDelivery
 
 if TYPE_CHECKING:
@@ -36,8 +38,28 @@ LOOK_S = 10.0
 LOOK_AGAIN_S = 86_400.0
 """After so long a connection is made anew to see the broker's certificate, if the one it showed ends soon."""
 
+EARLIER_S = 3.0
+"""How long delivery waits for the broker to say what it has kept of an earlier run."""
+
 ANSWER_EXPIRY_S = 60.0
 """How long the answer to a command is of use."""
+
+
+@dataclass(slots=True)
+class EarlierState:
+    """A state of an earlier run, to be asked for once.
+
+    Attributes:
+        topic: where it is retained, if it is.
+        take: takes its payload.
+        is_asked: whether the broker was asked.
+        is_told: whether it has answered.
+    """
+
+    topic: str
+    take: Callable[[bytes], None]
+    is_asked: bool = False
+    is_told: bool = False
 
 
 class CredentialsReplacedError(Exception):
@@ -61,6 +83,7 @@ class Session:
         told: what it was told before.
         ends_soon: whether the certificate that the broker has shown, or the one behind it, ends soon.
         stopping: ends the deliveries as soon as nothing is left.
+        earlier: what to ask the broker for before anything is delivered; None for nothing.
     """
 
     def __init__(
@@ -79,6 +102,7 @@ class Session:
         told: ToldTopics,
         ends_soon: Callable[[], bool],
         stopping: asyncio.Event,
+        earlier: EarlierState | None = None,
     ) -> None:
         self._connection = connection
         self._credentials = credentials
@@ -93,6 +117,7 @@ class Session:
         self._told = told
         self._ends_soon = ends_soon
         self._stopping = stopping
+        self._earlier = earlier
         self._said_refused: set[str] = set()
 
     async def run(self, left_s: Callable[[], float]) -> None:
@@ -105,6 +130,7 @@ class Session:
             MqttError: the connection is lost.
             CredentialsReplacedError: make a new connection.
         """
+        await unless(self._stopping, self._ask_for_earlier())
         alarms = Delivery(
             self._outbox,
             self._connection,
@@ -133,6 +159,29 @@ class Session:
             for task in deliveries | others:
                 task.cancel()
             await asyncio.gather(*deliveries, *others, return_exceptions=True)
+
+    async def _ask_for_earlier(self) -> None:
+        """Have the broker send what it has kept of an earlier run, before this one takes its place.
+
+        Once for each run of the service: a broker that answers by silence or by ending the connection must
+        not hold up the alarms for ever.
+        """
+        if self._earlier is None or self._earlier.is_asked:
+            return
+        self._earlier.is_asked = True
+        try:
+            async with asyncio.timeout(EARLIER_S):
+                refused = await self._connection.watch(self._earlier.topic)
+        except TimeoutError:
+            refused = [self._earlier.topic]
+        if refused:
+            log.info(
+                "MQTT broker %s:%d does not say what it keeps on %s: if an earlier run could not write its "
+                "disk, the broker may go on showing its states",
+                self._settings.host,
+                self._settings.port,
+                self._earlier.topic,
+            )
 
     async def _until_stopped(
         self, deliveries: set[asyncio.Task[None]], others: set[asyncio.Task[Any]]
@@ -246,6 +295,11 @@ class Session:
 
     async def _take(self, message: Incoming) -> None:
         if self._home_assistant is not None and self._home_assistant.take(message):
+            return
+        if self._earlier is not None and message.topic == self._earlier.topic:
+            if message.retain and not self._earlier.is_told:
+                self._earlier.is_told = True
+                self._earlier.take(message.payload)
             return
         if self._topics.command_of(message.topic) is None or self._intake is None:
             # Brokers send what was never subscribed to: from a session of long ago, or out of malice.

@@ -9,6 +9,8 @@ import stat
 import pytest
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.audit import AuditLog
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.store import Outbox
 
@@ -37,6 +39,10 @@ async def use(path):
     await outbox.append(TOPIC, lambda _: b"{}", retain=True)
     outbox.telemetry("daqsvc/lab/edge-1/status", b"{}", expiry_s=60.0)
     await outbox.append(TOPIC, lambda _: b"{}", retain=True)
+    outbox.command_ids.remember("rig", "a", until_ns=10**18, now_ns=0)
+    await AuditLog(path.parent / "audit.jsonl", SystemClock()).asked(
+        AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="rotor-fault", by="jk"), "test"
+    )
     found = modes(path.parent)
     await outbox.close()
     return found
@@ -44,12 +50,20 @@ async def use(path):
 
 async def test_nobody_else_reads_a_file_of_the_store(tmp_path, umask):
     found = await use(tmp_path / "outbox.sqlite")
-    assert {"outbox.sqlite", "outbox.sqlite-wal", "outbox.sqlite.sequence"} <= set(found)
+    assert {
+        "outbox.sqlite",
+        "outbox.sqlite-wal",
+        "outbox.sqlite.sequence",
+        "audit.jsonl",
+        "command-ids",
+    } <= set(found)
     assert set(found.values()) == {0o600}
 
 
 async def test_files_that_an_earlier_version_left_open_are_closed_to_others(tmp_path):
     await use(tmp_path / "outbox.sqlite")
+    (tmp_path / "audit-000001.jsonl").write_text("")
+    (tmp_path / "mqtt-version.json").write_text("{}")
     for path in tmp_path.iterdir():
         path.chmod(0o644)
     assert set((await use(tmp_path / "outbox.sqlite")).values()) == {0o640}

@@ -335,3 +335,48 @@ async def test_after_kill_minus_nine_on_a_full_disk_the_broker_shows_the_truth_a
         each_id_means_one_event(consumer.on("rig/"))
         async with desk_at(store, mosquitto.port) as desk:
             assert not desk.outbox.broker_is_ahead
+
+
+async def test_a_run_that_the_disk_never_heard_of_leaves_nothing_false_at_the_broker(disk, tmp_path):
+    """It ends in order, or is killed; nothing on the disk says that it was, but the broker remembers."""
+    store = disk.directory / "store"
+    with running_mosquitto(tmp_path) as mosquitto:
+        port = mosquitto.port
+        async with desk_at(store, port) as desk:
+            find(desk, "rotor-fault", "danger")
+            desk.tick()
+            await eventually(lambda: desk.outbox.counters.depth == 0, "the broker has it")
+        disk.refuse_writes()
+        async with desk_at(store, port) as desk, Consumer(port) as consumer:
+            find(desk, "bearing-fault", "danger")
+            await eventually(lambda: desk.outbox.counters.unbacked, "it is not backed")
+            desk.tick()
+            await eventually(lambda: consumer.on("store/journal"), "that is said")
+            await eventually(lambda: consumer.on("bearing-fault"), "and so is the fault")
+        disk.take_writes()
+        async with Consumer(port) as consumer:
+            await eventually(lambda: len(consumer.on("/alarms/")) == 3, "all that is retained")
+            assert states(consumer.on("/alarms/"))["store/journal"][0].startswith("active")
+            before = {m.topic: m.payload["sequence"] for m in consumer.on("/alarms/")}
+            async with desk_at(store, port) as desk:
+                for _ in range(3):
+                    desk.tick()
+                    await asyncio.sleep(0.1)
+                await eventually(
+                    lambda: states(consumer.on("/alarms/"))["store/journal"][0] == "normal",
+                    "it is true again",
+                )
+                await eventually(
+                    lambda: states(consumer.on("/alarms/"))["bearing-fault"][0] == "normal", "and all others"
+                )
+                await eventually(lambda: desk.outbox.counters.depth == 0, "all is told")
+        for topic, number in before.items():
+            told = [m.payload["sequence"] for m in consumer.on(topic)]
+            assert max(told) > number, "a consumer that drops what is not newer hears of it"
+        assert states(consumer.on("/alarms/"))["rotor-fault"][1] == "danger", "as the journal has it"
+        # It is told once.
+        async with desk_at(store, port) as desk:
+            used = desk.outbox._books.last_sequence
+            desk.tick()
+            await asyncio.sleep(0.5)
+            assert desk.outbox._books.last_sequence == used

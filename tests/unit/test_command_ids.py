@@ -23,7 +23,7 @@ def test_an_id_is_known_until_it_is_too_old_and_after_every_restart(tmp_path):
     assert remember(ids, "a") == "known"
     assert remember(ids, "a", machine="pump") == "new"
     assert remember(ids, "a", now_ns=LATER, until_ns=LATER + 1) == "new"
-    assert path.stat().st_mode & 0o777 == 0o640
+    assert path.stat().st_mode & 0o777 == 0o600
 
 
 def test_the_file_stays_small_and_forgets_nothing_that_could_come_again(tmp_path, monkeypatch):
@@ -64,6 +64,55 @@ def test_of_a_damaged_file_every_whole_line_counts(tmp_path):
         ids = CommandIds(path)
         for number, line in enumerate(line for line in whole.split(b"\n") if line):
             assert remember(ids, f"n{number}") == ("known" if line in lines else "new")
+
+
+def opened(path, begun_ns=NOW, *, is_new=False):
+    ids = CommandIds(path)
+    return ids, ids.open(begun_ns, is_new=is_new)
+
+
+def test_a_file_that_is_as_it_was_left_refuses_nothing(tmp_path):
+    path = tmp_path / "ids"
+    ids, lost = opened(path, is_new=True)
+    assert not lost
+    assert path.stat().st_size, "it is there before the first command, so that its loss can be told"
+    for _ in range(2):
+        ids, lost = opened(path)
+        assert not lost
+        assert not ids.is_from_before(1)
+    assert remember(ids, "a") == "new"
+    ids, lost = opened(path)
+    assert not lost
+    assert remember(ids, "a") == "known"
+
+
+@pytest.mark.parametrize("damage", ["deleted", "emptied", "overwritten", "cut", "a flipped bit"])
+def test_what_was_issued_before_a_start_without_the_ids_is_refused(tmp_path, damage, caplog):
+    path = tmp_path / "ids"
+    ids, _ = opened(path, is_new=True)
+    for name in ("first", "second"):
+        assert remember(ids, name) == "new"
+    whole = path.read_bytes()
+    spoilt = {
+        "emptied": b"",
+        "overwritten": b"\xff" * len(whole),
+        "cut": whole[:-3],
+        "a flipped bit": whole.replace(b"second", b"sacond"),
+    }
+    if damage == "deleted":
+        path.unlink()
+    else:
+        path.write_bytes(spoilt[damage])
+    begun_ns = NOW + 5 * 10**9
+    ids, lost = opened(path, begun_ns)
+    assert lost
+    assert "is missing or damaged" in caplog.text
+    assert ids.is_from_before(NOW)
+    assert not ids.is_from_before(begun_ns + 1)
+    assert remember(ids, "third") == "new"
+    ids, lost = opened(path, begun_ns)
+    assert not lost, "it is told once"
+    assert remember(ids, "third") == "known"
 
 
 @pytest.mark.parametrize("what", ["directory", "link"])

@@ -150,7 +150,7 @@ async def test_the_log_stays_within_its_quota_and_loses_the_oldest_first(tmp_pat
     assert 0 < numbers[0] < 400 - len(numbers) + 1
     assert len(numbers) * 350 > QUOTA / 2, "little of the quota is of use"
     assert foreign.read_text() == "of logrotate"
-    assert {stat.S_IMODE(one.stat().st_mode) for one in older_parts(log.path).values()} == {0o640}
+    assert {stat.S_IMODE(one.stat().st_mode) for one in older_parts(log.path).values()} == {0o600}
 
 
 async def test_a_log_that_was_never_parted_does_not_vanish_at_once(tmp_path: Path) -> None:

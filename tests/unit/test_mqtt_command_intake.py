@@ -382,3 +382,26 @@ async def test_whatever_comes_there_is_an_answer(payload):
         response, _ = await answer(make(desk, Path(store)), payload=payload)
     assert len(desk.asked) == response.accepted
     assert response.accepted or response.reason
+
+
+@pytest.mark.parametrize("damage", ["", None, "spoilt"])
+async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_path, damage):
+    clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
+    ids = CommandIds(tmp_path / "command-ids")
+    assert not ids.open(clock.wall_ns(), is_new=True)
+    response, _ = await answer(CommandIntake(SETTINGS, TOPICS, desk, clock, ids))
+    assert response.accepted
+    if damage is None:
+        (tmp_path / "command-ids").unlink()
+    else:
+        (tmp_path / "command-ids").write_text(damage)
+    clock = DrivenClock(wall_start_ns=round(NOW.timestamp() + 10) * 10**9)
+    ids = CommandIds(tmp_path / "command-ids")
+    assert ids.open(clock.wall_ns(), is_new=False)
+    again = CommandIntake(SETTINGS, TOPICS, desk, clock, ids)
+    response, _ = await answer(again)
+    assert not response.accepted
+    assert "before the service started" in response.reason
+    assert len(desk.asked) == 1
+    response, _ = await answer(again, id="c2", issued_at=(NOW + timedelta(seconds=11)).isoformat())
+    assert response.accepted

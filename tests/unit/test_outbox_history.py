@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import itertools
 import os
 import shutil
 import sqlite3
@@ -13,11 +15,12 @@ import pytest
 from journal_commits import commit
 
 from daqsvc.outbox import files, sequence
+from daqsvc.outbox import journal as journal_module
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import ASIDE_KEPT, free_bytes
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
 from daqsvc.outbox.limits import MIB, NS_PER_DAY, OutboxLimits
-from daqsvc.outbox.messages import Draft
+from daqsvc.outbox.messages import Draft, OutboxAwayError
 
 SIZE = 1000
 
@@ -197,7 +200,7 @@ def test_a_log_that_is_lost_brings_no_number_back(tmp_path, wall, monkeypatch, b
         monkeypatch.setattr(sequence, "boot_id", lambda: "another-boot")
     journal = opened(crashed / "outbox.sqlite", wall)
     [after] = append(journal, 1)
-    assert last < after <= last + 1 + sequence.STEP + sequence.UNRECORDED
+    assert last < after <= last + 1 + sequence.STEP + 2 * sequence.MARGIN
     assert journal.vanished == 5
     journal.close()
 
@@ -234,7 +237,7 @@ def test_a_side_file_of_an_earlier_version_is_understood(tmp_path, wall, caplog,
     told = f"{last if ended else last + 500:020d} {last:020d} {sequence.boot_id()}"
     mark.write_text(f"{told} {zlib.crc32(told.encode()):08x}\n")
     journal = opened(path, wall)
-    assert append(journal, 1) == [last + 1 if ended else last + 501 + sequence.UNRECORDED]
+    assert append(journal, 1) == [last + 1 if ended else last + 501 + 2 * sequence.MARGIN]
     assert "damaged" not in caplog.text
     journal.close()
 
@@ -271,6 +274,75 @@ def test_a_system_without_boot_identity_is_taken_for_a_new_boot_each_time(tmp_pa
     assert last + 1 < after <= last + 1 + sequence.STEP + sequence.UNRECORDED
     again.close()
     journal.close()
+
+
+def run_on_a_disk_that_takes_no_writes(path, wall, monkeypatch, count):
+    """The numbers that such a run gives to messages in memory; it leaves no trace."""
+
+    def refuse(*_arguments, **_options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patches:
+        for module, name in (
+            (journal_module, "connect"),
+            (sequence, "overwrite_durably"),
+            (sequence, "replace_durably"),
+        ):
+            patches.setattr(module, name, refuse)
+        patches.setattr(sequence._Side, "note", refuse)
+        journal = Journal(path, wall, OutboxLimits(ballast_bytes=0))
+        with pytest.raises(OutboxAwayError):
+            journal.open()
+        told = [journal.number([Draft("t", lambda _: b"x", retain=True)])[0].sequence for _ in range(count)]
+        journal.close()
+    return told
+
+
+@pytest.mark.parametrize("runs", list(itertools.product(["in order", "killed", "read-only"], repeat=3)))
+def test_numbers_rise_over_runs_that_the_disk_never_heard_of(tmp_path, wall, monkeypatch, runs):
+    path = tmp_path / "outbox.sqlite"
+    last = 0
+    killed = []
+    for number, how in enumerate(runs):
+        wall.ns += 60 * 10**9
+        if how == "read-only":
+            told = run_on_a_disk_that_takes_no_writes(path, wall, monkeypatch, 50)
+        else:
+            journal = opened(path, wall)
+            told = append(journal, 50)
+            if how == "killed":
+                journal._lock.close()
+                killed.append(journal)
+            else:
+                journal.close()
+        assert told[0] > last, f"run {number} of {runs}"
+        assert told == sorted(set(told))
+        last = told[-1]
+        # Not a lead that a run without a disk could fall behind of.
+        assert last < wall.ns // files.NS_PER_MS + 1000
+    for journal in killed:
+        journal.close()
+
+
+def test_kills_in_quick_succession_bring_no_number_back(tmp_path, wall, monkeypatch):
+    """The numbers are ahead of the clock then; the clock has overtaken them after a while."""
+    path, last, killed = tmp_path / "outbox.sqlite", 0, []
+    for _ in range(4):
+        wall.ns += 10**9
+        journal = opened(path, wall)
+        told = append(journal, 20)
+        assert told[0] > last
+        last = told[-1]
+        journal._lock.close()
+        killed.append(journal)
+    wall.ns += 10**9
+    unread = run_on_a_disk_that_takes_no_writes(path, wall, monkeypatch, 20)
+    assert unread[0] > last
+    journal = opened(path, wall)
+    [after] = append(journal, 1)
+    assert unread[-1] < after < wall.ns // files.NS_PER_MS + 20 * sequence.MARGIN
+    for one in (journal, *killed):
+        one.close()
 
 
 def test_only_so_many_corrupt_files_are_kept(tmp_path, wall):
