@@ -32,6 +32,11 @@ if TYPE_CHECKING:
 CHANGES_NS = 5 * NS_PER_S
 """Whoever doubts a sensor may have another reason each time: that is told no more often than this."""
 
+FINDINGS = frozenset(
+    {EventKind.RAISED, EventKind.ESCALATED, EventKind.LOWERED, EventKind.CHANGED, EventKind.RECURRED}
+)
+"""Events whose message says what is found."""
+
 
 class Alarm:
     """The memory of one alarm. Every method that changes something returns the events that say so.
@@ -56,6 +61,10 @@ class Alarm:
         self.name = name
         self.doubts: tuple[Doubt, ...] = ()
         self._told_doubts: tuple[Doubt, ...] = ()
+        self._seen_doubts: tuple[Doubt, ...] = ()
+        """Those of the last event, or of a change since that a person could not tell from it."""
+        self._told_finding = ""
+        """The message by which the finding that stands was told; empty if nobody knows."""
         self._identity = identity
         self._latching = latching
         self._new_occurrence = new_occurrence
@@ -105,7 +114,9 @@ class Alarm:
         """Whether ``hold`` covers the state."""
         return bool(self._holds) and hold in self._holds
 
-    def resume(self, told: AlarmEvent, found: str, since: ClockReading, now: ClockReading) -> None:
+    def resume(
+        self, told: AlarmEvent, found: str, since: ClockReading, now: ClockReading, sentence: str = ""
+    ) -> None:
         """Stand as the last event before a restart said.
 
         Args:
@@ -114,6 +125,7 @@ class Alarm:
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
                 left of it at ``told`` is never exceeded.
+            sentence: what stood, in words, where ``told`` does not say it; empty if nobody knows.
         """
         self._state, self._level = told.own_state, told.to_level
         self._holds = {Hold(state) for state in told.holds}
@@ -122,7 +134,11 @@ class Alarm:
             self._shelved_until_ns = now.t_ns + max(left_ns, 0)
         self._occurrence = None if self._state is AlarmState.NORMAL else told.occurrence
         self._found, self._cause = found, told.cause
-        self.doubts = self._told_doubts = told.doubts
+        self.doubts = self._told_doubts = self._seen_doubts = told.doubts
+        if told.kind in FINDINGS:
+            self._told_finding = told.message
+        elif sentence:
+            self._told_finding = self._saying(told.to_level, sentence)
         self._chatter.resume(chattering=told.chattering)
         self._since, self._message = since, told.message
 
@@ -169,7 +185,7 @@ class Alarm:
             self._state.is_active
             and finding.level == self._level
             and finding.identity != self._found
-            and [doubt[:3] for doubt in self.doubts] == [doubt[:3] for doubt in self._told_doubts]
+            and [doubt[:3] for doubt in self.doubts] == [doubt[:3] for doubt in self._seen_doubts]
             and self._changed_ns is not None
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
         )
@@ -185,6 +201,7 @@ class Alarm:
             return []
         self._found = finding.identity
         message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"
+        self._told_finding = message
         return [self._event(EventKind.CHANGED, cause, HandlingRequest("", at), message)]
 
     def hold(self) -> None:
@@ -207,13 +224,22 @@ class Alarm:
         kind, level = self._worsening(finding)
         if kind is None:
             return None
+        message = self._saying(level, finding.sentence)
+        if kind is EventKind.CHANGED and message == self._told_finding:
+            # No person could tell it from what was said last; what is found goes with the next event.
+            self._found, self._seen_doubts = finding.identity, self.doubts
+            return None
+        self._told_finding = message
         if kind is EventKind.RAISED:
             self._occurrence = self._new_occurrence()
         self._found = finding.identity
         stimulus = Stimulus.ESCALATE if kind is EventKind.ESCALATED else Stimulus.RAISE
         state = transition(self._state, stimulus, latching=self._latching)
-        message = f"{self.name} {level.label}: {finding.sentence}"
         return self._change(kind, state, level, cause, HandlingRequest("", at), message)
+
+    def _saying(self, level: Level, sentence: str) -> str:
+        """The message of a finding that is not normal."""
+        return f"{self.name} {level.label}: {sentence}"
 
     def _worsening(self, finding: RuleFinding) -> tuple[EventKind | None, Level]:
         """What a finding that is not normal means here, and the level that it leads to."""
@@ -377,7 +403,8 @@ class Alarm:
         at = request.at
         if kind is EventKind.CHANGED:
             self._changed_ns = at.t_ns
-        self._since, self._message, self._told_doubts = at, message, self.doubts
+        self._since, self._message = at, message
+        self._told_doubts = self._seen_doubts = self.doubts
         until_ns = self._shelved_until_ns
         return AlarmEvent(
             identity=self._identity,

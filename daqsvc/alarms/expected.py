@@ -23,8 +23,8 @@ class Expected:
     def __init__(self, handling: AlarmHandling) -> None:
         self.conditions = set(handling_conditions(flood=handling.flood, start_up=handling.start_up))
         """Those of the service itself."""
-        self.quality: set[str] = set()
-        """Those that say whether a sensor can be judged."""
+        self.quality: dict[str, dict[str, Sequence[str]]] = {}
+        """Those that say whether a sensor can be judged: their detectors, with the sensors these rest on."""
 
     def take(self, active_detectors: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
         """Learn more of them.
@@ -33,15 +33,14 @@ class Expected:
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself.
         """
-        self.quality.update(
-            quality_alarm(detector, sensors) for detector, sensors in active_detectors.items()
-        )
+        for detector, sensors in active_detectors.items():
+            self.quality.setdefault(quality_alarm(detector, sensors), {})[detector] = sensors
         self.conditions.update(conditions)
 
     @property
     def names(self) -> set[str]:
         """All of them."""
-        return self.quality | self.conditions
+        return self.quality.keys() | self.conditions
 
 
 def handling_conditions(*, flood: object | None, start_up: object | None) -> list[str]:

@@ -25,7 +25,7 @@ from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
 from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
-from daqsvc.alarms.quality import PREFIXES, SensorHealth
+from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
 from daqsvc.alarms.shelving import ShelvingEnds
@@ -343,6 +343,8 @@ class AlarmManager:
                 yield expired
         for name, diagnosis in tuple(self._waiting.items()):
             yield from self._quality([name], diagnosis, now)
+        for name in self._doubts.give_up(now.t_ns):
+            yield from self._quality([name], self._unjudged(name, now), now)
         yield from self._stand(TRIP_MULTIPLY, *self._start_up.overrun(now.t_ns), now)
 
     def _await_end_of_shelving(self, alarm: Alarm) -> None:
@@ -411,7 +413,9 @@ class AlarmManager:
         elif ours and name in self._expected.quality:
             self._resume_unruled(event)
             doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
-            self._doubts.resume(doubts, self._clock.monotonic_ns(), event.found)
+            t_ns = self._clock.monotonic_ns()
+            self._doubts.resume(doubts, t_ns, event.found)
+            self._doubts.expect(name, self._expected.quality[name], t_ns)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
             self._resume_unruled(event)
             self._conditions.add(name)
@@ -429,7 +433,8 @@ class AlarmManager:
         self._resume_alarm(self._add(event.alarm, latching=False), event, event.found)
 
     def _resume_alarm(self, alarm: Alarm, event: AlarmEvent, found: str) -> None:
-        alarm.resume(event, found, self._since(event.wall_ns), self._now())
+        sentence = in_words(event.alarm, event.doubts) if event.doubts else ""
+        alarm.resume(event, found, self._since(event.wall_ns), self._now(), sentence)
         self._count(AlarmState.NORMAL, alarm.status.state)
         self._await_end_of_shelving(alarm)
 

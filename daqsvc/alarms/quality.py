@@ -13,7 +13,7 @@ from daqsvc.alarms.rules import RuleFinding
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.rules import Rule
@@ -42,6 +42,10 @@ MOST_LACKED = 0.1
 """A detector that lacked samples is good again when it lacks no larger share of them, ..."""
 GOOD_NS = 3 * NS_PER_S
 """... and has been able to judge for so long."""
+
+
+UNHEARD_NS = 30 * NS_PER_S
+"""After a restart a quality alarm waits so long, at most, for each detector of its sensor to speak."""
 
 
 class Touched(NamedTuple):
@@ -131,6 +135,9 @@ class SensorHealth:
         self._by_alarm: defaultdict[str, dict[str, Doubt]] = defaultdict(dict)
         # By sensor who blames it by name and why, the latest last; a sensor that nobody blames has no row.
         self._blamed: dict[str, dict[str, str]] = {}
+        # Who may have joined in before a restart and has not spoken since, and until when that counts.
+        self._unheard: set[str] = set()
+        self._unheard_until_ns = 0
         self._unsettled: dict[str, set[str]] = {}
         self._unsettled_by: defaultdict[str, set[str]] = defaultdict(set)
 
@@ -144,6 +151,7 @@ class SensorHealth:
         detector = diagnosis.detector
         name = quality_alarm(detector, diagnosis.sensors)
         before = self._forget(detector)
+        self._unheard.discard(detector)
         touched: set[str] = set() if before is None else _blames(before[1])
         if diagnosis.quality == "good" or diagnosis.partial:
             for alarm in self._unsettled_by.pop(detector, ()):
@@ -201,6 +209,35 @@ class SensorHealth:
             self._forget(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
 
+    def expect(self, name: str, speakers: Mapping[str, Sequence[str]], t_ns: int) -> None:
+        """Have the quality alarm ``name`` wait, after `resume`, for who may doubt its sensor, too.
+
+        Who joins in or leaves with nothing new to say makes no event, so the journal may not know of it.
+
+        Args:
+            name: of the alarm.
+            speakers: its detectors, with the sensors that they rest on.
+            t_ns: monotonic time now.
+        """
+        doubts = self.of(name)
+        if not doubts:
+            return
+        worst = _worst(doubts)
+        for detector in speakers.keys() - {doubt.detector for doubt in doubts}:
+            self._unheard.add(detector)
+            sensors = tuple(speakers[detector])
+            # That it has silenced alarms, too, is not assumed.
+            self._remember(name, worst._replace(detector=detector, not_ok=False, sensors=sensors))
+        self._unheard_until_ns = t_ns + UNHEARD_NS
+
+    def give_up(self, t_ns: int) -> list[str]:
+        """Wait no longer for who has not spoken since a restart; the quality alarms that this touches."""
+        if not self._unheard or t_ns < self._unheard_until_ns:
+            return []
+        forgotten = [self._forget(detector) for detector in sorted(self._unheard)]
+        self._unheard.clear()
+        return sorted({before[0] for before in forgotten if before is not None})
+
     def unsettle(self, rule: Rule) -> None:
         """Whoever found a sensor of ``rule`` not OK is gone; now its own detectors must find them good."""
         self._unsettled[rule.alarm] = set(rule.detectors)
@@ -209,20 +246,18 @@ class SensorHealth:
 
     def of(self, name: str) -> tuple[Doubt, ...]:
         """What is said against the subject of the quality alarm ``name``, by detector."""
-        return tuple(sorted(self._by_alarm.get(name, {}).values()))
+        doubts = self._by_alarm.get(name, {})
+        return tuple(sorted(doubt for detector, doubt in doubts.items() if detector not in self._unheard))
 
     def finding(self, name: str) -> RuleFinding:
         """What the quality alarm ``name`` is to say."""
-        subject, doubts = name.partition("/")[2], self.of(name)
+        doubts = tuple(sorted((*self.of(name), *self._assumed(name))))
         if not doubts:
-            return RuleFinding(Level.NORMAL, "good", lambda: f"{subject} is good again")
-        worst = min(doubts, key=lambda doubt: doubt.quality != "not_ok")
-        what = "cannot be judged" if worst.quality == "missing" else "not OK"
-        because = f": {worst.reason}" if worst.reason else ""
+            return RuleFinding(Level.NORMAL, "good", lambda: f"{name.partition('/')[2]} is good again")
         said = "|".join(
             f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
         )
-        return RuleFinding(Level.ALERT, said, lambda: f"{subject} {what}{because}")
+        return RuleFinding(Level.ALERT, said, lambda: in_words(name, doubts))
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` cannot speak while it rests on ``sensors``; None if it can.
@@ -239,6 +274,11 @@ class SensorHealth:
                     return _reason(blamed[1])
         lost = self._blamed.keys() & sensors if self._blamed else ()
         return next(reversed(self._blamed[min(lost)].values())) if len(lost) > rule.spare else None
+
+    def _assumed(self, name: str) -> list[Doubt]:
+        """What those may have against the subject who have not spoken since a restart."""
+        doubts = self._by_alarm.get(name, {}) if self._unheard else {}
+        return [doubt for detector, doubt in doubts.items() if detector in self._unheard]
 
     def _cause(self, doubt: Doubt) -> str:
         """Tells silence from a rate or counter that is wrong: one may take over from the other."""
@@ -260,6 +300,19 @@ class SensorHealth:
         for sensor in _blames(doubt):
             _drop(self._blamed, sensor, detector)
         return before
+
+
+def in_words(name: str, doubts: Sequence[Doubt]) -> str:
+    """What the quality alarm ``name`` says of its subject while there are ``doubts``."""
+    worst = _worst(doubts)
+    what = "not OK"
+    if worst.quality == "missing":
+        what = "cannot be judged, and was not OK" if any(d.not_ok for d in doubts) else "cannot be judged"
+    return f"{name.partition('/')[2]} {what}" + (f": {worst.reason}" if worst.reason else "")
+
+
+def _worst(doubts: Sequence[Doubt]) -> Doubt:
+    return min(doubts, key=lambda doubt: doubt.quality != "not_ok")
 
 
 def _blames(doubt: Doubt) -> set[str]:

@@ -18,7 +18,7 @@ from daqsvc.alarms.events import Doubt, Identity
 from daqsvc.alarms.flood import FloodLimit
 from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
-from daqsvc.alarms.quality import SensorHealth, Touched, quality_alarm
+from daqsvc.alarms.quality import UNHEARD_NS, SensorHealth, Touched, quality_alarm
 from daqsvc.alarms.rules import Circumstances
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
@@ -58,11 +58,12 @@ class WalkingDoubts(SensorHealth):
     def __init__(self):
         super().__init__()
         self.table = {}
+        self.assumed = {}
         self.unsettled = {}
 
     def take(self, diagnosis):
         detector, name = diagnosis.detector, quality_alarm(diagnosis.detector, diagnosis.sensors)
-        before = self.table.pop(detector, None)
+        before = self.table.pop(detector, None) or self.assumed.pop(detector, None)
         if diagnosis.quality == "good":
             for detectors in self.unsettled.values():
                 detectors.discard(detector)
@@ -76,6 +77,24 @@ class WalkingDoubts(SensorHealth):
     def resume(self, doubts, t_ns, found=""):
         for doubt in doubts:
             self.table[doubt.detector] = (quality_alarm(doubt.detector, doubt.sensors), doubt)
+
+    def expect(self, name, speakers, t_ns):
+        self.until_ns = t_ns + UNHEARD_NS
+        doubts = self.of(name)
+        worst = min(doubts, key=lambda doubt: doubt.quality != "not_ok", default=None)
+        for detector, sensors in speakers.items():
+            if doubts and detector not in self.table:
+                self.assumed[detector] = name, Doubt(detector, worst.quality, False, worst.reason, sensors)
+
+    def give_up(self, t_ns):
+        if not self.assumed or t_ns < self.until_ns:
+            return []
+        names = sorted({name for name, _ in self.assumed.values()})
+        self.assumed.clear()
+        return names
+
+    def _assumed(self, name):
+        return [doubt for alarm, doubt in self.assumed.values() if alarm == name]
 
     def unsettle(self, rule):
         self.unsettled[rule.alarm] = set(rule.detectors)
@@ -137,6 +156,8 @@ class WalkingManager(AlarmManager):
         for alarm in sorted(shelved, key=lambda one: (one.shelved_until_ns, one.name)):
             if expired := alarm.expire(now, self._unjudged(alarm.name, now)):
                 yield expired
+        for name in self._doubts.give_up(now.t_ns):
+            yield from self._quality([name], self._unjudged(name, now), now)
 
 
 class Clock:

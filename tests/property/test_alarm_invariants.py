@@ -14,6 +14,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from daqsvc.alarms.alarm import FINDINGS
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import ANNUNCIATIONS, EventKind, Identity
@@ -38,7 +39,14 @@ RULES = [
     DiagnosisRule("mode-latching", "bank", latching=True, group="bank"),
 ]
 GROUPS = {rule_.alarm: rule_.group for rule_ in RULES}
-SPEAKERS = {"levels/x": ("x",), "levels/y": ("y",), "levels/z": ("z",), "bank": ("x", "y")}
+SPEAKERS = {
+    "levels/x": ("x",),
+    "levels/y": ("y",),
+    "levels/z": ("z",),
+    "bank": ("x", "y"),
+    "bearing": ("x",),
+    "bearing-fe": ("x",),
+}
 HANDLING = AlarmHandling(
     chatter=ChatterLimit(1, 20 * SECOND_NS, 4 * SECOND_NS),
     flood=FloodLimit(6, 30 * SECOND_NS),
@@ -90,6 +98,7 @@ class Alarms(RuleBasedStateMachine):
         self.sequence = itertools.count(1)
         self.told = {}
         self.told_at = {}
+        self.found = {}
         self.settings_of_the_wall = 0
         self.occurrences = set()
         self.start()
@@ -127,6 +136,10 @@ class Alarms(RuleBasedStateMachine):
             assert event.kind in {EventKind.RESET, EventKind.RECURRED}
         if event.to_level < event.from_level:
             assert event.kind in {EventKind.RETURNED, EventKind.RESET, EventKind.LOWERED}, "a silent drop"
+        if event.kind is EventKind.CHANGED:
+            assert event.message != self.found.get(event.alarm), "nothing has changed for a person"
+        if event.kind in FINDINGS:
+            self.found[event.alarm] = event.message
         if event.kind is EventKind.RAISED:
             assert event.occurrence not in self.occurrences, "an occurrence was used twice"
             self.occurrences.add(event.occurrence)
@@ -199,6 +212,16 @@ class Alarms(RuleBasedStateMachine):
         )
         if nats < 5.0 and not stood:
             assert not self.manager.alarms["mode"].own_state.is_active
+
+    @rule(
+        detector=st.sampled_from(["bearing", "bearing-fe"]),
+        quality=QUALITY,
+        reason=st.sampled_from(["", "no samples", "clipped"]),
+        seconds=SECONDS,
+    )
+    def doubt(self, detector, quality, reason, seconds):
+        """Others have something against the same sensor."""
+        self.take(detector, seconds, decision="normal", quality=quality, reason=reason)
 
     @rule(
         verb=st.sampled_from(list(Verb)),

@@ -11,6 +11,7 @@ from alarm_rig import SECOND_NS, AlarmRig, kinds
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.handling import AlarmHandling
+from daqsvc.alarms.quality import UNHEARD_NS
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 
@@ -56,9 +57,55 @@ def test_all_doubters_are_remembered_over_a_restart():
     rig.rms(0.0, "not_ok", reason="dead")
     bearing(rig, "missing", ("probe-x",))
     after = rig.restarted(SPEAKERS)
-    assert kinds(bearing(after, "good", ("probe-x",))) == [("sensor-ok/probe-x", "changed")]
+    assert bearing(after, "good", ("probe-x",)) == [], "it was not OK by the other one, and is"
     assert after.status("vibration-x").state.value == "suppressed"
     assert kinds(after.rms(0.0)) == [("sensor-ok/probe-x", "returned"), ("vibration-x", "unsuppressed")]
+
+
+@pytest.mark.parametrize("acknowledged", [False, True])
+@pytest.mark.parametrize("restarted", [False, True])
+def test_who_joins_in_with_nothing_new_to_say_is_no_event(acknowledged, restarted):
+    """Two detectors miss the samples of one sensor: one line, and one return when neither does."""
+    rig = AlarmRig(LEVEL)
+    assert kinds(rig.rms(0.0, "missing", reason="no samples")) == [("sensor-ok/probe-x", "raised")]
+    if acknowledged:
+        rig.acknowledge("sensor-ok/probe-x")
+    if restarted:
+        rig = rig.restarted(SPEAKERS)
+    assert bearing(rig, "missing", ("probe-x",), "no samples") == []
+    assert rig.rms(0.0, "missing", reason="no samples") == []
+    shelved = rig.shelve("sensor-ok/probe-x", 60.0)
+    assert [doubt.detector for doubt in shelved.doubts] == ["bearing", "levels/probe-x"], "told with the next"
+    rig.ask(Verb.UNSHELVE, "sensor-ok/probe-x")
+    for _ in range(4):
+        assert rig.rms(0.0) == [], "the other one still misses them"
+    changed = bearing(rig, "not_ok", ("probe-x",), "clipped")[0]
+    assert changed.message == "sensor-ok/probe-x alert: probe-x not OK: clipped"
+    assert kinds(bearing(rig, "good", ("probe-x",)))[0] == ("sensor-ok/probe-x", "returned")
+
+
+@pytest.mark.parametrize("other", ["missing", "good", "silent"])
+def test_after_a_restart_a_quality_alarm_waits_for_who_may_have_joined_in(other):
+    """The journal knows only of the first who missed the samples; who never speaks is not waited for long."""
+    rig = AlarmRig(LEVEL)
+    rig.rms(0.0, "not_ok", reason="no samples")
+    bearing(rig, "not_ok", ("probe-x",), "no samples")
+    assert kinds(rig.events) == [("sensor-ok/probe-x", "raised"), ("vibration-x", "suppressed")]
+    after, restarted_ns = rig.restarted(SPEAKERS), rig.clock.t_ns
+    assert ("sensor-ok/probe-x", "returned") not in kinds(after.rms(0.0))
+    if other == "silent":
+        while not (events := after.tick()):
+            pass
+        assert UNHEARD_NS <= after.clock.t_ns - restarted_ns <= UNHEARD_NS + SECOND_NS
+    elif other == "missing":
+        bearing(after, "missing", ("probe-x",), "no samples")
+        assert after.tick(100.0) == [], "it has spoken, and stands by it"
+        events = bearing(after, "good", ("probe-x",))
+        for _ in range(5):
+            events = events or bearing(after, "good", ("probe-x",))
+    else:
+        events = bearing(after, "good", ("probe-x",))
+    assert kinds(events) == [("sensor-ok/probe-x", "returned")]
 
 
 def test_an_acknowledged_quality_alarm_still_knows_after_a_restart_that_the_sensor_was_not_ok():
