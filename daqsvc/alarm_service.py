@@ -327,9 +327,12 @@ class AlarmService:
 
     async def keep_time(self) -> None:
         """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
+        was_backed = True
         for tick in itertools.count():
-            if tick % DISK_TICKS == 0:
+            is_backed = not (self.outbox.counters.shut or self.outbox.counters.unbacked)
+            if tick % DISK_TICKS == 0 or is_backed != was_backed:
                 await self._look_at_disk()
+            was_backed = is_backed
             if tick % REFUSED_TICKS == 0:
                 await self._tell_refused()
             self.tick()
@@ -563,5 +566,5 @@ def _not_on_disk(committed: Sequence[asyncio.Future[int]]) -> str:
         return ""
     errors = [f"{one.exception()}" for one in committed if one.done() and one.exception() is not None]
     return "done, but the journal cannot be written yet, and a restart before it can will undo it: " + (
-        "; ".join(errors) or "the event waits in memory; make room on the disk"
+        "; ".join(errors) or "the event waits in memory; the alarm store/journal says what helps"
     )

@@ -27,6 +27,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.supervisor import Backoff
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.text_validation import printable, refuse_twice
+from daqsvc.outbox.files import is_possessed, is_read_only
+from daqsvc.outbox.reading import JOURNAL_NAME
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -59,6 +61,10 @@ _ANSWER: Literal["daqsvc.control-answer/1"] = "daqsvc.control-answer/1"
 
 class ControlError(Exception):
     """The control socket cannot be used; the text names it and the remedy."""
+
+
+class UnreachableError(ControlError):
+    """A service runs on the store, but has no control socket there."""
 
 
 def _finite(value: float) -> float:
@@ -388,9 +394,7 @@ def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
             with client.makefile("rb") as answers:
                 return ControlAnswer.model_validate_json(answers.readline(LONGEST_LINE))
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
-        raise ControlError(
-            f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
-        ) from None
+        raise _absence(store) from None
     except PermissionError:
         raise ControlError(
             f"the daqsvc of {store} takes commands from its own user and from root only: try again with sudo"
@@ -405,6 +409,21 @@ def _asked(store: Path, line: bytes, timeout_s: float) -> ControlAnswer:
             f"the daqsvc of {store} has closed the connection without an answer ({_in_short(error)}); "
             "whether it has obeyed, daqsvc alarms tells"
         ) from None
+
+
+def _absence(store: Path) -> ControlError:
+    """Why nobody listens at the control socket of a store."""
+    if not is_possessed(store / f"{JOURNAL_NAME}.lock"):
+        return ControlError(
+            f"no daqsvc runs on the store {store}: start it with daqsvc run, or name its store with --store"
+        )
+    if is_read_only(store):
+        why = "it cannot make it on a read-only file system: mount it writable again, or ask over MQTT"
+    else:
+        why = "it starts or stops, or cannot make it, which its log says: make room on the disk, or try again"
+    return UnreachableError(
+        f"the daqsvc of {store} runs, but has no control socket {store / SOCKET} to take commands at: {why}"
+    )
 
 
 async def _next_line(reader: asyncio.StreamReader) -> bytes | None:

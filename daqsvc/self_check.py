@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S, iso_utc
 from daqsvc.alarms.states import Level
+from daqsvc.outbox.files import remedy
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -163,6 +164,7 @@ class SelfCheck:
     def __init__(self, store: Path, reserve_bytes: int) -> None:
         self._store = store
         self._reserve_bytes = reserve_bytes
+        self._remedy = "make room on the disk"
         self._ending: set[str] = set()
         self._telemetry = _Happening()
         self._lost = _Happening()
@@ -184,6 +186,7 @@ class SelfCheck:
         Raises:
             OSError: the store cannot be reached.
         """
+        self._remedy = remedy(self._store)
         return shutil.disk_usage(self._store).free
 
     def look(self, vitals: Vitals) -> Iterator[Condition]:
@@ -279,7 +282,7 @@ class SelfCheck:
             sentence = (
                 f"the journal in {self._store} cannot be written: delivery of alarms is not backed by the "
                 "disk, they go out from memory, and what the broker does not get before the process ends is "
-                "lost: make room on the disk"
+                f"lost: {self._remedy}"
             )
             return Condition(JOURNAL, Level.ALERT, sentence)
         return Condition(JOURNAL, Level.NORMAL, f"the journal in {self._store} takes what comes")
@@ -304,7 +307,9 @@ class SelfCheck:
         stands = self._unwritten.goes_on(vitals.unwritten, vitals.now_ns)
         if not stands:
             return Condition("store/audit-log", Level.NORMAL, "the audit log takes what comes")
-        sentence = f"the audit log in {self._store} cannot be written, and commands are refused: make room"
+        sentence = (
+            f"the audit log in {self._store} cannot be written, and commands are refused: {self._remedy}"
+        )
         return Condition("store/audit-log", Level.ALERT, sentence)
 
     def _overrun(self, bus: str, health: BusHealth, now_ns: int) -> Condition:

@@ -64,15 +64,19 @@ class AlarmsCommand:
 
         try:
             store = chosen_store(arguments, self._load)
-            waiting = _waiting(store)
-            if arguments.history is not None:
-                events = history(store, arguments.history)
-            else:
-                events = current(store)
-                if not arguments.all:
-                    events = [told for told in events if told["state"] != "normal"]
-            _show(store, events, arguments)
-            _tell_waiting(waiting)
+            doubt = _doubt(store)
+            try:
+                if arguments.history is not None:
+                    events = history(store, arguments.history)
+                else:
+                    events = current(store)
+                    if not arguments.all:
+                        events = [told for told in events if told["state"] != "normal"]
+                _show(store, events, arguments)
+            finally:
+                if doubt:
+                    # What goes wrong goes to stderr.
+                    print(f"daqsvc alarms: {doubt}", file=sys.stderr)  # noqa: T201
         except BadFileError:
             return EXIT_BAD_FILE
         except (StoreNotFoundError, OutboxError) as error:
@@ -96,24 +100,25 @@ def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespa
         print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201
 
 
-def _waiting(store: Path) -> int:
-    """Events that the service has and the disk cannot take: the journal is not how things stand then."""
-    from daqsvc.control import ControlError, events_waiting  # noqa: PLC0415
+def _doubt(store: Path) -> str:
+    """Why the journal may not be how things stand: what the disk cannot take, the service has in memory."""
+    from daqsvc.control import ControlError, UnreachableError, events_waiting  # noqa: PLC0415
+    from daqsvc.outbox.files import is_read_only, remedy  # noqa: PLC0415
 
     try:
-        if not events_waiting(store):
-            return 0
-        time.sleep(SLOW_DISK_S)  # they are on their way to a slow disk, as a rule
-        return events_waiting(store)
+        waiting = events_waiting(store)
+        if waiting:
+            time.sleep(SLOW_DISK_S)  # they are on their way to a slow disk, as a rule
+            waiting = events_waiting(store)
+    except UnreachableError as error:
+        journal = "the journal cannot be written" if is_read_only(store) else "the journal may not be written"
+        return f"{journal}, so this may not be how the alarms stand by now; {error}"
     except ControlError:
-        return 0  # no service, or one that this user may not ask: the journal is all there is
-
-
-def _tell_waiting(waiting: int) -> None:
-    if waiting:
-        events = "1 event waits" if waiting == 1 else f"{waiting} events wait"
-        print(  # noqa: T201 - what goes wrong goes to stderr
-            f"daqsvc alarms: {events} in the service's memory for a disk that cannot be written: this is not "
-            "how the alarms stand by now; make room on the disk",
-            file=sys.stderr,
-        )
+        return ""  # no service, or one that this user may not ask: the journal is all there is
+    if not waiting:
+        return ""
+    events = "1 event waits" if waiting == 1 else f"{waiting} events wait"
+    return (
+        f"{events} in the service's memory for a disk that cannot be written: this is not how the alarms "
+        f"stand by now; {remedy(store)}"
+    )

@@ -186,6 +186,36 @@ def take_possession(path: Path) -> BinaryIO:
     return lock
 
 
+def is_possessed(path: Path) -> bool:
+    """Whether a process has taken possession of a store, by the word of the kernel; nothing is locked.
+
+    Args:
+        path: the lock file.
+    """
+    try:
+        inode = path.stat().st_ino
+        locks = Path("/proc/locks").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return False
+    # "1: FLOCK  ADVISORY  WRITE 4711 08:01:131075 0 EOF"
+    return any(" FLOCK " in lock and f":{inode} " in lock for lock in locks)
+
+
+def is_read_only(directory: Path) -> bool:
+    """Whether a directory is on a file system that is mounted read-only; no if it cannot be asked."""
+    try:
+        return bool(os.statvfs(directory).f_flag & os.ST_RDONLY)
+    except OSError:
+        return False
+
+
+def remedy(directory: Path) -> str:
+    """What to do about a disk that takes no writes."""
+    if is_read_only(directory):
+        return "its file system is read-only: mount it writable again"
+    return "make room on the disk"
+
+
 def _lock_file(path: Path) -> int:
     """The lock file; one that is there can be locked on a disk that takes no writes, too."""
     try:

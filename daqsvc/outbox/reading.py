@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import quote
 
-from daqsvc.outbox.files import FileError, pragma
+from daqsvc.outbox.files import FileError, pragma, remedy
 from daqsvc.outbox.messages import OutboxError, is_sound
 from daqsvc.outbox.safety import refuse_link
 from daqsvc.outbox.tables import SCHEMA_VERSION
@@ -174,6 +174,11 @@ def _read_once(path: Path, query: Callable[[sqlite3.Connection], _T]) -> _T:
 
 def _check_version(path: Path, connection: sqlite3.Connection) -> None:
     version = pragma(connection, "user_version")
+    if not version and not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+        raise OutboxError(
+            f"the journal {path} is empty: the service has not been able to write anything to it yet; "
+            f"{remedy(path.parent)}"
+        )
     if version != SCHEMA_VERSION:
         raise OutboxError(
             f"the journal {path} has schema version {version}, this program reads {SCHEMA_VERSION}; "

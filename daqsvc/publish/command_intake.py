@@ -7,6 +7,7 @@ stands in the machine file. So the broker's access list says who, and the box sa
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import logging
 import re
@@ -262,7 +263,7 @@ class CommandIntake:
             self.counters.unwritten += 1
             raise CommandRefusedError(
                 f"its id cannot be written down ({error.strerror or error}), so it might be obeyed twice: "
-                "make room on the disk of the box, then ask again"
+                f"{_remedy(error)}, then ask again"
             ) from error
         if known == "known":
             self.counters.stale += 1
@@ -287,6 +288,12 @@ class CommandIntake:
         if wanted == own or wanted.startswith(f"{own}/"):
             return wanted
         return own if f"{wanted}/".startswith(self._reserved) else wanted
+
+
+def _remedy(error: OSError) -> str:
+    if error.errno == errno.EROFS:
+        return "mount the disk of the box writable again"
+    return "make room on the disk of the box"
 
 
 def _id_of(asked: bytes) -> str | None:

@@ -15,10 +15,23 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from brokers import eventually
+from small_disks import mounted
 
 from daqsvc import control
+from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.control import ControlError, ControlRequest, ControlServer, ask, events_waiting, request_of
+from daqsvc.cli import main
+from daqsvc.control import (
+    ControlError,
+    ControlRequest,
+    ControlServer,
+    UnreachableError,
+    ask,
+    events_waiting,
+    request_of,
+)
+from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.outbox.store import Outbox
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -391,3 +404,28 @@ def test_what_cannot_be_asked_is_said_in_our_words_only() -> None:
     with pytest.raises(ControlError) as refused:
         request_of(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="\udcff", by="Ada"), None)
     assert f"{refused.value}".startswith("that cannot be asked, alarm: must be printable")
+
+
+async def test_a_service_without_its_socket_is_not_said_to_be_away(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As on a store that is read-only: the service runs and watches, but can make no socket there."""
+    with mounted(tmp_path / "disk", "4m") as disk:
+        store = disk.directory / "store"
+        limits = OutboxLimits(reserve_bytes=0, ballast_bytes=0)
+        outbox = Outbox(store / "outbox.sqlite", SystemClock(), limits)
+        await outbox.open()
+        await outbox.close()
+        disk.refuse_writes()
+        with pytest.raises(ControlError, match="no daqsvc runs"):
+            await asyncio.to_thread(ask, store, RESET)
+        outbox = Outbox(store / "outbox.sqlite", SystemClock(), limits)
+        await outbox.open()
+        try:
+            with pytest.raises(UnreachableError, match=r"runs, but has no control socket .* read-only"):
+                await asyncio.to_thread(ask, store, RESET)
+            assert await asyncio.to_thread(main, ["alarms", "--store", str(store)]) == 0
+            said = capsys.readouterr().err
+            assert "the journal cannot be written, so this may not be how the alarms stand" in said
+        finally:
+            await outbox.close()

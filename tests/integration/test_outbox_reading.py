@@ -170,6 +170,19 @@ def test_what_is_no_journal_is_said_to_be_none(tmp_path):
         read_journal(tmp_path)
 
 
+@pytest.mark.parametrize("content", [b"", "a header"])
+def test_a_journal_that_was_never_written_is_said_to_be_empty(tmp_path, content):
+    """So a disk that was full at the first start leaves it."""
+    if content:
+        with sqlite3.connect(tmp_path / JOURNAL_NAME) as other:
+            other.execute("PRAGMA journal_mode = DELETE")
+        other.close()
+    else:
+        (tmp_path / JOURNAL_NAME).write_bytes(b"")
+    with pytest.raises(OutboxError, match=r"is empty: .* make room on the disk"):
+        read_journal(tmp_path)
+
+
 @pytest.mark.parametrize(("version", "remedy"), [(1, "start the service once"), (99, "use the program")])
 def test_another_version_is_named(tmp_path, version, remedy):
     with sqlite3.connect(tmp_path / JOURNAL_NAME) as other:

@@ -109,10 +109,13 @@ async def test_without_room_the_alarms_are_watched_at_once_and_stored_later(disk
             assert state(desk, "rotor-fault").is_latched, "what stood is known all the same"
         find(desk, "bearing-fault", "danger")
         assert state(desk, "bearing-fault").is_active
+        await desk._look_at_disk()
         desk.tick()
         await eventually(lambda: desk.outbox.counters.write_errors > 2, "it is tried again")
         desk.tick()
         assert state(desk, "store/journal").is_active
+        remedy = "mount it writable again" if trouble == "takes no writes" else "make room on the disk"
+        assert desk._newest["rig", "store/journal"].message.endswith(remedy)
         if trouble == "takes no writes":
             disk.take_writes()
         disk.free()
