@@ -162,7 +162,7 @@ def _chosen(root: argparse.ArgumentParser, arguments: Sequence[str] | None) -> a
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; returns the exit code."""
-    _await_reload(sys.argv[1:] if arguments is None else arguments)
+    _ignore_until_heard(sys.argv[1:] if arguments is None else arguments)
     try:
         chosen = _chosen(parser(commands()), arguments)
         command: Command = chosen.command
@@ -186,14 +186,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _await_reload(arguments: Sequence[str]) -> None:
-    """From the first moment on, let a SIGHUP that asks the service for a reload not end it.
+def _ignore_until_heard(arguments: Sequence[str]) -> None:
+    """From here on, let a SIGHUP that asks the service for a reload not end it, nor SIGUSR1 and SIGUSR2.
 
     Whoever starts and reloads it in one go is too quick for its own handler (`ProcessGuard`). A handler, and
     not SIG_IGN: that says that the service is to outlive its terminal.
     """
-    if arguments[:1] == ["run"] and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, lambda *_: None)
+    if arguments[:1] != ["run"]:
+        return
+    for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda *_: None)
 
 
 def _give_up_stdout() -> None:

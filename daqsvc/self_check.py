@@ -265,11 +265,13 @@ class SelfCheck:
         return Condition(condition, Level.ALERT, sentence)
 
     def _disk(self, free_bytes: int) -> Condition:
-        full = free_bytes < self._reserve_bytes
-        sentence = f"{free_bytes // MIB} MiB are free on the disk of {self._store}"
-        if full:
-            sentence += f", less than {self._reserve_bytes // MIB} MiB: make room, or alarms wait in memory"
-        return Condition("store/disk", Level.ALERT if full else Level.NORMAL, sentence)
+        # No count of what is free: it stands for hours, and would be another sentence with every MiB.
+        limit = f"{self._reserve_bytes // MIB} MiB"
+        if free_bytes < self._reserve_bytes:
+            on = f"on the disk of {self._store}"
+            sentence = f"less than {limit} are free {on}: make room, or alarms wait in memory"
+            return Condition("store/disk", Level.ALERT, sentence)
+        return Condition("store/disk", Level.NORMAL, f"{limit} or more are free on the disk of {self._store}")
 
     def _journal(self, vitals: Vitals) -> Condition:
         failed = vitals.write_errors > self._write_errors

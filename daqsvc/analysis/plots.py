@@ -308,6 +308,8 @@ def _innovations(subject: _Subject) -> Figure:
     deviation = np.sqrt(calibration.spread.of_means(1.0, float(calibration.revolutions), 0.0))
     innovation = np.abs(moved - calibration.baseline) / deviation
     for k, name in enumerate(_COMPONENTS):
+        if not (innovation[:, k] > 0.0).any():
+            continue  # as the mean of probes without one: a logarithmic axis has no place for it
         upper.plot(subject.revolutions, innovation[:, k], linewidth=1.2, label=name)
     upper.set_yscale("log")
     upper.set_ylim(0.03, 5.0 * max(10.0, float(np.nanmax(innovation))))  # leaves room for the legend

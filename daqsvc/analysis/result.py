@@ -245,7 +245,7 @@ class RotorAnalysis:
         if self.calibration is not None:
             was = self.calibration
             lines.append(
-                f"healthy: 1X {was.amplitude_um:.4g} um at {_degrees(was.baseline[1]):.0f} degrees, "
+                f"healthy: 1X {was.amplitude_um:.4g} um at {_degrees(was.baseline[1]):z.0f} degrees, "
                 f"{was.revolutions} revolutions at {abs(was.speed_rpm):.1f} rpm, noise {was.noise_um:.3g} um "
                 f"({was.snr_db:.0f} dB)"
             )
@@ -297,7 +297,7 @@ class RotorAnalysis:
         change, now = self.identification.change, self.calibration.baseline + self.identification.change
         return (
             f"severity {self.identification.severity:.3g} of the healthy whirl; 1X is "
-            f"{abs(now[1]):.4g} um at {_degrees(now[1]):.0f} degrees, the mean position moved by "
+            f"{abs(now[1]):.4g} um at {_degrees(now[1]):z.0f} degrees, the mean position moved by "
             f"{abs(change[0]):.3g} um, backward 1X by {abs(change[2]):.3g}, 2X by {abs(change[3]):.3g} um"
         )
 
@@ -371,5 +371,5 @@ def _figure(key: str, value: float) -> str:
     """A figure whose name ends in its unit, in words: ``change_um`` 3.0 is ``change 3 um``."""
     for ending, unit in _UNITS.items():
         if key.endswith(ending):
-            return f"{words(key.removesuffix(ending))} {value:.3g}{unit}"
+            return f"{words(key.removesuffix(ending))} {value:z.3g}{unit}"
     return f"{words(key)} {value:.3g}"

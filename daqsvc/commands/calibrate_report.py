@@ -139,7 +139,7 @@ def _run_up_lines(fit: RunUpFit, source: str, asked: Sequence[float] | None) -> 
     )
     unbalance = (
         f"eccentricity {abs(fit.eccentricity_um):.4g} +- {fit.eccentricity_uncertainty_um:.2g} um at "
-        f"{_degrees(fit.eccentricity_um):.1f} +- {fit.heavy_spot_uncertainty_deg:.2g} degrees, centre "
+        f"{_degrees(fit.eccentricity_um):z.1f} +- {fit.heavy_spot_uncertainty_deg:.2g} degrees, centre "
         f"({fit.centre_um.real:.4g}, {fit.centre_um.imag:.4g}) +- {fit.centre_uncertainty_um:.2g} um"
     )
     errors = (
@@ -151,7 +151,7 @@ def _run_up_lines(fit: RunUpFit, source: str, asked: Sequence[float] | None) -> 
         vector, deviation = fit.predict(speed)
         said.append(
             f"predicted 1X at {speed:.0f} rpm: {abs(vector):.4g} +- {deviation:.2g} um at "
-            f"{_degrees(vector):.1f} degrees"
+            f"{_degrees(vector):z.1f} degrees"
         )
     return [f"{source}: {fit.revolutions} revolutions from {low:.0f} to {high:.0f} rpm", *_indented(said)]
 
@@ -160,7 +160,7 @@ def _steady_lines(record: CalibrationRecord, calibration: Calibration, source: s
     deviations = _deviations(calibration)
     mean, forward = calibration.baseline[0], calibration.baseline[1]
     whirl = (
-        f"1X {abs(forward):.4g} +- {deviations[1]:.2g} um at {_degrees(forward):.1f} degrees, backward over "
+        f"1X {abs(forward):.4g} +- {deviations[1]:.2g} um at {_degrees(forward):z.1f} degrees, backward over "
         f"forward 1X {100.0 * calibration.ellipticity:.2g} %"
     )
     said = [whirl]

@@ -30,6 +30,9 @@ EXIT_HUNG = 4
 EXIT_STUCK = 5
 """The event loop stood still."""
 
+USER_SIGNALS = (signal.SIGUSR1, signal.SIGUSR2)
+"""They would end the process, and mean nothing to it."""
+
 TURN_S = 0.1
 STOP_TURNS = 17
 """Turns that a stop may take before it is forced, which leaves `CLOSE_S` of its two seconds."""
@@ -85,6 +88,8 @@ class ProcessGuard:
         if not self._outlives_terminal:
             # Only that there is a handler: the thread hears it.
             self._before[signal.SIGHUP] = signal.signal(signal.SIGHUP, lambda *_: None)
+        for number in USER_SIGNALS:
+            self._before[number] = signal.signal(number, lambda *_: None)
         self._thread.start()
         return self
 
@@ -177,6 +182,8 @@ class ProcessGuard:
     def _hear(self, number: int) -> None:
         if number in {signal.SIGTERM, signal.SIGINT}:
             self._ask_to_stop("")
+        elif number in USER_SIGNALS:
+            log.warning("%s is ignored: it means nothing to the service", signal.Signals(number).name)
         elif number == signal.SIGHUP:
             if any(_is_gone(fd) for fd in self._terminals):
                 self.lose_terminal("the terminal is gone")

@@ -188,7 +188,9 @@ class ErrorFormatter:
         allowed = re.sub(r"[^A-Za-z0-9_./-]+" if parts else r"[^A-Za-z0-9_.-]+", "-", text).strip("-/")
         subject = "" if named else "its name "
         message = f"{subject}may only have letters, digits, '_', '.' and '-'{also}, and must not be empty"
-        remedy = f"write e.g. {json.dumps(allowed)}" if allowed else "give it a name"
+        if text and not parts and not text.strip("."):
+            return f"{message}; dots alone are no name", "give it a name"
+        remedy = f"write e.g. {json.dumps(allowed)}" if allowed.strip(".") else "give it a name"
         return message, remedy
 
     def _string_too_short(self, path: KeyPath, _context: Mapping[str, Any]) -> tuple[str, str]:

@@ -49,8 +49,23 @@ def packed_room(layout: PackedFields, at: KeyPath) -> Iterator[Finding]:
                 (*at, key),
                 f"{what} (bytes {later_start} to {later_end - 1}) would overlap {first} "
                 f"(bytes {start} to {end - 1})",
-                f"move {what} to byte {end} or behind, as the device sends it",
+                _make_way(layout, key, what, end, later_end - later_start),
             )
+
+
+def _make_way(layout: PackedFields, key: str, what: str, end: int, needed_bytes: int) -> str:
+    """What to do about a field that lies within another which ends before byte ``end``."""
+    if end + needed_bytes <= layout.frame_length:
+        return f"move {what} to byte {end} or behind, as the device sends it"
+    if end != layout.samples_end_byte or key == "first_byte":
+        return f"correct {key}: from byte {end} on is no room for {what}"
+    begin = layout.frame_length - needed_bytes if key != "crc_byte" else layout.crc_byte or 0
+    fitting_samples = (begin - layout.first_byte) // layout.sample_bytes
+    if fitting_samples < 1:
+        return "make the frame longer"
+    fewer = f"write samples_per_frame = {fitting_samples}"
+    to = layout.first_byte + fitting_samples * layout.sample_bytes
+    return fewer if key == "crc_byte" else f"{fewer} and move {what} to byte {to}, as the device sends it"
 
 
 def _make_room(layout: PackedFields, key: str, needed_bytes: int) -> str:

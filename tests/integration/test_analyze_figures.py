@@ -56,6 +56,25 @@ def test_figures_of_a_rotor(analyze, drawn, tmp_path, name):
         assert_whole(figure)
 
 
+@pytest.mark.parametrize("has_mean", [True, False])
+def test_the_legend_of_innovations_names_lines_that_are_there(analyze, drawn, tmp_path, has_mean):
+    orbit = Orbit(400, change=UNBALANCE)
+    if has_mean:
+        orbit.x, orbit.y = orbit.x + 20.0, orbit.y - 30.0
+    code, _, _ = analyze(
+        orbit.save(tmp_path / "run.npz"),
+        *OPTIONS,
+        *(() if has_mean else ("--ac-coupled",)),
+        "--plot",
+        tmp_path,
+    )
+    assert code == 0
+    upper = drawn["innovations"].axes[0]
+    named = [text.get_text() for text in upper.get_legend().get_texts()]
+    assert named == [*(["mean"] if has_mean else []), "1X", "-1X", "2X", "-2X"]
+    assert all(np.nanmax(line.get_ydata()) > upper.get_ylim()[0] for line in upper.get_lines())
+
+
 @pytest.mark.parametrize("name", ["run.npz", LONG])
 def test_figures_of_a_bearing(analyze, drawn, tmp_path, name):
     path = tmp_path / name

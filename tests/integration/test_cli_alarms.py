@@ -335,6 +335,7 @@ async def test_the_store_is_found_as_run_finds_it(tmp_path: Path) -> None:
     [
         (["shelve", "shaking", "--for", "30"], "'30' is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m"),
         (["shelve", "shaking", "--for", "0s"], "'0s' is not a time"),
+        (["shelve", "shaking", "--for", "-5m"], "'-5m' is not a time; write e.g. 90s"),
         (["shelve", "shaking", "--for", "m30"], "'m30' is not a time"),
         (["shelve", "shaking"], "--for"),
         (["ack", "shaking", "--for", "30m"], "--for"),

@@ -233,7 +233,7 @@ def test_what_cannot_be_started_again_ends_the_process_with_its_own_code(why: st
     assert said.splitlines()[-1].endswith(why)
 
 
-def test_a_hang_up_is_ignored_and_said(tmp_path: Path) -> None:
+def test_signals_that_do_not_stop_the_service_are_ignored_and_said(tmp_path: Path) -> None:
     with service(tmp_path) as process:
         for _ in range(2):
             process.send_signal(signal.SIGHUP)
@@ -242,6 +242,11 @@ def test_a_hang_up_is_ignored_and_said(tmp_path: Path) -> None:
             assert any(
                 "SIGHUP is ignored: the machine file is read at the start" in line for line in until_said
             )
+        for number in (signal.SIGUSR1, signal.SIGUSR2):
+            process.send_signal(number)
+            assert process.stderr is not None
+            until_said = iter(process.stderr.readline, "")
+            assert any(f"{number.name} is ignored" in line for line in until_said)
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
     assert closed(tmp_path)

@@ -100,10 +100,15 @@ def test_a_certificate_that_is_no_longer_in_use_stands_no_longer() -> None:
     assert "alarm-flood" not in found
 
 
-def test_a_disk_that_fills_is_told_with_what_is_left() -> None:
+def test_a_disk_that_fills_is_told_by_the_limit() -> None:
     level, sentence = look(self_check(), free_bytes=63 * MIB)["store/disk"]
     assert level is Level.ALERT
-    assert sentence.startswith("63 MiB are free on the disk of /var/lib/daqsvc, less than 64 MiB: make room")
+    assert sentence.startswith("less than 64 MiB are free on the disk of /var/lib/daqsvc: make room")
+    assert look(self_check(), free_bytes=0)["store/disk"] == (level, sentence), (
+        "it stays true as the rest goes"
+    )
+    level, sentence = look(self_check(), free_bytes=64 * MIB)["store/disk"]
+    assert (level, sentence) == (Level.NORMAL, "64 MiB or more are free on the disk of /var/lib/daqsvc")
     assert "store/disk" not in look(self_check()), "nobody has looked"
 
 

@@ -43,13 +43,13 @@ def test_a_hang_up_that_comes_before_the_service_has_its_handlers_ends_nothing()
     before = signal.getsignal(signal.SIGHUP)
     try:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
-        cli._await_reload(["check", "machine.toml"])
+        cli._ignore_until_heard(["check", "machine.toml"])
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
-        cli._await_reload(["run", "machine.toml"])
+        cli._ignore_until_heard(["run", "machine.toml"])
         signal.raise_signal(signal.SIGHUP)
         # Whoever has asked for it (nohup) keeps a service that outlives its terminal.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        cli._await_reload(["run", "machine.toml"])
+        cli._ignore_until_heard(["run", "machine.toml"])
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

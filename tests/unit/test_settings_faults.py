@@ -375,3 +375,11 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path):
     marked = tmp_path / "marked.toml"
     marked.write_bytes(b"\xef\xbb\xbf" + LAVAL.read_bytes())
     assert load_machine_file(marked).machine.name == "laval-rig"
+
+
+@pytest.mark.parametrize("name", [".", ".."])
+def test_dots_alone_are_no_name_and_are_not_proposed(name):
+    problem, _ = only_problem(LAVAL, ('name = "laval-rig"', f'name = "{name}"'))
+    assert problem.key == "machine.name"
+    assert problem.message.endswith("dots alone are no name")
+    assert problem.remedy == "give it a name"

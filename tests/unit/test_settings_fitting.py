@@ -43,6 +43,13 @@ FITTING = [
         "move the CRC to byte 62",
     ),
     (
+        MOTOR,
+        [("samples_per_frame = 30", "samples_per_frame = 31")],
+        "streams.drive-end.layout.crc_byte",
+        "overlap the samples",
+        "write samples_per_frame = 30",
+    ),
+    (
         LAVAL,
         [("byte = 0, bits", "byte = 1, bits")],
         "streams.shaft.layout.first_byte",

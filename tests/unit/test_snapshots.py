@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import re
 
 import numpy as np
 import pytest
 from alarm_rig import AlarmRig
 from bearing_signals import OUTER, SPEED_RPM, healthy, knocks
 from bearing_signals import RATE_HZ as BEARING_HZ
-from machine_files import problems_of
+from machine_files import MACHINES, problems_of
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.acquisition.ring import RingReader, SampleRing
@@ -24,7 +25,7 @@ from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.silence import SILENT_PERIODS, UNKNOWN_NS, Patience
-from daqsvc.settings import parse_machine_file
+from daqsvc.settings import describe, parse_machine_file
 
 RATE_HZ = 3200.0
 PERIOD_NS = 1e9 / RATE_HZ
@@ -209,3 +210,18 @@ def test_a_bearing_is_raised_by_two_blocks_that_agree():
     )
     assert (short.quality, short.decision) == ("missing", "outer")
     assert "a block of casing is 0.0417 s long, and a bearing is judged by 1.25 s or more" in short.reason
+
+
+def test_check_says_that_the_levels_of_blocks_are_those_of_each_block():
+    file = MACHINES.parents[1] / "tests" / "guard" / "specimens" / "specimen-modbus.toml"
+    levels = "\n[pipeline.levels]\nwindow_s = 0.5\nvelocity_band_hz = [10.0, 40.0]\n"
+    machine = parse_machine_file(file.read_text() + levels, file)
+    of_blocks = {
+        sensor.name
+        for sensor in machine.sensors
+        if sensor.type != "trend" and machine.streams[sensor.stream].layout.block is not None
+    }
+    assert of_blocks
+    found = re.search(r"over each block of ([^;\n]+)", describe(machine))
+    assert found is not None
+    assert of_blocks == set(found[1].split(", "))

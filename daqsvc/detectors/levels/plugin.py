@@ -10,7 +10,7 @@ from daqsvc.detectors.levels.checks import level_checks
 from daqsvc.detectors.levels.settings import Levels
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import STALE_S, Reading
-from daqsvc.diagnosis.snapshots import patience
+from daqsvc.diagnosis.snapshots import at_once, patience
 from daqsvc.settings.models import (
     Accelerometer,
     Keyphasor,
@@ -144,11 +144,15 @@ def _readings(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
 
 def _described(machine: MachineFile, given: Levels) -> str:
     casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
-    waveforms = [s.name for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
+    waveforms = [s for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
+    steady = [s.name for s in waveforms if not at_once(machine, s.stream)]
+    of_blocks = [s.name for s in waveforms if at_once(machine, s.stream)]
     trends = [s.name for s in machine.sensors if isinstance(s, TrendValue)]
     parts: list[str] = []
-    if waveforms:
-        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(waveforms)}")
+    if steady:
+        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(steady)}")
+    if of_blocks:
+        parts.append(f"RMS, peak and crest factor over each block of {', '.join(of_blocks)}")
     if casing:
         low_hz, high_hz = given.velocity_band_hz
         parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")

@@ -64,6 +64,12 @@ class _DelimitedTable:
             RecordingError: a cell is no number, or it is empty.
         """
         layout = self._layout
+        if not layout.numeric and not layout.has_header:
+            first = self._first_lines()[0]
+            raise RecordingError(
+                f"{self._path} holds no numeric channel: its first line is {first[:LONGEST_NAME]!r}, and no "
+                "line behind it has a number; give a table with a column of numbers for each channel"
+            )
         numbers = self._numbers()
         entries: dict[str, NDArray[np.generic]] = {
             name: numbers[:, layout.numeric.index(i)] if i in layout.numeric else np.empty(1, dtype=object)

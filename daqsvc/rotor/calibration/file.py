@@ -353,7 +353,7 @@ def _complex(value: complex) -> str:
 
 
 def _polar(value: complex) -> str:
-    return f"{abs(value):.4g} um at {math.degrees(math.atan2(value.imag, value.real)):.1f} degrees"
+    return f"{abs(value):.4g} um at {math.degrees(math.atan2(value.imag, value.real)):z.1f} degrees"
 
 
 def _quoted(text: str) -> str:
