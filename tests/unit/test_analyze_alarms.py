@@ -81,3 +81,12 @@ def test_the_smallest_change_is_that_of_the_baseline_as_it_has_grown():
     returned = analysed(Orbit(300, change=0.5, until=130.0))
     (alarm,) = returned.alarms
     assert returned.reference_revolutions == int(ONSET) + 300 - alarm.returned.revolution
+
+
+def test_no_angle_is_minus_zero():
+    orbit = Orbit(300, change=0.5)
+    z = (orbit.x + 1j * orbit.y) * np.exp(1j * np.radians(39.9))
+    orbit.x, orbit.y = z.real, z.imag
+    text = analysed(orbit).describe()
+    assert "um at 0 degrees" in text
+    assert "-0 degrees" not in text
