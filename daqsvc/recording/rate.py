@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
 from daqsvc.recording.errors import RecordingError
@@ -53,6 +52,8 @@ LEAST_IN_ORDER = 0.75
 """Part of the stamps, or of the steps, that go forward where a column of time with stamps that go back still
 tells the rate."""
 
+_PIECE = 1 << 14
+"""Values whose medians are looked for at a time."""
 _NEIGHBOURS = 51
 """Stamps that the one in their middle is held against."""
 
@@ -279,6 +280,22 @@ def _read(contents: Contents, name: str) -> _TimeColumn | None:
     return _TimeColumn(name, unit, unit_is_named, float(rate_hz), tolerance, rows, backward=backward)
 
 
+def _median_of_neighbours(values: Floats) -> Floats:
+    """The median of each value with those around it, float64 ``[n]``; mirrored at both ends.
+
+    NumPy's, and in pieces: SciPy's cannot be loaded in the little memory that recordings are read with.
+    """
+    half = _NEIGHBOURS // 2
+    padded = np.pad(values, half, mode="reflect")
+    medians = np.empty_like(values)
+    for begin in range(0, len(values), _PIECE):
+        windows = np.lib.stride_tricks.sliding_window_view(
+            padded[begin : begin + _PIECE + 2 * half], _NEIGHBOURS
+        )
+        medians[begin : begin + len(windows)] = np.median(windows, axis=1)
+    return medians
+
+
 def _in_order(seconds: Floats, period: float) -> Floats:
     """Stamps of which those out of order follow the ones before them by even steps.
 
@@ -288,7 +305,7 @@ def _in_order(seconds: Floats, period: float) -> Floats:
     at = np.arange(len(seconds))
     late = seconds - period * at
     # A median keeps the edge that a gap makes, and leaves out what lies beside its neighbours.
-    neighbours = median_filter(late, size=_NEIGHBOURS, mode="mirror")
+    neighbours = _median_of_neighbours(late)
     fits = np.abs(late - neighbours) <= MOST_UNEVEN * period
     fits[0] = True
     in_place = _follow(seconds, fits, period)

@@ -182,7 +182,7 @@ async def test_telemetry_of_a_former_run_makes_way_before_the_journal_is_opened(
     fill(disk)
     outbox = await opened(disk, OutboxLimits(reserve_bytes=2 * MIB, ballast_bytes=0))
     assert [m.sequence for m in await outbox.pending(0, 10)] == numbers
-    assert await asyncio.wait_for(outbox.append(TOPIC, kilobyte, retain=True), 10) == numbers[-1] + 1
+    assert await asyncio.wait_for(outbox.append(TOPIC, kilobyte, retain=True), 10) > numbers[-1]
     assert "is dropped: the disk is nearly full" in caplog.text
     await outbox.close()
 
