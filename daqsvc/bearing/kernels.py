@@ -1,4 +1,4 @@
-"""Compiled recursions: the residual generator, the sliding units, and the paper's unit in two states."""
+"""Compiled recursions: the residual generator and the sliding units."""
 
 from __future__ import annotations
 
@@ -125,50 +125,3 @@ def slide(
             distance[n, 0] = distance[n, 1] = np.nan
             inner = outer = 0.0
     sigma[0], sigma[1] = inner, outer
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def slide_in_two_states(
-    residual: Floats,
-    a: float,
-    b: float,
-    slope: float,
-    gain: Floats,
-    step: float,
-    implicit: bool,  # noqa: FBT001 - numba has no keyword-only arguments
-    state: Floats,
-    path: Floats,
-) -> None:
-    """The paper's unit x1' = x2 - k1 sgn(s) + r1, x2' = -a x1 - b x2 - k2 sgn(s) + r2, s = -slope x1 + x2.
-
-    Args:
-        residual: float64 ``[n, 2]``, what drives the unit.
-        a: of the free dynamics, in 1/s^2.
-        b: of the free dynamics, in 1/s.
-        slope: x2 / x1 of the sliding surface.
-        gain: float64 ``[2]``, k1 and k2.
-        step: in s.
-        implicit: whether sgn is taken at the end of a step, with a value between -1 and 1 on the surface;
-            else at its beginning, and the unit chatters.
-        state: float64 ``[2]``, x1 and x2; changed.
-        path: float64 ``[n, 2]``, written: the state after each step.
-    """
-    x1, x2 = state[0], state[1]
-    # Both ways treat the free dynamics alike: (I - step A) x+ = x + step (r - k sgn).
-    determinant = 1.0 + step * b + step * step * a
-    p11, p12 = (1.0 + step * b) / determinant, step / determinant
-    p21, p22 = -step * a / determinant, 1.0 / determinant
-    n1, n2 = -slope, 1.0
-    pull = step * (n1 * (p11 * gain[0] + p12 * gain[1]) + n2 * (p21 * gain[0] + p22 * gain[1]))
-    for n in range(residual.shape[0]):
-        f1, f2 = x1 + step * residual[n, 0], x2 + step * residual[n, 1]
-        if implicit:
-            free = n1 * (p11 * f1 + p12 * f2) + n2 * (p21 * f1 + p22 * f2)
-            sign = min(1.0, max(-1.0, free / pull))
-        else:
-            sign = np.sign(n1 * x1 + n2 * x2)
-        f1 -= step * gain[0] * sign
-        f2 -= step * gain[1] * sign
-        x1, x2 = p11 * f1 + p12 * f2, p21 * f1 + p22 * f2
-        path[n, 0], path[n, 1] = x1, x2
-    state[0], state[1] = x1, x2

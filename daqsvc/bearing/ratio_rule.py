@@ -1,4 +1,4 @@
-"""Which race, by the energies of the two sliding units: their ratio, and the paper's absolute limits.
+"""Which race, by the ratio of the energies of the two sliding units.
 
 A fault of the inner race pushes the outer race's unit off its surface and leaves the inner race's unit in
 peace, and the other way round; a ball meets both races and pushes both off. With the model a little wrong the
@@ -74,31 +74,3 @@ class RatioRule:
         if abs(ratio_db) < self.boundary_db:
             return "ball"
         return "inner" if ratio_db > 0.0 else "outer"
-
-
-@dataclass(frozen=True, slots=True)
-class AbsoluteRule:
-    """The paper's logic: each unit against a limit of its own.
-
-    Attributes:
-        inner_limit: energy that the inner unit does not pass on a healthy machine.
-        outer_limit: the same for the outer unit.
-    """
-
-    inner_limit: float
-    outer_limit: float
-
-    def judge(self, energies: UnitEnergies) -> Race | Literal["normal"]:
-        """Name what the two bits say: a unit off its surface denies its own race.
-
-        Args:
-            energies: over a window.
-        """
-        denied = (energies.inner_unit > self.inner_limit, energies.outer_unit > self.outer_limit)
-        named: dict[tuple[bool, bool], Race | Literal["normal"]] = {
-            (False, False): "normal",
-            (False, True): "inner",
-            (True, False): "outer",
-            (True, True): "ball",
-        }
-        return named[denied]

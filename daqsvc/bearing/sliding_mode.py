@@ -1,11 +1,8 @@
-"""Sliding-mode detectors: the paper's unit in two states, and the two scalar units that the service runs.
+"""Sliding-mode detectors: two scalar units, one for each race.
 
-A unit slides on the line of its own fault direction and is pushed off by the other's. With a = 12 and b = 8
-the free dynamics have the poles -2 and -6, and with the sign of one output flipped the paper's directions
-(1, 2) and (1, 6) lie along the eigenvectors (1, -2) and (1, -6). The distance s = n . x from a surface then
-obeys s' = -mu s + n . r - K sgn(s) on its own, with mu = 6 for the inner unit and 2 for the outer one: the
-unit is a leaky sum with a soft threshold. A unit with the paper's bare directions has a coupled s, and its
-matched unit may leave before the other does.
+A unit slides on a surface that its own fault does not leave, and is pushed off by the other's. Its distance s
+from there obeys s' = -mu s + n . r - K sgn(s): a leaky sum with a soft threshold. The paper's units, in two
+states each, are in `sim_hw.reproduce.bearing.paper_units`.
 """
 
 from __future__ import annotations
@@ -20,91 +17,6 @@ from daqsvc.bearing import kernels
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import Floats
-
-STIFFNESS, DAMPING = 12.0, 8.0
-"""a in 1/s^2 and b in 1/s of the free dynamics, chosen so that both surfaces are their eigenvectors."""
-INNER_SLOPE, OUTER_SLOPE = -2.0, -6.0
-"""Slopes of the two surfaces: the paper's directions, the sign of the second output flipped."""
-
-
-@dataclass(frozen=True, slots=True)
-class PaperUnit:
-    """One detection unit of the paper, in its two states and its normalised time.
-
-    Attributes:
-        slope: x2 / x1 of the sliding surface.
-        gain: k1 and k2; the surface is attractive where k2 - slope k1 > 0.
-        a: of the free dynamics, 1/s^2.
-        b: of the free dynamics, 1/s.
-
-    Raises:
-        ValueError: the surface is not attractive, or the free dynamics are not stable.
-    """
-
-    slope: float
-    gain: tuple[float, float]
-    a: float = STIFFNESS
-    b: float = DAMPING
-
-    def __post_init__(self) -> None:
-        if self.pull <= 0.0:
-            raise ValueError(
-                f"sliding unit: gain {self.gain} pulls the state away from the surface of slope "
-                f"{self.slope:g}; k2 - slope k1 must be above 0"
-            )
-        if self.a <= 0.0 or self.b <= 0.0:
-            raise ValueError(
-                f"sliding unit: a {self.a:g} and b {self.b:g}; both must be above 0 (stable free dynamics)"
-            )
-
-    @property
-    def pull(self) -> float:
-        """K = n . k, at which the switching pulls the distance to 0; an input beyond it wins."""
-        return self.gain[1] - self.slope * self.gain[0]
-
-    @property
-    def decay(self) -> float | None:
-        """Rate mu in 1/s where the surface is an eigenvector of the free dynamics; else None (coupled)."""
-        other = self.a / -self.slope if self.slope else math.inf
-        return other if math.isclose(self.b, other - self.slope, rel_tol=1e-9) else None
-
-    def distance(self, path: Floats) -> Floats:
-        """Distance s = x2 - slope x1 of states float64 ``[n, 2]``."""
-        return np.asarray(path[:, 1] - self.slope * path[:, 0])
-
-    def run(
-        self,
-        residual: Floats,
-        step: float,
-        *,
-        start: tuple[float, float] = (0.0, 0.0),
-        implicit: bool = True,
-    ) -> Floats:
-        """Drive the unit with a residual.
-
-        Args:
-            residual: float64 ``[n, 2]``.
-            step: of time.
-            start: state before the first step.
-            implicit: whether the sign is solved for at the end of each step (projected Euler): no chatter at
-                any step. The explicit sign chatters by about half a step times K.
-
-        Returns:
-            float64 ``[n, 2]``, the state after each step.
-        """
-        path = np.empty((len(residual), 2))
-        kernels.slide_in_two_states(
-            np.ascontiguousarray(residual, dtype=np.float64),
-            self.a,
-            self.b,
-            self.slope,
-            np.array(self.gain),
-            step,
-            implicit,
-            np.array(start, dtype=np.float64),
-            path,
-        )
-        return path
 
 
 @dataclass(frozen=True, slots=True)

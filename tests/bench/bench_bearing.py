@@ -16,16 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from targets import Targets
 
-from daqsvc.bearing.parameter_sets import S3
 from daqsvc.bearing.residual import TwoSensorResidual
-from daqsvc.bearing.sliding_mode import (
-    DAMPING,
-    INNER_SLOPE,
-    OUTER_SLOPE,
-    STIFFNESS,
-    SlidingGains,
-    SlidingPair,
-)
+from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair
+from sim_hw.reproduce.bearing.design import S3
+from sim_hw.reproduce.bearing.paper_units import DAMPING, INNER_SLOPE, OUTER_SLOPE, STIFFNESS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,6 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify_file import load_bearing_baseline, save_bearing_baseline
-from daqsvc.bearing.parameter_sets import S3
 from daqsvc.bearing.two_sensors import PairModel
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.direction import TwoSensors
@@ -26,6 +25,7 @@ from daqsvc.settings import parse_machine_file
 from sim_hw.demo.session import DemoSession, Script
 from sim_hw.link_faults import LinkFaults
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
+from sim_hw.reproduce.bearing.design import S3
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

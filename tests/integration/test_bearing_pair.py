@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from machine_files import MACHINES, changed
 
-from daqsvc.bearing.parameter_sets import S3
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
+from sim_hw.reproduce.bearing.design import S3
 
 if TYPE_CHECKING:
     from pathlib import Path

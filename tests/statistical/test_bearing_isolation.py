@@ -19,9 +19,9 @@ import pytest
 from rotor_runs import seeds
 from scipy.stats import beta
 
-from daqsvc.bearing.parameter_sets import S1, S2, S3
 from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
+from sim_hw.reproduce.bearing.design import S1, S2, S3
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import BearingParameters

@@ -7,9 +7,9 @@ import pytest
 
 from daqsvc.bearing.isolation import IsolationRule, isolation_spectrum
 from daqsvc.bearing.likelihood import WhittleDetector, detection_spectrum
-from daqsvc.bearing.parameter_sets import S1, S3
 from daqsvc.bearing.residual import TwoSensorResidual
 from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
+from sim_hw.reproduce.bearing.design import S1, S3
 
 RATE_HZ = 48_000.0
 

@@ -10,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_bearing_model import random_parameters
 
-from daqsvc.bearing.detection_filter import (
+from daqsvc.bearing.model import BearingModel
+from daqsvc.bearing.residual import DELAY, TwoSensorResidual
+from sim_hw.reproduce.bearing.design import (
+    S1,
+    S2,
+    S3,
     fixed_eigenvalues,
     literal_transfer,
     paper_gain,
@@ -18,9 +23,6 @@ from daqsvc.bearing.detection_filter import (
     separating_gain,
     separation_deg,
 )
-from daqsvc.bearing.model import BearingModel
-from daqsvc.bearing.parameter_sets import S1, S2, S3
-from daqsvc.bearing.residual import DELAY, TwoSensorResidual
 
 EVERY = [S1, S2, S3]
 RATE_HZ = 48_000.0

@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.bearing.checks import check, fault_space_condition, invariant_zeros, observability
 from daqsvc.bearing.model import BearingModel, BearingParameters
-from daqsvc.bearing.parameter_sets import S1, S2, S2_EIGENVALUE, S3, S3_EIGENVALUE
 from sim_hw.plants.bearing import BearingMachine
+from sim_hw.reproduce.bearing.design import (
+    S1,
+    S2,
+    S2_EIGENVALUE,
+    S3,
+    S3_EIGENVALUE,
+    check,
+    fault_space_condition,
+    invariant_zeros,
+    observability,
+)
 
 FREQUENCY_HZ = np.geomspace(1.0, 20_000.0, 300)
 EVERY = [S1, S2, S3]

@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.bearing.parameter_sets import S3
-from daqsvc.bearing.ratio_rule import AbsoluteRule, RatioRule
-from daqsvc.bearing.sliding_mode import (
-    INNER_SLOPE,
-    OUTER_SLOPE,
-    PaperUnit,
-    SlidingGains,
-    SlidingPair,
-    UnitEnergies,
-)
+from daqsvc.bearing.ratio_rule import RatioRule
+from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair, UnitEnergies
+from sim_hw.reproduce.bearing.design import S3
+from sim_hw.reproduce.bearing.paper_units import INNER_SLOPE, OUTER_SLOPE, AbsoluteRule, PaperUnit
 
 INNER = PaperUnit(INNER_SLOPE, (2.0 / 5**0.5, 1.0 / 5**0.5))
 OUTER = PaperUnit(OUTER_SLOPE, (6.0 / 37**0.5, 1.0 / 37**0.5))

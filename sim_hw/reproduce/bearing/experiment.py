@@ -13,12 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import lfilter
 
-from daqsvc.bearing.detection_filter import paper_gain, residual_transfer, separating_gain, separation_deg
 from daqsvc.bearing.model import BearingModel
-from daqsvc.bearing.parameter_sets import S2, S2_EIGENVALUE, S3
-from daqsvc.bearing.sliding_mode import INNER_SLOPE, OUTER_SLOPE, PaperUnit
 from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
+from sim_hw.reproduce.bearing.design import (
+    S2,
+    S2_EIGENVALUE,
+    S3,
+    paper_gain,
+    residual_transfer,
+    separating_gain,
+    separation_deg,
+)
+from sim_hw.reproduce.bearing.paper_units import INNER_SLOPE, OUTER_SLOPE, PaperUnit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
