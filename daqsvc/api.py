@@ -8,8 +8,8 @@ with a new major version.
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import Clock
+from daqsvc.acquisition.link import Link
 from daqsvc.acquisition.samples import SampleBlock
-from daqsvc.acquisition.supervisor import Link
 from daqsvc.diagnosis.detector import Detector, Window
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.text_validation import printable, refuse_twice
 from daqsvc.outbox.files import is_possessed, is_read_only

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.acquisition.link import Link
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.acquisition.standing import Tell
-    from daqsvc.acquisition.supervisor import Link
     from daqsvc.acquisition.timebase import TimeBaseState
 
 LayoutT = TypeVar("LayoutT")

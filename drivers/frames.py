@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from drivers.field_group import FieldGroup
-from drivers.fields import ByteOrder, Field, Kind, LayoutError, RawValues, j1939_valid_raw
+from drivers.fields import ByteOrder, Field, FieldGroup, Kind, LayoutError, RawValues, j1939_valid_raw
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

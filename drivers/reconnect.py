@@ -1,14 +1,16 @@
-"""What all drivers have in common: a link that is tried again, and blocking calls that end in order."""
+"""What all drivers have in common: a link that is tried again, and threads that end in order."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import logging
+import threading
+from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
 
@@ -17,12 +19,14 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from threading import Thread
 
-    from daqsvc.acquisition.supervisor import Link
+    from daqsvc.acquisition.link import Link
     from drivers.base import BusCounters, BusPort
+
+
+logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-logger = logging.getLogger(__name__)
 
 LOOK_S = 1.0
 """How often to look whether a thread that is waited for still lives."""
@@ -165,3 +169,60 @@ async def in_thread(
 def _undo_late(undo: Callable[[T], object], outcome: Future[T]) -> None:
     if outcome.exception() is None:
         undo(outcome.result())
+
+
+def words(error: BaseException) -> str:
+    """An error as a person should read it."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return f"{error}" or type(error).__name__
+
+
+Call: TypeAlias = "tuple[Callable[..., object], tuple[Any, ...]]"
+
+
+class HandOver:
+    """Has calls made on the event loop in their order, one in each turn.
+
+    Args:
+        loop: the event loop.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._calls: deque[Call] = deque()
+        self._lock = threading.Lock()
+        self._due = False
+
+    def post(self, call: Callable[..., object], *arguments: object) -> None:
+        """Have ``call`` made; from any thread.
+
+        Raises:
+            RuntimeError: the event loop is closed.
+        """
+        with self._lock:
+            self._calls.append((call, arguments))
+            if self._due:
+                return
+            self._due = True
+        self._loop.call_soon_threadsafe(self._next)
+
+    def finish(self) -> None:
+        """Make at once all calls that wait; on the event loop, when nobody posts any more."""
+        while self._calls:
+            self._make()
+
+    def _next(self) -> None:
+        """Make the next call, and come back for the one after it when all others had their turn."""
+        try:
+            if self._calls:
+                self._make()
+        finally:
+            with self._lock:
+                self._due = bool(self._calls)
+                if self._due:
+                    self._loop.call_soon(self._next)
+
+    def _make(self) -> None:
+        call, arguments = self._calls.popleft()
+        call(*arguments)

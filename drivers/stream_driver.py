@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.supervisor import Link
+from daqsvc.acquisition.link import Link
 from drivers.base import BusCounters
 from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.sim_command_order import NodeError
 

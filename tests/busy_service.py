@@ -17,7 +17,7 @@ from machine_files import MACHINES
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit

@@ -11,7 +11,7 @@ from brokers import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.service import Service
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.arrival_rate import ArrivalRate
+from daqsvc.acquisition.arrivals import ArrivalRate
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
@@ -78,7 +78,7 @@ class StreamAssembler:
         stream: name of the stream.
         rate_hz: nominal sampling rate.
         counter_bits: width of the device's counter; None if it sends none, and loss can only be estimated
-            from the times of arrival (`daqsvc.acquisition.arrival_count`).
+            from the times of arrival (`daqsvc.acquisition.arrivals`).
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         deliver: called with each block, in order, from the thread that calls `accept`.

@@ -22,7 +22,7 @@ from daqsvc.recording.recording import Recording
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
 from drivers.can.batches import DecodedBatch, FrameDemultiplexer
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from drivers.can.settings import DbcLayout, PlainLayout
 from drivers.replay.can_log import CanLog
 from drivers.replay.files import RecordedLogError as LogError

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.publish.certificates import CertificateError, certificate, issuer_of
 from daqsvc.publish.command_intake import CommandIntake

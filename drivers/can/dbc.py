@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.settings.files import UnreadableFileError, read_bounded, shortened
+from daqsvc.settings.packing import LARGEST_SCALE, LEAST_SCALE
+from daqsvc.settings.problems import Finding, choice
+from drivers.can.settings import DbcMessage
 from drivers.frames import ByteOrder, Counts, Field, FrameLayout, Kind, LayoutError, Selector
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
+
+    from daqsvc.settings.problems import KeyPath
+    from drivers.can.settings import DbcLayout
 
 
 def layout_from_dbc(
@@ -110,3 +119,224 @@ def selecting_values(signals: Mapping[str, Signal], names: Iterable[str]) -> dic
             wanted[signal.multiplexer_signal] = wanted.get(signal.multiplexer_signal, ids) & ids
             signal = signals[signal.multiplexer_signal]
     return wanted
+
+
+MOST_DBC_BYTES = 4 << 20
+"""A larger DBC file describes more messages than a car has; reading it takes minutes."""
+
+
+# Start, length or page of a signal, or length of a message, of which the parser would make a list each.
+_ENDLESS = re.compile(
+    r"\bSG_\s[^:@]{0,200}:[^@(]{0,60}?\d{6}|\bBO_\s[^:]{0,200}:\s{0,20}\d{6}|\d\s{0,9}-\s{0,9}\d{6}"
+)
+_STRING = re.compile(r'"[^"]*"')
+
+
+def check_dbc(layout: DbcLayout, file: Path, at: KeyPath) -> tuple[DbcMessage | None, list[Finding]]:
+    """Read the message that ``layout`` names and look for its signals.
+
+    Args:
+        layout: names the message and its signals.
+        file: the DBC file, as an absolute path.
+        at: key path of the layout.
+
+    Returns:
+        The message, or None if it cannot be had; and what is wrong.
+    """
+    database = _database(file, at)
+    if isinstance(database, Finding):
+        return None, [database]
+    messages = {message.name: message for message in database.messages}
+    if layout.message not in messages:
+        return None, [
+            Finding((*at, "message"), f"{file} has no such message", choice(layout.message, messages))
+        ]
+    message = messages[layout.message]
+    facts = DbcMessage(
+        frame_id=message.frame_id,
+        extended=message.is_extended_frame,
+        length=message.length,
+        signal_bits={signal.name: signal.length for signal in message.signals},
+        signal_units={signal.name: signal.unit or "" for signal in message.signals},
+        signal_ranges={signal.name: _range(signal) for signal in message.signals if not signal.is_float},
+        any_priority=message.protocol == "j1939",
+        pages=_pages(message, [name for _, name in _asked(layout, at)]),
+    )
+    return facts, list(_signal_findings(layout, message, at))
+
+
+def _database(file: Path, at: KeyPath) -> Database | Finding:
+    """What the DBC file describes, or why it cannot be had."""
+    here = (*at, "dbc")
+    try:
+        from cantools.database import can, load_string  # noqa: PLC0415 - an extra, and slow to import
+    except ImportError:
+        return Finding(here, "needs cantools, which is not installed", "pip install 'daqsvc[dbc]'")
+    try:
+        data = read_bounded(file, MOST_DBC_BYTES)
+    except UnreadableFileError as error:
+        remedy = error.remedy
+        if isinstance(error.__cause__, FileNotFoundError):
+            return Finding(
+                here,
+                f"there is no file {file}",
+                "correct the path; a relative one starts at the directory of the machine file",
+            )
+        return Finding(here, f"{file} {error}", remedy)
+    text = data.decode("cp1252", "replace")
+    try:
+        _see_sizes(text)
+        database = load_string(text, "dbc")
+    except Exception as error:  # noqa: BLE001 - the parser raises what it likes: of lookups, numbers, recursion
+        reason = shortened(" ".join(str(error).split()) or type(error).__name__, 200)
+        return Finding(
+            here,
+            f"{file} cannot be read as a DBC file: {reason}",
+            "open it in the tool it came from and export it as DBC again",
+        )
+    if not isinstance(database, can.Database):
+        return Finding(here, f"{file} describes no CAN messages", "give another DBC file")
+    return database
+
+
+def _see_sizes(text: str) -> None:
+    """See that the parser will come to an end.
+
+    Raises:
+        ValueError: it would make lists of what has no end.
+    """
+    plain = _STRING.sub(lambda found: "\n" * found[0].count("\n"), text)
+    if (found := _ENDLESS.search(plain)) is not None:
+        line = plain.count("\n", 0, found.start()) + 1
+        raise ValueError(f"line {line} has a number of bits, bytes or pages that no message has")
+
+
+def _range(signal: Signal) -> tuple[float, float]:
+    """What the raw bits can carry, in the unit of the signal."""
+    bits = signal.length
+    least, largest = (
+        (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1) if signal.is_signed else (0.0, 2.0**bits - 1)
+    )
+    ends = [float(raw * float(signal.scale) + float(signal.offset)) for raw in (least, largest)]
+    return min(ends), max(ends)
+
+
+def _asked(layout: DbcLayout, at: KeyPath) -> list[tuple[KeyPath, str]]:
+    """The signals that a layout names, and where."""
+    asked: list[tuple[KeyPath, str]] = []
+    if layout.counter is not None:
+        asked.append(((*at, "counter", "signal"), layout.counter.signal))
+    for index, channel in enumerate(layout.channels):
+        asked += [
+            ((*at, "channels", index, "signals", place), name) for place, name in enumerate(channel.signals)
+        ]
+    return asked
+
+
+def _pages(message: Message, names: Iterable[str]) -> dict[str, frozenset[int]]:
+    """As the driver reads the signals; no values of a multiplexer where no frame holds them all."""
+    signals = {signal.name: signal for signal in message.signals}
+    pages: dict[str, frozenset[int]] = {}
+    for name in names:
+        signal = signals.get(name)
+        while signal is not None and signal.multiplexer_signal is not None:
+            ids = frozenset(signal.multiplexer_ids or ())
+            pages[signal.multiplexer_signal] = pages.get(signal.multiplexer_signal, ids) & ids
+            signal = signals.get(signal.multiplexer_signal)
+    return pages
+
+
+def _signal_findings(layout: DbcLayout, message: Message, at: KeyPath) -> Iterator[Finding]:
+    signals = {signal.name: signal for signal in message.signals}
+    asked = _asked(layout, at)
+    for path, name in asked:
+        if name not in signals:
+            yield Finding(path, f'message "{message.name}" has no such signal', choice(name, signals))
+    names = [name for _, name in asked]
+    if not all(_pages(message, names).values()):
+        yield Finding(
+            (*at, "channels"),
+            f'no frame of message "{message.name}" holds all of {", ".join(names)}: they are on different '
+            "pages of its multiplexer",
+            "make a stream for each page, with a counter that is on it",
+        )
+    if layout.counter is not None and layout.counter.signal in signals:
+        yield from _counter(signals[layout.counter.signal], (*at, "counter", "signal"))
+    for path, name in asked:
+        signal = signals.get(name)
+        if signal is not None:
+            yield from _place(signal, message.length, path)
+
+
+def _counter(counter: Signal, at: KeyPath) -> Iterator[Finding]:
+    """The counter counts from 0 upwards, by 1, over all of its bits."""
+    if counter.is_signed or counter.is_float:
+        yield Finding(
+            at,
+            "is signed or a float; a counter runs from 0 upwards and wraps",
+            "name the signal that counts, or declare it unsigned (@1+) in the DBC file",
+        )
+    elif counter.scale != 1:
+        yield Finding(
+            at,
+            f"has the scale {counter.scale:g} in the DBC file: the raw value is counted, and one count of it "
+            "would then be something else than a frame or a sample",
+            "name a signal that grows by 1; if this one does, write (1,0) in the DBC file",
+        )
+    elif counter.maximum is not None:
+        largest, all_ones = float(counter.maximum) - float(counter.offset), 2**counter.length - 1
+        if largest != all_ones:
+            yield Finding(
+                at,
+                f"ends at {largest:g} by the DBC file: unless it goes on to {all_ones}, samples that were "
+                "not lost count as lost at each of its turns",
+                "see what the device sends: if it ends there, write no_counter = true in place of counter, "
+                "else correct the range in the DBC file",
+                fatal=False,
+            )
+
+
+def _place(signal: Signal, length: int, at: KeyPath) -> Iterator[Finding]:
+    """The signal lies within its message."""
+    if signal.start < 0 or _end_bit(signal) > 8 * length:
+        yield Finding(
+            at,
+            f"does not lie within the {length} bytes of its message in the DBC file",
+            "correct the signal, or the length of the message, in the DBC file",
+        )
+    if at[-2] == "signals":
+        yield from _scale(signal, at)
+
+
+def _end_bit(signal: Signal) -> int:
+    """One past the last bit of a signal, as they go over the bus."""
+    if signal.byte_order == "little_endian":
+        return int(signal.start + signal.length)
+    return int(8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length)
+
+
+def _scale(signal: Signal, at: KeyPath) -> Iterator[Finding]:
+    """Samples can be told apart, and are numbers."""
+    scale, offset = float(signal.scale), float(signal.offset)
+    if scale == 0:
+        yield Finding(
+            at,
+            "has the scale 0 in the DBC file, which would make every sample the same",
+            "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+        )
+    elif not LEAST_SCALE <= abs(scale) <= LARGEST_SCALE or not abs(offset) <= LARGEST_SCALE:
+        yield Finding(
+            at,
+            f"has the scale {scale:g} and the offset {offset:g} in the DBC file, which no quantity has",
+            "write in the DBC file what one count of the raw value is worth, e.g. (0.0005,0)",
+        )
+    if signal.is_float and signal.length not in {32, 64}:
+        yield Finding(
+            at,
+            f"is a float of {signal.length} bits in the DBC file, and there is none",
+            "correct its length to 32 or 64, or its type (SIG_VALTYPE_), in the DBC file",
+        )
+    elif not 1 <= signal.length <= 64:
+        yield Finding(
+            at, f"has {signal.length} bits in the DBC file", "correct its length there: a number has 1 to 64"
+        )

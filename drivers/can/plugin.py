@@ -5,8 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from daqsvc.settings.buses import percent
+from daqsvc.settings.plugins import StreamWords
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import UnusableValueError
 from drivers.can.checks import (
+    bus_share,
     check_bus_load,
     check_can_keys,
     check_counter,
@@ -17,11 +21,11 @@ from drivers.can.checks import (
     check_plain_layout,
     check_recorded_buses,
     check_signals,
+    frame_facts,
 )
-from drivers.can.dbc_file import check_dbc
+from drivers.can.dbc import check_dbc, layout_from_dbc
 from drivers.can.settings import CanBus, DbcLayout, PlainLayout
-from drivers.can.words import bus_words, stream_words
-from drivers.plugin import DriverPlugin
+from drivers.plugin import DriverPlugin, packed_layout, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -29,7 +33,6 @@ if TYPE_CHECKING:
 
     from daqsvc.settings.buses import Bus, Layout
     from daqsvc.settings.models import MachineFile, Stream
-    from daqsvc.settings.plugins import StreamWords
     from daqsvc.settings.problems import Finding, KeyPath
     from drivers.base import BusPort, Driver
     from drivers.frames import FrameLayout
@@ -85,8 +88,6 @@ class CanPlugin(DriverPlugin[CanBus]):
 
     def stream_layout(self, machine: MachineFile, stream: str) -> FrameLayout:
         """See `DriverPlugin.stream_layout`."""
-        from drivers.can.build import frame_layout  # noqa: PLC0415 - only the service needs it
-
         return frame_layout(machine, stream)
 
     def options(self, machine: MachineFile, bus: CanBus) -> dict[str, Any]:
@@ -102,3 +103,81 @@ class CanPlugin(DriverPlugin[CanBus]):
 
         del bus
         return CanDriver(port)
+
+
+def bus_words(machine: MachineFile, name: str) -> str:
+    """See `BusTable.describe_bus`."""
+    bus = machine.buses[name]
+    assert isinstance(bus, CanBus)  # noqa: S101 - for the type checker
+    parts = [f"{'CAN FD' if bus.fd else 'classic CAN'}, {bus.interface} {bus.channel}"]
+    if bus.bitrate is not None:
+        parts.append(_bit_rate(bus.bitrate))
+    if bus.fd and bus.data_bitrate is not None:
+        parts.append(f"data {_bit_rate(bus.data_bitrate)}")
+    if bus.options:
+        parts.append(f"options {' '.join(sorted(bus.options))}")
+    streams = [key for key, stream in machine.streams.items() if stream.bus == name]
+    loads = [bus_share(machine, key, machine.layout_facts.get(key)) for key in streams]
+    known = [load for load in loads if load is not None]
+    if loads and len(known) == len(loads):
+        load = percent(sum(least for least, _ in known), sum(most for _, most in known))
+        parts.append(f"load about {load} of the bus")
+    if bus.record is not None:
+        parts.append(
+            f"recorded as {bus.record.format} in {bus.record.folder}, {bus.record.keep_mb} MB at most"
+        )
+    return ", ".join(parts)
+
+
+def stream_words(machine: MachineFile, name: str) -> StreamWords:
+    """See `BusTable.describe_stream`."""
+    stream = machine.streams[name]
+    layout = stream.layout
+    assert isinstance(layout, PlainLayout | DbcLayout)  # noqa: S101 - for the type checker
+    facts = frame_facts(stream, machine.layout_facts.get(name))
+    share = bus_share(machine, name, machine.layout_facts.get(name))
+    shown_share = "" if share is None else percent(*share)
+    if facts is None:
+        return StreamWords(share=shown_share)
+    samples = f"{facts.samples_per_frame} x {len(layout.channels)} samples"
+    return StreamWords(
+        f"{facts.frame_id:#x}",
+        f"{stream.rate_hz / facts.samples_per_frame:.4g}/s",
+        f"{facts.length} bytes, {samples}",
+        "none: by time" if layout.counter is None else f"{facts.counter_bits} bit {layout.counter.counts}",
+        shown_share,
+    )
+
+
+def _bit_rate(rate: int) -> str:
+    return f"{rate / 1_000_000:g} Mbit/s" if rate >= 1_000_000 else f"{rate / 1000:g} kbit/s"
+
+
+def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
+    """The layout of a stream of CAN frames, decoding straight to the physical units of its sensors.
+
+    Raises:
+        AssemblyError: the stream does not come in CAN frames.
+        LayoutError: the DBC file does not hold what the machine file says.
+    """
+    given = machine.streams[stream].layout
+    if isinstance(given, DbcLayout):
+        layout = layout_from_dbc(
+            machine.resolve(given.dbc),
+            given.message,
+            counter=None if given.counter is None else given.counter.signal,
+            counts="frames" if given.counter is None else given.counter.counts,
+            channels={channel.name: channel.signals for channel in given.channels},
+            valid_raw={c.name: c.valid_raw for c in given.channels if c.valid_raw is not None},
+        )
+    elif isinstance(given, PlainLayout):
+        layout = packed_layout(
+            given,
+            given.length,
+            frame_id=given.id,
+            extended=given.extended,
+            any_priority=given.any_priority,
+        )
+    else:
+        raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames")
+    return layout.in_units(units_of(machine, stream))

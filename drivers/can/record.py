@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.can.kernel_time import monotonic_minus_wall_ns
-from drivers.can.reader import words
-from drivers.can.record_files import LogFile, LogFolder, OneLog
-from drivers.can.record_formats import encoder_for
+from drivers.can.record_files import LogFile, LogFolder, OneLog, encoder_for
+from drivers.reconnect import words
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock

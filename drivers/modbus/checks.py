@@ -1,32 +1,36 @@
-"""Whether what a machine file says of Modbus lines and of the layouts on them fits together."""
+"""Whether what a machine file says of Modbus lines and of the layouts on them fits together.
+
+No two numbers are in one register, and nothing is written among samples.
+"""
 
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.settings.buses import BUSY
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from drivers.modbus.load import USUAL_ANSWER_S, line_load
-from drivers.modbus.overlaps import check_channel_overlaps
 from drivers.modbus.settings import (
     FIFO_REGISTERS,
     MAX_REGISTERS,
     FifoLayout,
     ModbusRtuBus,
     ModbusTcpBus,
+    RegisterChannel,
     RegistersLayout,
     RingLayout,
     WaveformLayout,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import KeyPath
-    from drivers.modbus.settings import ModbusLayout
+    from drivers.modbus.settings import ModbusLayout, SampleChannel
+
 
 ADDRESSES = 65_536
 _LAYOUTS = (RegistersLayout, FifoLayout, RingLayout, WaveformLayout)
@@ -173,3 +177,159 @@ def _check_writes(
                 f"add {{ unit = {layout.unit}, address = {address}, count = {count} }} to writes in "
                 f"[buses.{name}]",
             )
+
+
+class _Block(NamedTuple):
+    """Registers of a unit that hold one thing."""
+
+    first: int
+    registers: int
+    what: str
+    path: KeyPath
+
+    @property
+    def last(self) -> int:
+        return self.first + self.registers - 1
+
+    def overlaps(self, other: _Block) -> bool:
+        return self.first <= other.last and other.first <= self.last
+
+
+def check_channel_overlaps(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
+    """No register is a part of two numbers, but where each takes its own bits of it."""
+    key = "address" if isinstance(layout, RegistersLayout) else "place"
+    channels: Sequence[RegisterChannel | SampleChannel] = layout.channels
+    placed = [(_first(channel), index, channel) for index, channel in enumerate(channels)]
+    widest: tuple[int, SampleChannel | RegisterChannel] | None = None
+    for first, index, other in sorted(placed, key=lambda item: item[:2]):
+        if widest is not None:
+            yield from _clash(*widest, first, other, (*path, "channels", index, key))
+        if widest is None or first + other.registers > widest[0] + widest[1].registers:
+            widest = first, other
+
+
+def _clash(
+    begin: int,
+    one: RegisterChannel | SampleChannel,
+    first: int,
+    other: RegisterChannel | SampleChannel,
+    at: KeyPath,
+) -> Iterator[Finding]:
+    """What there is to say of two numbers, of which the other one does not begin before the first."""
+    end = begin + one.registers
+    if first >= end:
+        return
+    whole = first == begin and one.type == other.type
+    if whole and one.bits is not None and other.bits is not None and _apart(one.bits, other.bits):
+        return
+    floats = one.type.startswith("float") or other.type.startswith("float")
+    # The same number twice, or words of a long whole number by themselves, may be meant.
+    within = first + other.registers <= end
+    yield Finding(
+        at,
+        f'is part of {one.type} "{one.name}" too, which takes registers {begin} to {end - 1}',
+        f"correct the two: {one.type} takes {one.registers} register{'s' if one.registers > 1 else ''}, "
+        f"so the next number begins at {end} or later",
+        fatal=not whole and (floats or not within),
+    )
+
+
+def _first(channel: RegisterChannel | SampleChannel) -> int:
+    return channel.address if isinstance(channel, RegisterChannel) else channel.place
+
+
+def _apart(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    return one[0] + one[1] <= other[0] or other[0] + other[1] <= one[0]
+
+
+def check_writes_and_samples(draft: MachineFile) -> Iterator[Finding]:
+    """What is written, and what tells that there is something new, lies beside the samples."""
+    taken: dict[_Place, list[tuple[str, _Block]]] = {}
+    controls: list[tuple[_Place, str, _Block]] = []
+    for name, stream in draft.streams.items():
+        with suppress(UnusableValueError):
+            layout, path = stream.layout, ("streams", name, "layout")
+            if not isinstance(layout, _LAYOUTS):
+                continue
+            table = "fifo" if isinstance(layout, FifoLayout) else layout.table
+            at = _Place(stream.bus, layout.unit, table)
+            taken.setdefault(at, []).extend((name, block) for block in _samples(layout, path))
+            controls += [
+                (at._replace(table=in_table), name, control) for in_table, control in _controls(layout, path)
+            ]
+    for number, (place, name, control) in enumerate(controls):
+        mine = [other for there, owner, other in controls[:number] if (there, owner) == (place, name)]
+        yield from _among_samples(control, name, taken.get(place, []))
+        yield from _twice(control, mine)
+
+
+class _Place(NamedTuple):
+    """Where registers are."""
+
+    bus: str
+    unit: int
+    table: str
+
+
+_REMEDY = "correct the address of one of them, as in the device's register map"
+
+
+def _among_samples(control: _Block, name: str, samples: Sequence[tuple[str, _Block]]) -> Iterator[Finding]:
+    for owner, block in samples:
+        if control.overlaps(block):
+            whose = block.what if owner == name else f'{block.what} of stream "{owner}"'
+            yield Finding(
+                control.path,
+                f"register {control.first} is {control.what}, but lies among {whose}, registers "
+                f"{block.first} to {block.last}",
+                _REMEDY,
+            )
+            return
+
+
+def _twice(control: _Block, others: Sequence[_Block]) -> Iterator[Finding]:
+    for other in others:
+        if control.overlaps(other):
+            yield Finding(
+                control.path,
+                f"register {control.first} is {other.what} already, and cannot be {control.what} too",
+                _REMEDY,
+            )
+            return
+
+
+def _samples(layout: ModbusLayout, path: KeyPath) -> Iterator[_Block]:
+    if isinstance(layout, RegistersLayout):
+        for index, channel in enumerate(layout.channels):
+            at = (*path, "channels", index, "address")
+            yield _Block(channel.address, channel.registers, f'channel "{channel.name}"', at)
+    elif isinstance(layout, RingLayout):
+        yield _Block(layout.address, layout.depth * layout.sample_registers, "the ring", (*path, "address"))
+    elif isinstance(layout, WaveformLayout):
+        whole = layout.samples * layout.sample_registers
+        count = whole if layout.page is None else min(whole, layout.page.registers)
+        yield _Block(layout.address, count, "the samples of a block", (*path, "address"))
+
+
+def _controls(layout: ModbusLayout, path: KeyPath) -> Iterator[tuple[str, _Block]]:
+    """Registers that steer the reading, each with its table; only holding ones can be written."""
+    if isinstance(layout, RingLayout):
+        count = layout.count
+        at = (*path, "count", "address")
+        yield layout.table, _Block(count.address, count.bits // 16, "the count of the ring", at)
+    elif isinstance(layout, FifoLayout) and layout.acknowledge is not None:
+        at = (*path, "acknowledge")
+        yield (
+            "holding",
+            _Block(layout.acknowledge, layout.count.bits // 16, "where a queue is acknowledged", at),
+        )
+    elif isinstance(layout, WaveformLayout):
+        yield layout.table, _Block(layout.block_id, 1, "the id of the block", (*path, "block_id"))
+        if layout.page is not None:
+            yield (
+                "holding",
+                _Block(layout.page.select, 1, "the choice of the page", (*path, "page", "select")),
+            )
+        if layout.trigger is not None:
+            at = (*path, "trigger", "address")
+            yield "holding", _Block(layout.trigger.address, 1, "the trigger", at)

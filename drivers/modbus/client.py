@@ -1,26 +1,46 @@
-"""The Modbus client: requests as pymodbus encodes them, one at a time, and what came of each.
+"""The Modbus client: one request at a time, and its reply told from all else that comes.
 
-Only this module and `drivers.modbus.wire` import pymodbus. Reconnecting, quiet times and retries are not
-their business: see `drivers.modbus.line`.
+Only this module imports pymodbus. Reconnecting, quiet times and retries are not its business: see
+`drivers.modbus.line`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import socket
+import termios
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU
 from pymodbus.pdu.file_message import ReadFifoQueueRequest
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersRequest,
     ReadInputRegistersRequest,
     WriteMultipleRegistersRequest,
 )
+from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
-from drivers.modbus.outcomes import LineLostError, RequestRefusedError
-from drivers.modbus.replies import READ_HOLDING, READ_INPUT, register_bytes
-from drivers.modbus.wire import ModbusRequest, ModbusWire
+from daqsvc.acquisition.clock import NS_PER_S
+from drivers.modbus.replies import (
+    FAULTY,
+    READ_HOLDING,
+    READ_INPUT,
+    ExpectedReply,
+    LineLostError,
+    ModbusCounters,
+    NoReplyError,
+    ReplyVerdict,
+    RequestRefusedError,
+    judge_rtu,
+    judge_tcp,
+    register_bytes,
+)
+from drivers.tty import why_not_open
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,8 +48,300 @@ if TYPE_CHECKING:
     from pymodbus.pdu import ModbusPDU
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.modbus.outcomes import ModbusCounters
-    from drivers.modbus.wire import LineOptions
+    from drivers.tty import Parity
+
+
+logging.getLogger("pymodbus.logging").setLevel(
+    logging.CRITICAL
+)  # every fault is counted, and told once, here
+
+BITS_PER_CHARACTER = 11
+"""Start, eight data, parity and stop bits, or a second stop bit without parity."""
+
+LEAST_CONNECT_S = 1.0
+_BUFFER_BYTES = 4096
+_LAST_TRANSACTION = 0xFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class LineOptions:
+    """How to open a line, and how long to wait on it.
+
+    Attributes:
+        transport: Modbus TCP, or RTU on a serial port.
+        host: of a TCP server.
+        tcp_port: of a TCP server.
+        serial_port: device file of a serial port.
+        baud: bit/s of a serial port.
+        parity: of a serial port.
+        stop_bits: of a serial port.
+        timeout_ns: how long a unit may take to answer.
+    """
+
+    transport: Literal["tcp", "rtu"]
+    host: str = ""
+    tcp_port: int = 502
+    serial_port: str = ""
+    baud: int = 19_200
+    parity: Parity = "even"
+    stop_bits: Literal[1, 2] = 1
+    timeout_ns: int = NS_PER_S // 2
+
+    @property
+    def where(self) -> str:
+        """What a person calls the other end."""
+        return f"{self.host}:{self.tcp_port}" if self.transport == "tcp" else self.serial_port
+
+    @property
+    def gap_ns(self) -> int:
+        """Silence between serial frames: t3.5, at least 1.75 ms (Modbus over serial line 1.02, 2.5.1.1)."""
+        if self.transport == "tcp":
+            return 0
+        return max(round(3.5 * BITS_PER_CHARACTER * NS_PER_S / self.baud), 1_750_000)
+
+
+class ModbusRequest(NamedTuple):
+    """A request as it is sent.
+
+    Attributes:
+        unit: address of the unit.
+        pdu: function and data.
+        data_bytes: bytes of register data in the reply, see `ExpectedReply`.
+    """
+
+    unit: int
+    pdu: bytes
+    data_bytes: int | None
+
+
+class ModbusWire(ModbusProtocol):
+    """pymodbus' transport: one request goes out, and of all bytes that come in only its reply is taken.
+
+    pymodbus' own transactions sit between this and its client. They are left out: they skip faulty frames
+    without counting them, and take a turn of the event loop more for each request.
+
+    Args:
+        options: what to open.
+        clock: stamps when bytes last arrived.
+        counters: where faults are counted.
+
+    Attributes:
+        last_byte_ns: when bytes last arrived, monotonic; 0 if never.
+        why_lost: why there is no connection, if there is none.
+    """
+
+    def __init__(self, options: LineOptions, clock: Clock, counters: ModbusCounters) -> None:
+        super().__init__(_transport_of(options), is_server=False)
+        self.last_byte_ns = 0
+        self.why_lost = f"{options.where} is closed"
+        self._options = options
+        self._serial = options.transport == "rtu"
+        self._timeout_s = options.timeout_ns / NS_PER_S
+        self._framer = (FramerRTU if self._serial else FramerSocket)(DecodePDU(False))
+        self._clock = clock
+        self._counters = counters
+        self._transaction = 0
+        self._deadline_s = 0.0
+        self._alarm: asyncio.TimerHandle | None = None
+        self._expected: ExpectedReply | None = None
+        self._reply: asyncio.Future[bytes] = self.loop.create_future()
+
+    async def open(self) -> None:
+        """Open the connection or the port.
+
+        Raises:
+            LineLostError: it cannot be opened.
+        """
+        patience_s = max(self._timeout_s, LEAST_CONNECT_S)
+        try:
+            async with asyncio.timeout(patience_s):
+                self.transport, _ = await self.call_create()
+        except (OSError, ValueError, termios.error) as error:  # a time-out and pyserial's own are OSErrors
+            self._counters.open_failures += 1
+            why = self._why_not_open(error, patience_s)
+            raise LineLostError(f"it cannot be opened: {why}") from error
+
+    async def exchange(self, request: ModbusRequest) -> bytes:
+        """Send a request and wait for its reply.
+
+        Returns:
+            PDU of the reply, or of the refusal.
+
+        Raises:
+            LineLostError: the connection is gone.
+            NoReplyError: no sound reply came in time.
+        """
+        if self._waits:
+            raise RuntimeError(f"{self._options.where} is asked twice at once; wait for the first reply")
+        if not self._serial:
+            self._transaction = self._transaction % _LAST_TRANSACTION + 1
+        unit, pdu, data_bytes = request
+        self._expected = ExpectedReply(unit, pdu[0], data_bytes, self._transaction)
+        self._reply = self.loop.create_future()
+        self._deadline_s = self.loop.time() + self._timeout_s
+        if self._alarm is None:
+            self._alarm = self.loop.call_at(self._deadline_s, self._look_at_the_clock)
+        self._begin_anew()
+        self._throw_away()
+        try:
+            self.transport.write(self._framer.encode(pdu, unit, self._transaction))  # type: ignore[attr-defined]
+            return await self._reply
+        finally:
+            if self._serial and self._expected is not None and self.recv_buffer:
+                self._counters.note("truncated")  # this is all that came of the reply
+            self._expected = None
+            self._begin_anew()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what answers the request, count all else; see `asyncio.Protocol`."""
+        self.last_byte_ns = self._clock.monotonic_ns()
+        data = self.recv_buffer + data
+        while data:
+            verdict = self._judge(data)
+            if not verdict.used:
+                break
+            data = data[verdict.used :]
+            if verdict.fault is not None:
+                self._counters.note(verdict.fault)
+            if verdict.final:
+                self._settle(verdict)
+        self.recv_buffer = data
+
+    def callback_disconnected(self, exc: Exception | None) -> None:
+        """Let nobody wait for a reply that cannot come any more."""
+        self.why_lost = f"{self._options.where} has closed the connection" + (f" ({exc})" if exc else "")
+        self._fail(LineLostError(self.why_lost))
+
+    def callback_connected(self) -> None:
+        """Nothing to do: whoever opens the connection waits for it."""
+
+    def callback_data(self, data: bytes, addr: tuple[object, ...] | None = None) -> int:
+        """Never called: `data_received` takes all."""
+        raise RuntimeError(f"{len(data)} bytes from {addr} have not come through data_received")
+
+    def callback_new_connection(self) -> ModbusProtocol:
+        """Never called: this end connects, and does not listen."""
+        raise RuntimeError(f"{self._options.where} is a client's end and accepts no connection")
+
+    def _why_not_open(self, error: Exception, patience_s: float) -> str:
+        if self._serial:
+            return why_not_open(error, self._options.serial_port, "serial_port")
+        if isinstance(error, socket.gaierror):
+            return f"no address of {self._options.host!r} is known ({error.strerror}); correct host"
+        if isinstance(error, ConnectionRefusedError):
+            return "nobody listens there; start the server, or correct host and tcp_port"
+        if isinstance(error, TimeoutError):
+            return f"nobody answers there within {patience_s:g} s; correct host, or see to the network"
+        return f"{error}" or type(error).__name__
+
+    def _begin_anew(self) -> None:
+        """On a serial line, what came before a request or is left of it belongs to no reply."""
+        if self._serial:
+            self.recv_buffer = b""
+
+    def _throw_away(self) -> None:
+        """Throw away what waits in a serial port: it came while this process was kept from looking at it."""
+        port = getattr(self.transport, "sync_serial", None)
+        if port is None:
+            return
+        with contextlib.suppress(OSError, termios.error):  # a port that is gone: sending says so
+            if port.in_waiting:
+                port.reset_input_buffer()
+                self._counters.note("unasked")
+
+    def _judge(self, data: bytes) -> ReplyVerdict:
+        if len(data) > _BUFFER_BYTES:
+            return ReplyVerdict(len(data), fault="oversized", final=True)
+        if not self._serial:
+            return judge_tcp(data, self._expected)
+        if self._expected is None:
+            self._counters.note("unasked")
+            return ReplyVerdict(len(data))
+        return judge_rtu(data, self._expected, FramerRTU.compute_CRC)
+
+    def _settle(self, verdict: ReplyVerdict) -> None:
+        """End the request: with its reply, or because this was its reply and it is faulty."""
+        if verdict.pdu is not None:
+            if self._waits:
+                self._reply.set_result(verdict.pdu)
+        elif verdict.fault == "wrong_protocol":
+            # Where the next frame begins is not known any more.
+            where = self._options.where
+            self._lose(f"{where} does not speak Modbus TCP; compare host and tcp_port with the device's")
+        elif self._expected is not None and verdict.fault is not None:
+            who = f"unit {self._expected.unit} at {self._options.where}"
+            self._fail(
+                NoReplyError(
+                    f"{who} answers with {FAULTY[verdict.fault]}; compare its register map with the layout"
+                )
+            )
+        self._expected = None
+
+    def close(self, reconnect: bool = False) -> None:  # noqa: FBT001, FBT002 - as pymodbus has it
+        """See `ModbusProtocol.close`."""
+        if self._alarm is not None:
+            self._alarm.cancel()
+            self._alarm = None
+        super().close(reconnect)
+
+    def _look_at_the_clock(self) -> None:
+        """Give a request up whose time is over.
+
+        One alarm goes on from request to request: one for each of thousands a second would mostly be
+        cancelled.
+        """
+        self._alarm = None
+        if not self._waits:
+            return
+        if self.loop.time() < self._deadline_s:
+            self._alarm = self.loop.call_at(self._deadline_s, self._look_at_the_clock)
+        else:
+            self._give_up()
+
+    def _give_up(self) -> None:
+        """End the request without a reply."""
+        if self._expected is None:
+            return
+        self._counters.timeouts += 1
+        unit, where = self._expected.unit, self._options.where
+        if self._serial or not self.recv_buffer:
+            self._fail(
+                NoReplyError(f"unit {unit} at {where} has not answered within {1e3 * self._timeout_s:g} ms")
+            )
+            return
+        # Half a frame: its other half, if it comes, would be taken for the head of the next.
+        self._counters.note("truncated")
+        self._lose(f"unit {unit} at {where} has sent half a frame")
+
+    def _lose(self, why: str) -> None:
+        """Close the connection: what comes over it cannot be told apart any more."""
+        self.why_lost = why
+        self._fail(LineLostError(why))
+        self.close()
+
+    @property
+    def _waits(self) -> bool:
+        return self._expected is not None and not self._reply.done()
+
+    def _fail(self, error: Exception) -> None:
+        if self._waits:
+            self._reply.set_exception(error)
+
+
+def _transport_of(options: LineOptions) -> CommParams:
+    """What pymodbus is to open; it neither tries again nor keeps time."""
+    if options.transport == "tcp":
+        return CommParams(options.where, CommType.TCP, host=options.host, port=options.tcp_port)
+    return CommParams(
+        options.where,
+        CommType.SERIAL,
+        host=options.serial_port,
+        baudrate=options.baud,
+        bytesize=8,
+        parity=options.parity[0].upper(),
+        stopbits=options.stop_bits,
+    )
+
 
 _READS = {READ_HOLDING: ReadHoldingRegistersRequest, READ_INPUT: ReadInputRegistersRequest}
 

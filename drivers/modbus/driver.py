@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import defaultdict
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Link
-from drivers.modbus.client import ModbusClient
-from drivers.modbus.line import ModbusLine, WritableRun
-from drivers.modbus.outcomes import LineLostError, ModbusCounters
+from daqsvc.acquisition.link import Link
+from drivers.modbus.client import LineOptions, ModbusClient
+from drivers.modbus.fifo import FifoReader
+from drivers.modbus.layouts import Fifo, Ring, TrendLayout, shared_runs
+from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByEnquiry, WritableRun
 from drivers.modbus.registers import RegisterRun
-from drivers.modbus.sampling import readers_for
-from drivers.modbus.silence import RetryPolicy, SparingByEnquiry
-from drivers.modbus.wire import LineOptions
+from drivers.modbus.replies import LineLostError, ModbusCounters
+from drivers.modbus.ring import DeviceRingReader
+from drivers.modbus.trend import TrendReader
+from drivers.modbus.waveform import WaveformReader
 from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
 from drivers.tty import Character, CharacterFormat
 
@@ -28,9 +31,36 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
-    from drivers.base import BusPort
+    from drivers.base import BusPort, StreamSpec
+    from drivers.modbus.reading import Reader
+
 
 logger = logging.getLogger(__name__)
+
+
+def readers_for(port: BusPort, counters: ModbusCounters) -> list[Reader]:
+    """A reader for each stream, by the way its device hands out samples; one for all that share requests."""
+    readers: list[Reader] = []
+    polled: dict[tuple[int, str, float], list[StreamSpec[Any]]] = {}
+    windows: dict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
+    checked = port.options.get("transport") == "rtu"  # each frame with its CRC
+    for spec in port.streams:
+        layout = spec.layout
+        if isinstance(layout, TrendLayout):
+            polled.setdefault((layout.unit, layout.table, spec.rate_hz), []).append(spec)
+        elif isinstance(layout, Fifo):
+            readers.append(FifoReader(spec, port, checked=checked))
+        elif isinstance(layout, Ring):
+            readers.append(DeviceRingReader(spec, port, counters, checked=checked))
+        else:
+            readers.append(WaveformReader(spec, port, counters, windows[layout.unit]))
+    for specs in polled.values():
+        if (runs := shared_runs([spec.layout for spec in specs])) is not None:
+            readers.append(TrendReader(specs, port, runs))
+        else:
+            readers += [TrendReader([spec], port) for spec in specs]
+    return readers
+
 
 _NS_PER_MS = 1_000_000
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.settings.buses import percent
-from drivers.modbus.checks import check_line_load, check_modbus
+from drivers.modbus.checks import check_line_load, check_modbus, check_writes_and_samples
 from drivers.modbus.load import line_load
-from drivers.modbus.overlaps import check_writes_and_samples
 from drivers.modbus.settings import WAYS, ModbusRtuBus, ModbusTcpBus, RegistersLayout
 from drivers.plugin import DriverPlugin
 

@@ -6,8 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Protocol
 
-from drivers.modbus.outcomes import LineLostError, NoReplyError, RequestRefusedError
-from drivers.modbus.replies import OTHER_REMEDY, REMEDIES
+from drivers.modbus.replies import OTHER_REMEDY, REMEDIES, LineLostError, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

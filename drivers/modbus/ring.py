@@ -11,7 +11,7 @@ from drivers.modbus.registers import RegisterRun
 if TYPE_CHECKING:
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus.line import ModbusLine
-    from drivers.modbus.outcomes import ModbusCounters
+    from drivers.modbus.replies import ModbusCounters
 
 REQUESTS_PER_LOOK = 16
 """Requests for samples between two looks at the counter, at most: if one fails, all are made again."""

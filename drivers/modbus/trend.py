@@ -20,8 +20,8 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
 from drivers.modbus.layouts import FUNCTIONS
-from drivers.modbus.outcomes import NoReplyError, RequestRefusedError
 from drivers.modbus.reading import PollingReader, streams_in_words
+from drivers.modbus.replies import NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

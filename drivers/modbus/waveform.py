@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus.layouts import Waveform
     from drivers.modbus.line import ModbusLine
-    from drivers.modbus.outcomes import ModbusCounters
+    from drivers.modbus.replies import ModbusCounters
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Link
+from daqsvc.acquisition.link import Link
 from daqsvc.confined.limits import GIGABYTE, ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
 from drivers.base import BusCounters, BusPort

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from drivers.plugin import DriverPlugin
+import numpy as np
+
+from daqsvc.settings.problems import AssemblyError
+from drivers.plugin import DriverPlugin, units_of
 from drivers.replay.checks import check_replay_buses, check_replayed
 from drivers.replay.settings import ReplayBus, TableLayout
 
@@ -39,9 +42,17 @@ class ReplayPlugin(DriverPlugin[ReplayBus]):
 
     def stream_layout(self, machine: MachineFile, stream: str) -> ColumnLayout:
         """See `DriverPlugin.stream_layout`."""
-        from drivers.replay.build import column_layout  # noqa: PLC0415 - only the service needs it
+        from drivers.replay.files import ColumnLayout  # noqa: PLC0415 - brings what reads recordings
 
-        return column_layout(machine, stream)
+        given = machine.streams[stream].layout
+        if not isinstance(given, TableLayout):
+            raise AssemblyError(f"{machine.path}: stream {stream!r} does not come from a table")
+        return ColumnLayout(
+            channels=given.channel_names,
+            columns=tuple(column.column for column in given.columns),
+            scale=np.array([column.scale for column in given.columns]),
+            offset=np.array([column.offset for column in given.columns]),
+        ).in_units(units_of(machine, stream))
 
     def options(self, machine: MachineFile, bus: ReplayBus) -> dict[str, Any]:
         """See `DriverPlugin.options`."""

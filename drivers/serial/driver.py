@@ -18,7 +18,7 @@ import numpy as np
 import serial
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.supervisor import Link
+from daqsvc.acquisition.link import Link
 from drivers.base import BusCounters, BusPort
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.serial.framing import Found, Pieces
+    from drivers.serial.settings import LineLayout
 
 Checksum = Literal["none", "xor", "crc16"]
 TimeUnit = Literal["s", "ms", "us"]
@@ -318,3 +319,19 @@ class LineFraming(DelimitedFraming):
                 found.note_unknown(prefix.decode("ascii"))
                 in_step[k] = True
         return in_step
+
+
+def text_layout(given: LineLayout) -> TextLayout:
+    """The columns of a line as the machine file names them, in the units that are written."""
+    return TextLayout(
+        columns=given.line,
+        channels=given.channel_names,
+        scale=np.array([channel.scale for channel in given.channels]),
+        offset=np.array([channel.offset for channel in given.channels]),
+        counter=None if given.counter is None else given.counter.column,
+        counter_bits=32 if given.counter is None else given.counter.bits,
+        time=None if given.time is None else given.time.column,
+        time_unit="ms" if given.time is None else given.time.unit,
+        prefix=given.prefix,
+        separator=given.separator,
+    )

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from drivers.hand_over import HandOver
+from drivers.reconnect import HandOver
 
 if TYPE_CHECKING:
     import asyncio

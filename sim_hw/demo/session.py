@@ -15,7 +15,7 @@ import can
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.service import Service
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.errors import DemoError

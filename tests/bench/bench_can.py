@@ -33,16 +33,14 @@ from daqsvc.acquisition.ring import SampleRing
 from drivers.base import BusPort, StreamSpec
 from drivers.can.batches import LONGEST, CanBatch, FrameDemultiplexer
 from drivers.can.driver import CanDriver
-from drivers.can.record_files import LogFile
-from drivers.can.record_formats import ENDINGS, encoder_for
-from drivers.can.recvmmsg import SO_TIMESTAMPNS
-from drivers.can.socketcan import SocketCan
+from drivers.can.record_files import ENDINGS, LogFile, encoder_for
+from drivers.can.socketcan import SO_TIMESTAMPNS, SocketCan
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from drivers.can.record_formats import LogFormat
+    from drivers.can.record_files import LogFormat
 
 IDS = tuple(range(0x100, 0x108))
 FRAMES = 16_384

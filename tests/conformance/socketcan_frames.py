@@ -13,7 +13,7 @@ from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, layout
 
 from drivers.base import BusPort, StreamSpec
-from drivers.can.recvmmsg import SO_TIMESTAMPNS
+from drivers.can.socketcan import SO_TIMESTAMPNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

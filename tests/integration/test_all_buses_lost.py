@@ -18,7 +18,7 @@ from live_service import running
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from drivers.make import stream_layout
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit, RingStore

@@ -17,7 +17,7 @@ import pytest
 from orbit_files import RATE_HZ, SPEED_RPM, UNBALANCE, Orbit
 
 from daqsvc.settings import load_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 

@@ -25,7 +25,7 @@ from daqsvc.rotor.calibration.file import load_calibration, load_record
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.settings import parse_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
 from sim_hw.scenario import Scenario

@@ -19,7 +19,7 @@ from daqsvc.detectors.make import check_files
 from daqsvc.service import Service
 from daqsvc.settings import MachineFileError, describe, load_machine_file, parse_machine_file
 from daqsvc.settings.problems import AssemblyError
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 
 RING_BYTES = 200_000_000
 DEVICE = MACHINES.parent / "devices" / "triaxial-accelerometer.dbc"

@@ -14,7 +14,7 @@ from brokers import Consumer, running_mosquitto
 
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.recording.recording import Recording, load_recording
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.demo.baseline import setpoints
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import Setpoints, for_recording, laval_rig

@@ -17,9 +17,9 @@ from daqsvc.acquisition.samples import Quality
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.can.batches import EXTENDED, CanBatch, IdMatch
-from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
 from drivers.can.driver import CanDriver
+from drivers.can.plugin import frame_layout
 
 if TYPE_CHECKING:
     from pathlib import Path

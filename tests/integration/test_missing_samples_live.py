@@ -14,7 +14,7 @@ from machine_files import MACHINES
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from drivers.modbus.build import modbus_layout
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import CanNode

@@ -15,9 +15,8 @@ import serial
 from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus.client import ModbusClient
-from drivers.modbus.outcomes import LineLostError, ModbusCounters, NoReplyError
-from drivers.modbus.wire import LineOptions
+from drivers.modbus.client import LineOptions, ModbusClient
+from drivers.modbus.replies import LineLostError, ModbusCounters, NoReplyError
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 TIMEOUT_NS = 50_000_000

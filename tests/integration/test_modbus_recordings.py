@@ -12,17 +12,17 @@ import pytest
 from pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus.client import ModbusClient
-from drivers.modbus.outcomes import ModbusCounters, RequestRefusedError
+from drivers.modbus.client import LineOptions, ModbusClient
 from drivers.modbus.replies import (
     EXCEPTIONS,
     READ_INPUT,
     WRITE_REGISTERS,
     ExpectedReply,
+    ModbusCounters,
+    RequestRefusedError,
     judge_tcp,
     register_bytes,
 )
-from drivers.modbus.wire import LineOptions
 from sim_hw.nodes.modbus_node import ModbusTcpServer, UnitConnection
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from running_drivers import running, until
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
-from drivers.can.build import frame_layout
 from drivers.can.driver import CanDriver
+from drivers.can.plugin import frame_layout
 from drivers.make import bus_drivers
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from rogue_devices import WORST, RogueDevices, recording
 
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 
 if TYPE_CHECKING:
     from pathlib import Path

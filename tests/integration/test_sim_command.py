@@ -28,7 +28,7 @@ from sim_processes import (
 
 from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.scenario import load_any_scenario
 from sim_hw.sim_command_signals import BearingSignals

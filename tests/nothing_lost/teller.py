@@ -24,7 +24,7 @@ import paho.mqtt.client as paho
 from nothing_lost.script import RULES, SENSORS, Script
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.alarm_service import AlarmService
 from daqsvc.outbox.messages import event_id
 from daqsvc.publish.mqtt import MqttSettings

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
-from daqsvc.acquisition.fractional_delay import FractionalDelay
+from daqsvc.acquisition.alignment_source import FractionalDelay
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
 

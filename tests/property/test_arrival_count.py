@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from machine_files import MACHINES, changed, only_problem
 
-from daqsvc.acquisition.arrival_count import ArrivalCount
+from daqsvc.acquisition.arrivals import ArrivalCount
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
-from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
+from drivers.can.plugin import frame_layout
 
 PERIOD_NS = 10_000_000
 SENSOR = MACHINES / "j1939-pgn61485.toml"

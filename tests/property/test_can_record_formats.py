@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.can.adapter import batch_of
 from drivers.can.batches import ERROR, DecodedBatch
-from drivers.can.record_files import LogFile
-from drivers.can.record_formats import ENDINGS, encoder_for
+from drivers.can.record_files import ENDINGS, LogFile, encoder_for
 from drivers.replay.can_log import CanLog
 
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from daqsvc.acquisition import supervisor
+from daqsvc.acquisition import link as supervision
 from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
 from drivers.modbus.registers import RegisterField
 from sim_hw.nodes.modbus_node import PlannedReply
@@ -167,7 +167,7 @@ def play(layout, seed, *, count, restarts, serial, damaged, stale, seconds=12.0,
             device.sample()
 
     # The waits between attempts to open the line are drawn, too: the same ones in every run.
-    with patch.object(supervisor, "random", SimpleNamespace(Random=lambda: random.Random(seed))):
+    with patch.object(supervision, "random", SimpleNamespace(Random=lambda: random.Random(seed))):
         simulate(main)
     return rig, device
 

@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus.client import ModbusClient
+from drivers.modbus.client import LineOptions, ModbusClient
 from drivers.modbus.layouts import Count, Ring, TrendLayout, sample_record
-from drivers.modbus.line import ModbusLine
-from drivers.modbus.outcomes import ModbusCounters, NoReplyError, RequestRefusedError
+from drivers.modbus.line import ModbusLine, RetryPolicy, UnitSetAsideError
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
-from drivers.modbus.silence import RetryPolicy, UnitSetAsideError
-from drivers.modbus.wire import LineOptions
+from drivers.modbus.replies import ModbusCounters, NoReplyError, RequestRefusedError
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 

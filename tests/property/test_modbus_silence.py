@@ -14,13 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_lines import LoopClock, Rig, options_of, responding, simulate
 
-from daqsvc.acquisition import supervisor
+from daqsvc.acquisition import link as supervision
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.layouts import Count, Fifo, TrendLayout, sample_record
-from drivers.modbus.outcomes import ModbusCounters
+from drivers.modbus.line import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
-from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS
-from drivers.modbus.silence import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
+from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS, ModbusCounters
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -67,7 +66,7 @@ def test_no_late_reply_becomes_the_value_of_another_stream_however_often_the_lin
                     await asyncio.sleep(rng.uniform(0.05, 4.0))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(supervisor, "random", SimpleNamespace(Random=lambda: random.Random(seed)))
+        patch.setattr(supervision, "random", SimpleNamespace(Random=lambda: random.Random(seed)))
         simulate(main)
     for name, (layout, _) in streams.items():
         if rig.blocks[name]:

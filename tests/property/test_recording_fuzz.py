@@ -17,7 +17,7 @@ from daqsvc.cli import main
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, shared, stop_reading
 from daqsvc.settings import load_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 
 MACHINE = Path(__file__).parents[2] / "config" / "machines" / "rotor-synchronous.toml"
 MOST_MB = 450

@@ -18,8 +18,8 @@ from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import load_machine_file, parse_machine_file
-from drivers.can.build import frame_layout
 from drivers.can.dbc import layout_from_dbc
+from drivers.can.plugin import frame_layout
 from drivers.frames import FrameLayout, LayoutError
 
 LARGEST = {8: 0xFA, 16: 0xFAFF, 24: 0xFAFFFF, 32: 0xFAFFFFFF}

@@ -16,7 +16,7 @@ from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
 from daqsvc.detectors.make import detectors
 from daqsvc.settings import load_machine_file
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 from drivers.frames import FrameLayout
 from drivers.make import bus_drivers, stream_layout
 

@@ -15,8 +15,8 @@ import pytest
 import serial
 
 from drivers.can.batches import DecodedBatch
-from drivers.can.reader import BATCHES_UNDER_WAY, CanReader
-from drivers.hand_over import HandOver
+from drivers.can.driver import BATCHES_UNDER_WAY, CanReader
+from drivers.reconnect import HandOver
 from drivers.serial.reader import SerialReader
 
 BATCHES = 16

@@ -11,7 +11,7 @@ from machine_files import MACHINES
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusCounters
 from drivers.modbus.build import modbus_layout
-from drivers.modbus.outcomes import ModbusCounters
+from drivers.modbus.replies import ModbusCounters
 
 TEXT = (Path(__file__).parents[2] / "docs" / "modbus.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from daqsvc.acquisition.supervisor import Link
+from daqsvc.acquisition.link import Link
 from drivers import reconnect
 from drivers.base import BusPort, DeviceAbsentError
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect

@@ -9,7 +9,7 @@ import pytest
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 from daqsvc.settings.problems import MachineFileError
-from drivers.can.build import frame_layout
+from drivers.can.plugin import frame_layout
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,8 +10,8 @@ from machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 from daqsvc.settings.models import LevelAlarm
+from drivers.can.checks import frame_time
 from drivers.can.settings import DbcLayout, PlainLayout
-from drivers.can.wire import frame_time
 
 CONFIG = MACHINES.parent
 EXAMPLES = sorted(MACHINES.glob("*.toml"))

@@ -17,8 +17,7 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import StreamSpec
 from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameDemultiplexer, IdMatch
 from drivers.can.kernel_time import KernelTime
-from drivers.can.recvmmsg import DatagramBuffer
-from drivers.can.socketcan import BATCH_FRAMES, SocketCan, open_socketcan
+from drivers.can.socketcan import BATCH_FRAMES, DatagramBuffer, SocketCan, open_socketcan
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.acquisition.sparing import Sparing
+from daqsvc.acquisition.link import Sparing
 
 if TYPE_CHECKING:
     import pytest

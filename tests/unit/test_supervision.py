@@ -12,7 +12,7 @@ import pytest
 from brokers import eventually
 
 from daqsvc import supervision
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.supervision import OTHERS, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads, ThreadLostError, call_in_thread
 

@@ -6,7 +6,7 @@ import logging
 import random
 from typing import TYPE_CHECKING
 
-from daqsvc.acquisition.supervisor import Backoff, Link
+from daqsvc.acquisition.link import Backoff, Link
 
 if TYPE_CHECKING:
     import pytest

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import daqsvc
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.supervisor import Backoff
+from daqsvc.acquisition.link import Backoff
 from daqsvc.publish.connection import Connection, Will
 from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
