@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from daqsvc.dsp.shaft import Revolutions
+from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 

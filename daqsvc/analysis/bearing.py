@@ -24,9 +24,9 @@ from daqsvc.analysis.quality import DataQuality
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import compare_residual
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.detectors.bearing.finding import find
 from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
+from daqsvc.dsp.quality import UnfitError
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def analyse_bearings(
         except ClippedError as error:
             unfit[name] = str(error)
             quality = replace(quality, clipped={**quality.clipped, name: error.samples})
-        except RaceInputError as error:
+        except UnfitError as error:
             unfit[name] = str(error)
         else:
             races[name] = race

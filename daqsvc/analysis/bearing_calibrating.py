@@ -11,10 +11,10 @@ from daqsvc.analysis.machine import MachineAnalyst
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
 from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -96,7 +96,7 @@ def _refuse_faults(recording: Recording, bearings: Mapping[str, BearingOrders], 
             said = race_test(
                 np.where(np.isfinite(column), column, np.nan), recording.rate_hz, speed_rpm, orders
             )
-        except (ClippedError, RaceInputError) as error:
+        except (ClippedError, UnfitError) as error:
             raise RefusedError(f"{recording.source}: {name}: {error}") from None
         if said.verdict != "normal":
             damage = "ball" if said.verdict == "ball" else f"{said.verdict.replace('_', ' ')} race"

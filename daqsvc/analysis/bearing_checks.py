@@ -9,7 +9,7 @@ import numpy as np
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.quality import count_bad
 from daqsvc.bearing.race.quality import OFFSET_NOTE
-from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -65,12 +65,12 @@ def refuse_no_machine(samples: Floats, unit: AccelerationUnit, race: RaceVerdict
         race: what the race test says of them.
 
     Raises:
-        RaceInputError: they are quieter than any machine, and no harmonics of a shaft stand out.
+        UnfitError: they are quieter than any machine, and no harmonics of a shaft stand out.
     """
     rms = float(np.nanstd(samples))
     quiet = rms * M_S2_PER_UNIT.get(unit, float("nan")) < _LEAST_MACHINE_M_S2
     if quiet and not race.speed_seen and race.verdict == "normal":
-        raise RaceInputError(
+        raise UnfitError(
             "channel",
             f"shows no machine: {rms:.3g} {unit} r.m.s. and no speed that its harmonics confirm",
             "check sensor, cable and --unit",

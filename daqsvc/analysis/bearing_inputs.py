@@ -11,8 +11,9 @@ import numpy as np
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.bearing.race.verdict import PLACES, RaceInputError
+from daqsvc.bearing.race.verdict import PLACES
 from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
+from daqsvc.dsp.quality import UnfitError
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def _judged(recording: Recording, name: str, setup: BearingSetup, speed_rpm: flo
     try:
         refuse_clipped(column)
         return race_test(column, recording.rate_hz, speed_rpm, setup.bearings[name], setup.race)
-    except (ClippedError, RaceInputError) as error:
+    except (ClippedError, UnfitError) as error:
         return str(error)
 
 

@@ -16,8 +16,8 @@ from daqsvc.analysis import quality as checks
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed import LEAST_JUDGED, speed_of
-from daqsvc.dsp.probe_axes import probes_to_xy, shaft_axes_deg
-from daqsvc.dsp.revolutions import KeyphasorCutter
+from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
+from daqsvc.dsp.speed.revolutions import KeyphasorCutter
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration.file import CalibrationRecord
 from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up

@@ -12,8 +12,8 @@ from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import DataQuality, known_against
 from daqsvc.analysis.result import VERDICTS, finite
-from daqsvc.dsp.order_speed import ORDERS
 from daqsvc.dsp.orders import OrderVectors, order_vectors
+from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
 from daqsvc.rotor.orders.change import OrderChange, OrderRules, compare_orders

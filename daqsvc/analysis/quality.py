@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.keyphasor_edges import EdgeCounts
+    from daqsvc.dsp.speed.keyphasor import EdgeCounts
     from daqsvc.recording.recording import Recording
 
     Floats = NDArray[np.float64]

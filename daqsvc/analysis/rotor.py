@@ -20,8 +20,8 @@ from daqsvc.analysis.result import RotorAnalysis, Step, Trace
 from daqsvc.analysis.setup import RefusedError
 from daqsvc.analysis.speed import LEAST_JUDGED, refuse_coarse, speed_of, too_short
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
-from daqsvc.detectors.shaft.probe_checks import Probe
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.probes import Probe
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration.record import baseline_at
 from daqsvc.rotor.synchronous.baseline import Calibration, compensated

@@ -10,7 +10,7 @@ from daqsvc.rotor.synchronous.watch import WatchRules
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.dsp.keyphasor_edges import Edge
+    from daqsvc.dsp.speed.keyphasor import Edge
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration

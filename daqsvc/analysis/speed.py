@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.analysis.speed_trend import Trend, trend_of_orbit, trend_of_pulses
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
-from daqsvc.dsp.keyphasor_edges import EdgeFinder
-from daqsvc.dsp.orbit_speed import estimate_speed
+from daqsvc.dsp.speed.keyphasor import EdgeFinder, KeyphasorProbe
+from daqsvc.dsp.speed.orbit import estimate_speed
+from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 
 if TYPE_CHECKING:

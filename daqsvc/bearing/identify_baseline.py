@@ -11,8 +11,8 @@ import numpy as np
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import HIGHEST, HealthyResidual, learn_healthy
 from daqsvc.bearing.race.judge import race_baseline
-from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.bearing.two_sensors import learn_pair
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -93,7 +93,7 @@ def learn_baseline(
         for names, model in (pairs or {}).items():
             columns = np.column_stack([samples[name] for name in names]) * model.m_s2_per_unit
             healthy_pairs[names] = learn_pair(model.parameters, rate_hz, columns)
-    except (NotIdentifiableError, RaceInputError, ValueError) as error:
+    except (NotIdentifiableError, UnfitError, ValueError) as error:
         raise NotIdentifiableError(f"{', '.join(names)}: {error}") from None
     return BearingBaseline(
         rate_hz=rate_hz,

@@ -1,19 +1,41 @@
-"""Vibration levels of a window: RMS, peak, crest factor, and RMS in a band."""
+"""Vibration levels of a window: RMS, peak, crest factor, and RMS in a band; with samples missing, too.
+
+In a band a filled-in value is wrong twice: what is missing takes its power along, and the edges of the gaps
+spread the power of all frequencies over all others. Integration blows that up at the low ones: one sample in
+fifty lost of an accelerometer that hears a loud bearing makes a velocity that is not there.
+
+The autocovariance has neither fault. Its mean product at lag k needs no sample but the pairs that are there,
+and has the right expectation whatever else is missing, as long as samples are not lost because of their
+value. The power in a band is a sum over lags of it (Wiener and Khinchin), so it is right on average, too:
+negative lags and taper included it is the very sum that a complete window has.
+"""
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
+import scipy.fft
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    _Weights: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
+    Floats: TypeAlias = NDArray[np.float64]
+    _Weights: TypeAlias = tuple[Floats, Floats]
 
 STANDARD_GRAVITY = 9.80665
 """m/s2 per g (CGPM 1901)."""
+
+SURE = 4.0
+"""Bounds are so many standard deviations wide on either side."""
+_LEAST_ERROR = 0.01
+"""Share of the power that is never known better when anything is missing."""
+_LEAST_PAIRS = 0.02
+"""A lag of which a smaller share of pairs is there says nothing."""
+_LEAST_LAG = 1e-3
+"""Nor does one at which the taper leaves a smaller share of the power."""
 
 
 class SignalLevels(NamedTuple):
@@ -87,3 +109,80 @@ def band_rms(
     taper, weight = band_weights(len(samples), rate_hz, low_hz, high_hz, integrate=integrate)
     spectrum = np.fft.rfft((samples - samples.mean()) * taper)
     return float(np.sqrt(np.sum((spectrum.real**2 + spectrum.imag**2) * weight)))
+
+
+class BandEstimate(NamedTuple):
+    """RMS in a band of a window that lacks samples, in the unit of the samples (times s if integrated).
+
+    Attributes:
+        rms: the estimate; 0 where that of the power is negative, which chance may make it.
+        low: it is hardly below this (`SURE` standard deviations of the power).
+        high: nor above this.
+        error: standard deviation of ``rms`` as a part of it; infinite if it is 0.
+    """
+
+    rms: float
+    low: float
+    high: float
+    error: float
+
+
+def gapped_band_rms(
+    samples: Floats, rate_hz: float, low_hz: float, high_hz: float, *, integrate: bool = False
+) -> BandEstimate:
+    """`band_rms` of a window that lacks samples, with the error that this brings.
+
+    The error is that beside the complete window, not beside the machine: of the gaps' own spectrum, by which
+    each frequency's power leaks into all others, only the mean is known and taken off; how far chance may be
+    from it follows from the power that leaks.
+
+    Args:
+        samples: float64 ``[n]``, n at least 4, at least two of them finite; what is not finite is missing.
+        rate_hz: sampling rate.
+        low_hz: lower edge of the band, above 0.
+        high_hz: upper edge of the band.
+        integrate: whether to give the RMS of the integral: velocity from acceleration.
+    """
+    n = len(samples)
+    taper, weight = band_weights(n, rate_hz, low_hz, high_hz, integrate=integrate)
+    there = np.isfinite(samples)
+    swing = np.where(there, samples - samples[there].mean(), 0.0)
+    whole, pairs = _taper_products(n), _products(there * taper)
+    share = pairs / np.maximum(whole, np.finfo(np.float64).tiny)
+    known = (whole > _LEAST_LAG * whole[0]) & (share > _LEAST_PAIRS)
+    covariance = np.where(known, _products(swing * taper) / np.where(known, share, 1.0), 0.0)
+    spectrum = _spectrum(covariance)
+    power = float(np.sum(spectrum * weight))
+
+    present = float(np.sum(there * taper) / np.sum(taper))
+    # What the gaps leak, beside the samples that are there: their spectrum without its mean.
+    leak = np.maximum(_spectrum(np.where(known, covariance * (share / present**2 - 1.0), 0.0)), 0.0)
+    # Squares of Gaussian amplitudes; a Hann taper makes one of two neighbouring bins.
+    variance = 2.0 * np.sum(weight**2 * (2.0 * np.maximum(spectrum, 0.0) * leak + leak**2))
+    deviation = math.hypot(math.sqrt(variance), _LEAST_ERROR * power)
+    return BandEstimate(
+        math.sqrt(max(power, 0.0)),
+        math.sqrt(max(power - SURE * deviation, 0.0)),
+        math.sqrt(max(power + SURE * deviation, 0.0)),
+        0.5 * deviation / power if power > 0.0 else math.inf,
+    )
+
+
+def _products(values: Floats) -> Floats:
+    """Sums of products of values that are k apart, for k from 0 on; float64 ``[n]``."""
+    n = len(values)
+    size = scipy.fft.next_fast_len(2 * n, real=True)
+    spectrum = scipy.fft.rfft(values, size)
+    return np.asarray(scipy.fft.irfft(spectrum.real**2 + spectrum.imag**2, size)[:n])
+
+
+@lru_cache(maxsize=64)
+def _taper_products(n: int) -> Floats:
+    return _products(np.hanning(n))
+
+
+def _spectrum(covariance: Floats) -> Floats:
+    """At the bins of a real FFT of ``n``, where lags k and k - n are alike; float64 ``[n // 2 + 1]``."""
+    both = covariance.copy()
+    both[1:] += covariance[:0:-1]
+    return np.asarray(scipy.fft.rfft(both).real)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from daqsvc.dsp.order_speed import ORDERS, find_speed
+from daqsvc.dsp.speed.lines import ORDERS, find_speed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

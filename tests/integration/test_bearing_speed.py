@@ -13,9 +13,9 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing
-from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
+from daqsvc.dsp.speed.steadiness import SpeedError, measure_speed
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis

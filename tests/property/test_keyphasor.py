@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daqsvc.dsp.keyphasor import KeyphasorTracker
+from daqsvc.dsp.speed.keyphasor import KeyphasorTracker
 from sim_hw.plants.sensors import keyphasor_voltage
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
+from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
 from sim_hw.plants.sensors import keyphasor_voltage
 
 

@@ -20,16 +20,16 @@ from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import learn_healthy
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing
-from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
 from daqsvc.detectors.rotor_bank.detector import RotorBankDetector, RotorMode
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.detector import Window
-from daqsvc.dsp.keyphasor import KeyphasorTracker
 from daqsvc.dsp.orders import order_vectors
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
+from daqsvc.dsp.speed.steadiness import SpeedError, measure_speed
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import RotorParameters
 from daqsvc.rotor.synchronous.vectors import synchronous_vectors
@@ -301,7 +301,7 @@ def test_the_race_test_says_the_same_or_refuses(share, frame):
     samples = lost(np.random.default_rng(5), housing(5.0, 1, 0.6), share, frame).astype(np.float64)
     orders = bearing_orders("6205-2RS")
     if share > 0.01:
-        with pytest.raises(RaceInputError, match="lacks"):
+        with pytest.raises(UnfitError, match="lacks"):
             race_test(samples, BEARING_HZ, SPEED_RPM, orders)
         return
     assert race_test(samples, BEARING_HZ, SPEED_RPM, orders).verdict == "outer"

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import race_records
 
-from daqsvc.bearing.race import RaceInputError, race_test
+from daqsvc.bearing.race import race_test
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -117,7 +118,7 @@ def judged(record: Record, spoil: Callable[..., None], seed: int) -> tuple[str, 
     spoil(samples, record.rate_hz, np.random.default_rng([seed, len(samples)]))
     try:
         v = race_test(samples, record.rate_hz, record.speed_rpm, record.bearing)
-    except RaceInputError:
+    except UnfitError:
         return "refused", 0.0
     return v.verdict, v.probability.get("normal", 0.0)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import race_records
 
-from daqsvc.bearing.race import RaceInputError, race_test
+from daqsvc.bearing.race import race_test
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -33,7 +34,7 @@ def outcomes(data: Path, factors_of: Callable[[int], Sequence[tuple[float, float
             found["judged"] += 1
             try:
                 v = race_test(r.samples, rate * r.rate_hz, speed * r.speed_rpm, r.bearing)
-            except RaceInputError:
+            except UnfitError:
                 found["refused"] += 1
                 continue
             found["confirmed"] += v.speed_seen

@@ -12,7 +12,7 @@ import math
 import numpy as np
 import pytest
 
-from daqsvc.dsp.revolutions import FixedSpeedCutter
+from daqsvc.dsp.speed.revolutions import FixedSpeedCutter
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 from daqsvc.rotor.synchronous.watch import RotorWatch

@@ -15,7 +15,7 @@ from run_ups import record
 
 from daqsvc.analysis.rotor import analyse
 from daqsvc.analysis.setup import Keyphasor, RotorSetup
-from daqsvc.analysis.speed_trend import trend_of_orbit, trend_of_pulses
+from daqsvc.dsp.speed.steadiness import trend_of_orbit, trend_of_pulses
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 

@@ -9,14 +9,15 @@ from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 from daqsvc.analysis.bearing_checks import ball_order_problem, refuse_no_machine
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.geometry import BearingOrders
-from daqsvc.bearing.race import RaceInputError, race_test
+from daqsvc.bearing.race import race_test
+from daqsvc.dsp.quality import UnfitError
 
 
 @pytest.mark.parametrize("rms_g", [2e-5, 1e-6])
 def test_the_noise_of_an_unplugged_sensor_is_no_machine(rms_g: float) -> None:
     noise = rms_g * np.random.default_rng(0).standard_normal(60_000)
     verdict = race_test(noise, RATE_HZ, SPEED_RPM, BEARING)
-    with pytest.raises(RaceInputError, match=r"shows no machine: \S+ g r.m.s.*check sensor, cable"):
+    with pytest.raises(UnfitError, match=r"shows no machine: \S+ g r.m.s.*check sensor, cable"):
         refuse_no_machine(noise, "g", verdict)
     refuse_no_machine(noise * 1e4, "g", verdict)
 

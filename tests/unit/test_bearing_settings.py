@@ -17,7 +17,7 @@ from daqsvc.cli import main
 from daqsvc.detectors.bearing.build import pair_models
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.make import detectors
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings import describe, parse_machine_file
 from daqsvc.settings.problems import AssemblyError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from run_ups import RATE_HZ, record
 
-from daqsvc.dsp.shaft import Revolutions
+from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.calibration.bode import fit_bode
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from daqsvc.dsp.orbit_speed import estimate_speed
+from daqsvc.dsp.speed.orbit import estimate_speed
 
 RATE_HZ = 640.0
 RPM = 600.0

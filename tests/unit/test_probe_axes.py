@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from daqsvc.dsp.probe_axes import probes_to_xy, shaft_axes_deg
+from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
 
 
 def seen(xy, angles_deg):

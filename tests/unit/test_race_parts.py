@@ -13,13 +13,13 @@ from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import best_comb, fundamental, highest_order
 from daqsvc.bearing.race.decision import decide
 from daqsvc.bearing.race.depth import ModulationDepth, sharpest
-from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.lines import LineEvidence, line_evidence
 from daqsvc.bearing.race.null import false_alarm_probability, significance
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.speed import ShaftRate, shaft_rate
-from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence, RaceInputError
+from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
 from daqsvc.dsp.envelope import line_power, running_median, squared_envelope, whiten
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.harmonics import ShaftRate, shaft_rate, slow_series
 
 RULES = RaceRules()
 PER_ORDER = 75.0
@@ -155,7 +155,7 @@ def test_without_harmonics_the_stated_speed_stays() -> None:
 
 
 def test_a_wholly_other_speed_is_refused_and_named() -> None:
-    with pytest.raises(RaceInputError, match=r"at about 14\d\d rpm.*sampled"):
+    with pytest.raises(UnfitError, match=r"at about 14\d\d rpm.*sampled"):
         found(tones([1, 2, 3], 24.0), 30.0)
 
 
@@ -266,5 +266,5 @@ def test_band_levels_are_mean_squares_and_compare_across_rates() -> None:
 def test_another_unit_than_the_baselines_is_named() -> None:
     before = BandLevels((400.0, 800.0, 1600.0, 3200.0), (1.0, 2.0, 0.5))
     now = BandLevels(before.edges_hz, tuple(9.81**2 * p for p in before.power))
-    with pytest.raises(RaceInputError, match=r"unit differs .* \+19.8 dB"):
+    with pytest.raises(UnfitError, match=r"unit differs .* \+19.8 dB"):
         now.change_db(before)

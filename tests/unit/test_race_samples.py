@@ -9,7 +9,7 @@ import pytest
 from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 from scipy.signal import butter, sosfiltfilt
 
-from daqsvc.bearing.race import RaceInputError, race_test
+from daqsvc.bearing.race import race_test
 from daqsvc.bearing.race.confidence import MOST_MARGIN, doubted
 from daqsvc.bearing.race.prewhitening import Prewhitening
 from daqsvc.bearing.race.quality import checked
@@ -17,6 +17,7 @@ from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.spikes import despiked
 from daqsvc.bearing.race.stuck import stuck
 from daqsvc.bearing.race.transients import blanked, find_transients, levelled, merged
+from daqsvc.dsp.quality import UnfitError
 
 REVOLUTION = round(60.0 * RATE_HZ / SPEED_RPM)
 BAND_HZ = (400.0, 0.48 * RATE_HZ)
@@ -136,9 +137,7 @@ def test_too_many_knocks_are_refused() -> None:
     samples = strikes(None, seed=10)
     for place in range(1_200, 56_000, 11_000):
         samples[place : place + 2_400] += 60.0 * np.random.default_rng(place).standard_normal(2_400)
-    with pytest.raises(
-        RaceInputError, match=r"channel is much louder for \d+% of its time, first at 0\.\d+ s"
-    ):
+    with pytest.raises(UnfitError, match=r"channel is much louder for \d+% of its time, first at 0\.\d+ s"):
         judge(samples)
 
 
@@ -159,7 +158,7 @@ def test_drop_outs_are_bridged_if_few_and_refused_if_many(*, held: bool) -> None
     assert "the channel stands still" in v.repairs[0]
     assert "% of its samples), first at" in v.repairs[0]
     for share in (0.02, 0.3):
-        with pytest.raises(RaceInputError, match=r"channel stands still .* check what drops its samples out"):
+        with pytest.raises(UnfitError, match=r"channel stands still .* check what drops its samples out"):
             judge(packets(share, held=held, seed=12))
 
 

@@ -7,11 +7,11 @@ import pytest
 import scipy.fft
 from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
-from daqsvc.bearing.race import RaceInputError, race_test
-from daqsvc.bearing.race.harmonics import slow_series
+from daqsvc.bearing.race import race_test
 from daqsvc.bearing.race.rival import refuse_rivals
-from daqsvc.bearing.race.speed import ShaftRate, shaft_rate
 from daqsvc.bearing.race.verdict import PartEvidence
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.harmonics import ShaftRate, shaft_rate, slow_series
 
 SHAFT_HZ = 29.5
 SECONDS = 4.0
@@ -52,7 +52,7 @@ def test_wrong_speeds_are_hardly_ever_confirmed() -> None:
         factor = 1.0 + random.choice([-1.0, 1.0]) * random.uniform(0.04, 0.3)
         try:
             confirmed += shaft_of(harmonics(SHAFT_HZ), factor * SHAFT_HZ, seed).seen
-        except RaceInputError:
+        except UnfitError:
             continue
     assert confirmed <= 0.03 * trials
 
@@ -88,7 +88,7 @@ def test_half_and_double_the_speed_are_not_confirmed(factor: float, said: str) -
 def test_a_wrong_sampling_rate_is_refused(part: str, rate_hz: float) -> None:
     samples = strikes(part, strength=1.5)
     assert race_test(samples, RATE_HZ, SPEED_RPM, BEARING).verdict == part
-    with pytest.raises(RaceInputError, match="shaft speed or sample rate is wrong"):
+    with pytest.raises(UnfitError, match="shaft speed or sample rate is wrong"):
         race_test(samples, rate_hz, SPEED_RPM, BEARING)
 
 
@@ -105,9 +105,7 @@ def test_a_part_is_not_named_where_its_lines_and_the_harmonics_agree_on_another_
     nothing = part_evidence(0.0, 0.05, 4.0, 3.0)
     ball = part_evidence(20.0, 0.8, BEARING.ball_pass, 7.7)
     evidence = {"inner": nothing, "outer": nothing, "ball": ball}
-    with pytest.raises(
-        RaceInputError, match=r"lines of the ball at .* those of the inner race at 17\d\d rpm"
-    ):
+    with pytest.raises(UnfitError, match=r"lines of the ball at .* those of the inner race at 17\d\d rpm"):
         refuse_rivals(evidence, BEARING, shaft, 0.015)
     refuse_rivals(evidence | {"ball": nothing}, BEARING, shaft, 0.015)
 

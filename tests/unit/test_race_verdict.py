@@ -7,7 +7,8 @@ import pytest
 from race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.race import RaceInputError, RaceWatch, race_baseline, race_test
+from daqsvc.bearing.race import RaceWatch, race_baseline, race_test
+from daqsvc.dsp.quality import UnfitError
 
 
 def judge(samples: np.ndarray, **changes: object) -> object:
@@ -107,7 +108,7 @@ GAPPED[100:2000] = np.nan
 def test_bad_input_is_named_with_a_remedy(
     samples: np.ndarray, changes: dict[str, float], message: str
 ) -> None:
-    with pytest.raises(RaceInputError, match=message) as error:
+    with pytest.raises(UnfitError, match=message) as error:
         judge(samples, **changes)
     assert error.value.remedy in str(error.value)
     assert error.value.thing
@@ -167,6 +168,6 @@ class TestWatch:
         samples = strikes("outer", 5.0)
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
         watch.take(samples[: watch.window])
-        with pytest.raises(RaceInputError, match="dead"):
+        with pytest.raises(UnfitError, match="dead"):
             watch.take(np.zeros(3 * watch.window))
         assert watch.take(samples[watch.window :]).revolutions == pytest.approx(75.0, rel=0.01)

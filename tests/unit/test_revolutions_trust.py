@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
+from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
 from sim_hw.plants.sensors import keyphasor_voltage
 
 

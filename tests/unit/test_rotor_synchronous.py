@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rotor_orbits import HEALTHY, orbits
 
-from daqsvc.dsp.shaft import Revolutions
+from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors, synchronous_vectors
 
 VECTORS = np.array(

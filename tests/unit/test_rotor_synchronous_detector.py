@@ -10,8 +10,9 @@ import pytest
 from shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
 
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.watch import WatchRules
 from sim_hw.plants import rotor as plant

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rotor_orbits import HEALTHY, PER_REV, RATE_HZ, ROTOR, SPEED_RAD_S, orbits
 
-from daqsvc.dsp.shaft import Revolutions
+from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError, calibrate
 from daqsvc.rotor.synchronous.severity import levels

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.dsp.revolutions import KeyphasorCutter
+from daqsvc.dsp.speed.revolutions import KeyphasorCutter
 
 
 def cut(turns, period, block=None):

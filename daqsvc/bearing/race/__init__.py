@@ -5,13 +5,12 @@ from __future__ import annotations
 from daqsvc.bearing.race.baseline import RaceBaseline
 from daqsvc.bearing.race.judge import race_baseline, race_test
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PartEvidence, RaceInputError, RaceLine, RaceVerdict
+from daqsvc.bearing.race.verdict import PartEvidence, RaceLine, RaceVerdict
 from daqsvc.bearing.race.watch import RaceWatch
 
 __all__ = [
     "PartEvidence",
     "RaceBaseline",
-    "RaceInputError",
     "RaceLine",
     "RaceRules",
     "RaceVerdict",

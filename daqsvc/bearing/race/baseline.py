@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,7 +45,7 @@ class BandLevels:
         Only bands that both have are compared, so the two may differ in sample rate.
 
         Raises:
-            RaceInputError: all bands changed alike and much, as by another unit.
+            UnfitError: all bands changed alike and much, as by another unit.
         """
         common = min(len(self.power), len(before.power))
         now = np.maximum(self.power[:common], LEAST_POWER)
@@ -53,7 +53,7 @@ class BandLevels:
         bands = 10.0 * np.log10(now / then)
         whole = float(10.0 * np.log10(now.sum() / then.sum()))
         if common > 1 and abs(whole) > UNIT_DB and np.ptp(bands) < SAME_DB:
-            raise RaceInputError(
+            raise UnfitError(
                 "unit",
                 f"differs from the baseline's: all bands changed by {whole:+.1f} dB alike",
                 "give both recordings in the same unit",

@@ -17,14 +17,12 @@ from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, ba
 from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
 from daqsvc.bearing.race.confidence import MOST_DOUBT, MOST_MARGIN, doubted
 from daqsvc.bearing.race.decision import RACES, decide
-from daqsvc.bearing.race.harmonics import slow_series
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
 from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.scoring import EnvelopeView, Scales, view_of
-from daqsvc.bearing.race.speed import shaft_rate
 from daqsvc.bearing.race.track import shaft_track
 from daqsvc.bearing.race.transients import levelled
 from daqsvc.bearing.race.verdict import (
@@ -37,6 +35,7 @@ from daqsvc.bearing.race.verdict import (
     RaceVerdict,
 )
 from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
+from daqsvc.dsp.speed.harmonics import shaft_rate, slow_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -103,7 +102,7 @@ def race_test(
         baseline: of the same machine in good order, by `race_baseline`; it makes ``"changed"`` possible.
 
     Raises:
-        RaceInputError: no verdict can rest on these samples.
+        UnfitError: no verdict can rest on these samples.
     """
     rules = rules or RaceRules()
     return verdict_of(race_features(samples, rate_hz, speed_rpm, bearing, rules), rules, baseline)

@@ -10,7 +10,7 @@ import numpy as np
 from daqsvc.bearing.race.repair import repaired
 from daqsvc.bearing.race.stuck import stuck
 from daqsvc.bearing.race.transients import blanked, merged, runs
-from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,27 +66,27 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
         rules: the rules of the test.
 
     Raises:
-        RaceInputError: no verdict can rest on these samples.
+        UnfitError: no verdict can rest on these samples.
     """
     x = np.asarray(samples, dtype=np.float64)
     if x.ndim != 1:
-        raise RaceInputError("samples", f"have shape {list(x.shape)}", "give one channel, [n]")
+        raise UnfitError("samples", f"have shape {list(x.shape)}", "give one channel, [n]")
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
-        raise RaceInputError("sample rate", f"is {rate_hz} Hz", "give the rate of the recording")
+        raise UnfitError("sample rate", f"is {rate_hz} Hz", "give the rate of the recording")
     if not (np.isfinite(speed_rpm) and speed_rpm > 0.0):
-        raise RaceInputError(
+        raise UnfitError(
             "shaft speed", f"is {speed_rpm} rpm", "give the speed: kinematic lines lie at multiples of it"
         )
     top_hz = min(0.48 * rate_hz, rules.high_hz)
     if top_hz < LEAST_BAND * rules.low_hz:
-        raise RaceInputError(
+        raise UnfitError(
             "sample rate",
             f"is {rate_hz:g} Hz, which leaves the band {rules.low_hz:g} to {top_hz:g} Hz",
             f"sample with {LEAST_BAND * rules.low_hz / 0.48:.0f} Hz or more",
         )
     revolutions = len(x) / rate_hz * speed_rpm / 60.0
     if revolutions < LEAST_REVOLUTIONS:
-        raise RaceInputError(
+        raise UnfitError(
             "record",
             f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
@@ -96,7 +96,7 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, rules: RaceRules) -
     x = mended.values
     clipped = _clipped_share(x)
     if clipped > CLIPPED_SHARE:
-        raise RaceInputError(
+        raise UnfitError(
             "channel",
             f"is clipped: {clipped:.1%} of its samples stand at {x.min():.4g} or {x.max():.4g}",
             "use a sensor or a gain with a larger range",
@@ -119,14 +119,14 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
     good = np.isfinite(x)
     missing = 1.0 - float(good.mean())
     if missing > MISSING_SHARE:
-        raise RaceInputError(
+        raise UnfitError(
             "channel", f"lacks {missing:.1%} of its samples (NaN or infinite)", "check sensor and cable"
         )
     if missing:
         x = _interpolated(x, good)
     steady = float(np.mean(np.diff(x) == 0.0))
     if steady > DEAD_SHARE:
-        raise RaceInputError(
+        raise UnfitError(
             "channel", f"is dead: {steady:.0%} of its samples repeat the one before", "check sensor and cable"
         )
     held = stuck(x) & good
@@ -139,7 +139,7 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
         first_s = dropped[0][0] / rate_hz
         what = f"{len(dropped)} times ({held.mean():.1%} of its samples), first at {first_s:.4g} s"
         if lost.mean() > MISSING_SHARE:
-            raise RaceInputError("channel", f"stands still {what}", "check what drops its samples out")
+            raise UnfitError("channel", f"stands still {what}", "check what drops its samples out")
         told.append(f"the channel stands still {what}: bridged; check what drops its samples out")
         x = _interpolated(x, ~held)
     long = [(first, last) for first, last in runs(np.flatnonzero(lost), 1) if last - first > BRIDGED]

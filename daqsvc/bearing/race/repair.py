@@ -16,7 +16,7 @@ from scipy.ndimage import median_filter
 from daqsvc.bearing.race.prewhitening import Prewhitening
 from daqsvc.bearing.race.spikes import despiked
 from daqsvc.bearing.race.transients import blanked, find_transients, merged
-from daqsvc.bearing.race.verdict import RaceInputError
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +65,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         band_hz: where the analysed band begins and ends.
 
     Raises:
-        RaceInputError: too much is wrong.
+        UnfitError: too much is wrong.
     """
     whitening = Prewhitening(samples, rate_hz, *band_hz)
     values = samples
@@ -94,7 +94,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         lost = sum(last - first for first, last in stretches) / len(samples)
         if lost > MOST_BLANKED:
             _refuse_empty_band(samples, rate_hz, band_hz)
-            raise RaceInputError(
+            raise UnfitError(
                 "channel",
                 f"is much louder for {lost:.0%} of its time, first at {stretches[0][0] / rate_hz:.2f} s, "
                 "than the machine is otherwise",
@@ -103,7 +103,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
         values = blanked(values, found, rate_hz)
     if len(spikes) > MOST_SPIKES * len(samples):
         _refuse_empty_band(samples, rate_hz, band_hz)
-        raise RaceInputError(
+        raise UnfitError(
             "channel", f"has {len(spikes)} wrong samples of {len(samples)}", "check cable and converter"
         )
     repairs = []
@@ -122,13 +122,13 @@ def _refuse_empty_band(samples: Real, rate_hz: float, band_hz: tuple[float, floa
     """Refuse a channel whose band holds nothing but rounding, which looks like wrong samples once whitened.
 
     Raises:
-        RaceInputError: it is such a channel.
+        UnfitError: it is such a channel.
     """
     power = np.abs(scipy.fft.rfft((samples - samples.mean()) * np.hanning(len(samples)))) ** 2
     frequency = scipy.fft.rfftfreq(len(samples), 1.0 / rate_hz)
     inside = float(power[(frequency >= band_hz[0]) & (frequency <= band_hz[1])].sum())
     if inside < EMPTY_SHARE * power.sum():
-        raise RaceInputError(
+        raise UnfitError(
             "channel",
             f"holds nothing but rounding from {band_hz[0]:g} to {band_hz[1]:g} Hz beside its "
             f"{frequency[power.argmax()]:.0f} Hz",

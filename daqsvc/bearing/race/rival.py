@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.bearing.race.combs import fundamental
-from daqsvc.bearing.race.speed import REMEDY
-from daqsvc.bearing.race.verdict import PARTS, PLACES, RaceInputError
+from daqsvc.bearing.race.verdict import PARTS, PLACES
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.harmonics import REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.bearing.geometry import BearingOrders
-    from daqsvc.bearing.race.speed import ShaftRate
     from daqsvc.bearing.race.verdict import Part, PartEvidence
+    from daqsvc.dsp.speed.harmonics import ShaftRate
 
 
 def refuse_rivals(
@@ -31,7 +32,7 @@ def refuse_rivals(
         slip: how far the lines of a part may be from their place, as a share.
 
     Raises:
-        RaceInputError: they do.
+        UnfitError: they do.
     """
     if shaft.seen:
         return
@@ -43,7 +44,7 @@ def refuse_rivals(
             rival_hz = shaft.rate_hz * e.order / fundamental(bearing, other)
             if other != part and shaft.outvoted(rival_hz, slip):
                 here, there = 60.0 * shaft.rate_hz, 60.0 * rival_hz
-                raise RaceInputError(
+                raise UnfitError(
                     "shaft speed or sample rate",
                     f"is in doubt: the lines of the {PLACES[part]} at {here:.0f} rpm are those of the "
                     f"{PLACES[other]} at {there:.0f} rpm, where more harmonics of a shaft stand out",

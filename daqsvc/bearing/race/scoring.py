@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.rules import RaceRules
-    from daqsvc.bearing.race.speed import ShaftRate
+    from daqsvc.dsp.speed.harmonics import ShaftRate
 
     Real = NDArray[np.float64]
 

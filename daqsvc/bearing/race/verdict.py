@@ -19,22 +19,6 @@ PLACES: Mapping[Part, str] = {"inner": "inner race", "outer": "outer race", "bal
 """The parts in words."""
 
 
-class RaceInputError(ValueError):
-    """The samples cannot be judged: they are not what a healthy sensor delivers, or not enough of it.
-
-    Attributes:
-        thing: what is wrong with what, e.g. ``"channel"``.
-        value: what was found.
-        remedy: what to do about it.
-    """
-
-    def __init__(self, thing: str, value: str, remedy: str) -> None:
-        super().__init__(f"{thing} {value}; {remedy}")
-        self.thing = thing
-        self.value = value
-        self.remedy = remedy
-
-
 @dataclass(frozen=True, slots=True)
 class PartEvidence:
     """What speaks for damage of one part.

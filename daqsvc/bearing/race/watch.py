@@ -58,7 +58,7 @@ class RaceWatch:
                 test begins anew.
 
         Raises:
-            RaceInputError: no verdict can rest on these samples. They are forgotten.
+            UnfitError: no verdict can rest on these samples. They are forgotten.
         """
         if speed_rpm is not None:
             if abs(speed_rpm / self.speed_rpm - 1.0) > self._rules.speed_tolerance:

@@ -17,8 +17,8 @@ from daqsvc.detectors.bearing.detector import SAME_SPEED, BearingDetector
 from daqsvc.detectors.bearing.direction import TwoSensors
 from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.detectors.bearing.settings import BEARING
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
 from daqsvc.dsp.levels import STANDARD_GRAVITY
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings.models import Keyphasor
 
 if TYPE_CHECKING:

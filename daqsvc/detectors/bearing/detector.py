@@ -9,7 +9,6 @@ import numpy as np
 
 from daqsvc.bearing.identify_change import ChangeRules, compare_residual
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import RaceInputError
 from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
 from daqsvc.detectors.bearing.direction import Direction, RaceDirection
 from daqsvc.detectors.bearing.evaluation import (
@@ -24,8 +23,9 @@ from daqsvc.detectors.bearing.finding import SOUND, find
 from daqsvc.detectors.bearing.learning import HealthyGathering
 from daqsvc.detectors.bearing.persistence import ConfirmedState, PersistenceFilter
 from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
-from daqsvc.detectors.bearing.speed import SpeedError, measure_speed
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.steadiness import SpeedError, measure_speed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from daqsvc.bearing.identify_change import ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.housed import HousedBearing
-    from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 
     Floats = NDArray[np.float64]
 
@@ -247,7 +247,7 @@ class BearingDetector:
                 refuse_clipped(signal)
                 race = self._watches[bearing.name].take(signal)
                 departed = self._departed(bearing, samples)
-            except (ClippedError, RaceInputError, _StandsStillError) as error:
+            except (ClippedError, UnfitError, _StandsStillError) as error:
                 self._watches[bearing.name].forget()
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
                 continue

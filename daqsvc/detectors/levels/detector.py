@@ -19,8 +19,7 @@ from daqsvc.detectors.levels.partial import (
 )
 from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.dsp.gapped_band import gapped_band_rms
-from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, levels
+from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, gapped_band_rms, levels
 from daqsvc.dsp.standstill import StandstillWatch
 
 if TYPE_CHECKING:

@@ -15,9 +15,10 @@ from daqsvc.detectors.rotor_bank.statements import (
     BankDiagnosisBuilder,
     Moment,
 )
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe, Verdict, stands_still
+from daqsvc.detectors.shaft.probe_checks import Verdict, stands_still
 from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
-from daqsvc.dsp.keyphasor import KeyphasorTracker
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
 from daqsvc.rotor.decision import DecisionRules

@@ -16,16 +16,18 @@ from daqsvc.detectors.rotor_synchronous.vector_checks import (
     speed_verdict,
     static_position_missing,
 )
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe, Verdict
+from daqsvc.detectors.shaft.probe_checks import Verdict
 from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.dsp.revolutions import EdgeCounts
+    from daqsvc.dsp.speed.keyphasor import EdgeCounts
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
-from daqsvc.dsp.probe_axes import probes_to_xy, shaft_axes_deg
-from daqsvc.dsp.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter, Revolutions
+from daqsvc.dsp.probes import Probe, probes_to_xy, shaft_axes_deg
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
+from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter, Revolutions
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors, synchronous_vectors
 
 if TYPE_CHECKING:
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.revolutions import EdgeCounts, RevolutionCutter
+    from daqsvc.dsp.speed.keyphasor import EdgeCounts
+    from daqsvc.dsp.speed.revolutions import RevolutionCutter
 
     Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.detectors.shaft.probe_checks import Probe
+    from daqsvc.dsp.probes import Probe
     from daqsvc.rotor.synchronous.baseline import Calibration
 
     Complexes = NDArray[np.complex128]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from daqsvc.detectors.shaft.probe_checks import KeyphasorProbe, Probe
+from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings.models import Keyphasor, ProximityProbe
 
 if TYPE_CHECKING:

@@ -11,48 +11,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.record import DataQuality
-    from daqsvc.dsp.keyphasor import Edge
 
     Floats = NDArray[np.float64]
 
 _CLIPPED = 1 / 16
 """Part of a revolution at one extreme value that makes a probe clipped."""
-
-
-@dataclass(frozen=True, slots=True)
-class Probe:
-    """A proximity probe.
-
-    Attributes:
-        name: name of the sensor.
-        column: its column in the stream, counted from the shaft-centred position.
-        angle_deg: where it points, from +x against the clock.
-        um_per_unit: micrometres in a unit of the column.
-    """
-
-    name: str
-    column: int
-    angle_deg: float
-    um_per_unit: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class KeyphasorProbe:
-    """A keyphasor.
-
-    Attributes:
-        name: name of the sensor.
-        column: its column in the stream, volts.
-        threshold_v: level that marks the edge.
-        hysteresis_v: how far the voltage must return before there can be another edge.
-        edge: the edge that marks angle zero.
-    """
-
-    name: str
-    column: int
-    threshold_v: float
-    hysteresis_v: float = 0.5
-    edge: Edge = "rising"
 
 
 @dataclass(frozen=True, slots=True)

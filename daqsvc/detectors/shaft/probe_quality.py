@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.detectors.shaft.probe_checks import Probe
+    from daqsvc.dsp.probes import Probe
     from daqsvc.dsp.standstill import Standstill
 
     Complexes = NDArray[np.complex128]

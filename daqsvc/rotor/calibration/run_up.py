@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import least_squares
 
-from daqsvc.dsp.shaft import Revolutions
+from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.calibration.chirp import Chirp
 from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 from daqsvc.rotor.laval import unbalance_response

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.dsp.order_speed import ORDERS
+from daqsvc.dsp.speed.lines import ORDERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

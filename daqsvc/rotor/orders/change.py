@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.dsp.order_speed import ORDERS
+from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.rotor.orders.causes import cause_evidence, surprise
 
 if TYPE_CHECKING:

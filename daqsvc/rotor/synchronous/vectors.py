@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.revolutions import Revolutions
+    from daqsvc.dsp.speed.revolutions import Revolutions
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

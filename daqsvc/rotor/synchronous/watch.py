@@ -32,7 +32,7 @@ from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.revolutions import Revolutions
+    from daqsvc.dsp.speed.revolutions import Revolutions
     from daqsvc.rotor.laval import LavalRotor
 
     Complexes = NDArray[np.complex128]

@@ -1,7 +1,8 @@
-"""Two proximity probes and the plane that they look at together."""
+"""Proximity probes, and the plane that two of them look at together."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """A proximity probe.
+
+    Attributes:
+        name: name of the sensor.
+        column: its column in the stream, counted from the shaft-centred position.
+        angle_deg: where it points, from +x against the clock.
+        um_per_unit: micrometres in a unit of the column.
+    """
+
+    name: str
+    column: int
+    angle_deg: float
+    um_per_unit: float = 1.0
 
 
 def shaft_axes_deg(angles_deg: tuple[float, float], *, clockwise: bool) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.keyphasor_edges import KeyphasorEdge
+    from daqsvc.dsp.speed.keyphasor import KeyphasorEdge
 
     Floats = NDArray[np.float64]
 

@@ -1,0 +1,20 @@
+"""What is wrong with samples: clipped, stuck, missing, outliers, wrong unit, wrong rate.
+
+A module for each question. What watches a machine and what reads a recording ask the same functions, with the
+same limits; where the limits differ, the reason stands beside them.
+"""
+
+from __future__ import annotations
+
+
+class UnfitError(ValueError):
+    """Samples cannot be judged: they are not what a healthy sensor delivers, or not enough of it.
+
+    Args:
+        thing: what is wrong, e.g. ``"channel"``.
+        value: what was found.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, thing: str, value: str, remedy: str) -> None:
+        super().__init__(f"{thing} {value}; {remedy}")
