@@ -1,6 +1,6 @@
 # make demo   the whole service against a simulated machine, live in the terminal
-# make test   the tests
-# make test-long  the long ones: statistics over hundreds of runs, soak, fuzz
+# make test   the tests; make test ROOM=rotor those of one room, a folder of tests/
+# make test-long  the long ones: statistics over hundreds of runs, soak, fuzz; of one room likewise
 # make hil    tests on real CAN interfaces (vcan), in a guest kernel where this one has none; as root
 # make check  formatting, lint, types, layers
 # make bench  speed, as ratios measured in one run
@@ -18,6 +18,9 @@ PYTHON ?= python3.11
 # Tests run side by side, one process a core; a file's tests stay together. Of the long ones many wait.
 WORKERS ?= auto
 LONG_WORKERS ?= 3
+# Without ROOM all of them.
+ROOMS = $(sort $(patsubst tests/%/,%,$(dir $(wildcard tests/*/test_*.py tests/*/*/test_*.py))))
+TESTS = $(if $(ROOM),$(if $(filter $(ROOMS),$(ROOM)),tests/$(ROOM),$(error there is no room '$(ROOM)' in tests/; there are $(ROOMS))))
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
@@ -45,10 +48,10 @@ demo: $(READY)
 	@$(BIN)/daqsvc demo $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(TESTS) $(ARGS)
 
 test-long: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m long $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m long $(TESTS) $(ARGS)
 
 hil: $(READY)
 	@tests/hil/run.sh $(ARGS)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 import pytest_asyncio
 from hypothesis import settings
+from support.paths import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -25,9 +26,12 @@ settings.register_profile(
 )
 settings.load_profile("daqsvc")
 
-ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()
 GRACE_S = 2.0
+
+pytest_plugins = ["support.fixtures"]
+KINDS = ("property", "integration", "statistical", "hil", "conformance")
+"""A file says its kind by its ``pytestmark``, or lies in the folder of that name; others are unit tests."""
 
 
 # A shell's background job, and nohup, ignore these, and what the tests start would inherit it.
@@ -64,5 +68,11 @@ async def _no_leaked_tasks() -> AsyncIterator[None]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
+        if (suite := item.path.parent.name) in KINDS:
+            item.add_marker(suite)
+        if not any(item.get_closest_marker(kind) for kind in KINDS):
+            item.add_marker(pytest.mark.unit)
+        if item.get_closest_marker("statistical"):
+            item.add_marker(pytest.mark.long)
         if isinstance(item, pytest.Function) and inspect.iscoroutinefunction(item.obj):
             item.fixturenames.insert(0, "_no_leaked_tasks")

@@ -8,7 +8,7 @@ all arrivals and lowered until it touches, errs less.
 
 How far the line may be off is told by the earliest arrivals of parts of the window. The constants below make
 that a 95th percentile for delays whose least value is not rare (uniform, exponential, in bursts), and about
-the 85th for others: tests/statistical/test_alignment_clocks.py draws them.
+the 85th for others: tests/acquisition/test_alignment_clocks.py draws them.
 """
 
 from __future__ import annotations

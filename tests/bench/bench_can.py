@@ -25,7 +25,7 @@ import can
 import cantools
 import numpy as np
 from can.interfaces.socketcan.socketcan import SocketcanBus
-from can_standin import frames_bytes
+from support.can_standin import frames_bytes
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock

@@ -24,7 +24,7 @@ import tty
 from typing import Any, NamedTuple
 
 import numpy as np
-from can_standin import frame_bytes
+from support.can_standin import frame_bytes
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock

@@ -17,15 +17,15 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests"))
 
-import race_records  # noqa: E402 - lies beside the tests that use it
-from race_signals import BEARING, SPEED_RPM  # noqa: E402
+from support import race_records  # noqa: E402 - lies beside the tests that use it
+from support.race_signals import BEARING, SPEED_RPM  # noqa: E402
 
 from daqsvc.bearing.race import race_test  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from race_records import Record
+    from support.race_records import Record
 
     from daqsvc.bearing.race import PartEvidence, RaceVerdict
 

@@ -7,10 +7,10 @@ from abc import abstractmethod
 from typing import TYPE_CHECKING
 
 import numpy as np
-from can_standin import frame_bytes
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, layout
+from support.can_standin import frame_bytes
 
 from drivers.base import BusPort, StreamSpec
 from drivers.can.socketcan import SO_TIMESTAMPNS

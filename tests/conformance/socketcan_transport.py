@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
 from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
-from vcan_links import VcanLink
+from support.vcan_links import VcanLink
 
 from drivers.can.driver import CanDriver
 from drivers.can.socketcan import dropped_frames, open_socketcan

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from can_standin import StandInBus
 from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
 from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
+from support.can_standin import StandInBus
 
 from drivers.can.driver import CanDriver
 

@@ -24,7 +24,7 @@ from daqsvc.settings import load
 if TYPE_CHECKING:
     from pathlib import Path
 
-TESTS = sorted((ROOT / "tests" / "unit").glob("test_*settings*.py"))
+TESTS = sorted((ROOT / "tests").rglob("test_*settings*.py"))
 _MOST_CHANGED = 0.4
 """Share of its lines in which a file may differ from an example to be told by edits of it."""
 

@@ -127,7 +127,7 @@ def test_every_key_of_every_table_is_spoilt():
         if section.__module__.split(".")[0] not in {"daqsvc", "drivers"}:
             continue  # of another test
         if section is PackedLayout:
-            continue  # of drivers of others, so tests/integration/test_example_driver.py spoils it
+            continue  # of drivers of others, so tests/drivers/test_example_driver.py spoils it
         seen += 1
         held = set(section.model_fields)
         # A table of another plugin may stand in this one without being a key of its model.

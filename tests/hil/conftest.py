@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from vcan_links import VcanLink
+from support.vcan_links import VcanLink
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from can_standin import frame_bytes
-from running_drivers import CountingDevice, QuickClock, running, until
+from support.can_standin import frame_bytes
+from support.running_drivers import CountingDevice, QuickClock, running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -19,7 +19,7 @@ from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
 
 if TYPE_CHECKING:
-    from vcan_links import VcanLink
+    from support.vcan_links import VcanLink
 
     from daqsvc.acquisition.samples import SampleBlock
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from can_standin import frame_bytes
+from support.can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.can.batches import ERROR, EXTENDED, REMOTE, STANDARD_ID, CanBatch, IdMatch
 from drivers.can.socketcan import SocketCan, dropped_frames, open_socketcan
 
 if TYPE_CHECKING:
-    from vcan_links import VcanLink
+    from support.vcan_links import VcanLink
 
 ALL = IdMatch(0, 0)
 
@@ -168,9 +168,7 @@ def test_sockets_opened_and_closed_leave_no_descriptor(vcan: VcanLink) -> None:
 
 def test_a_step_of_the_wall_clock_moves_no_arrival(vcan: VcanLink) -> None:
     if os.environ.get("DAQSVC_HIL_GUEST") != "1":
-        pytest.skip(
-            "sets the wall clock, and this machine is no guest; tests/unit/test_socketcan.py has it, too"
-        )
+        pytest.skip("sets the wall clock, and this machine is no guest; test_socketcan.py has it, too")
     clock = SystemClock()
     arrivals: list[int] = []
     sent: list[int] = []

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
-from can_recordings import STREAMS, books, only_file, replayed
-from can_standin import frame_bytes
-from running_drivers import running, until
+from support.can_recordings import STREAMS, books, only_file, replayed
+from support.can_standin import frame_bytes
+from support.running_drivers import running, until
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort
@@ -21,7 +21,7 @@ from drivers.can.driver import CanDriver
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from vcan_links import VcanLink
+    from support.vcan_links import VcanLink
 
     from drivers.replay.driver import ReplayDriver
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from brokers import Consumer, running_mosquitto
+from support.brokers import Consumer, running_mosquitto
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from vcan_links import VcanLink
+    from support.vcan_links import VcanLink
 
 CONFIG = Path(__file__).parents[2] / "config"
 MOTOR = CONFIG / "machines" / "motor-accelerometer.toml"

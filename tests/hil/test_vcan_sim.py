@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from vcan_links import VcanLink
+    from support.vcan_links import VcanLink
 
 MOTOR = Path(__file__).parents[2] / "config" / "machines" / "motor-accelerometer.toml"
 RATE_HZ, FRAME_HZ = 12_000, 400

@@ -19,7 +19,7 @@ from nothing_lost.consumer import Consumer
 from nothing_lost.disk import small_disk
 from nothing_lost.script import Script
 from nothing_lost.teller import Witness, settled_to
-from tcp_proxy import FaultyProxy
+from support.tcp_proxy import FaultyProxy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine

@@ -1,0 +1,85 @@
+"""The document of alarms says what the code does: its diagram is drawn from the moves, its example read."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from typing import get_args
+
+import pytest
+from support.paths import ROOT
+
+from daqsvc.alarms.commands import Verb
+from daqsvc.alarms.conditions import RESERVED
+from daqsvc.alarms.diagram import state_diagram
+from daqsvc.alarms.states import AlarmState, moves
+from daqsvc.detectors.levels.settings import Levels
+from daqsvc.settings.alarms import AlarmHandling, DiagnosisAlarm, LevelAlarm, Measure, StartUp, VotingAlarm
+from daqsvc.settings.sensors import TrendValue
+
+TEXT = (ROOT / "docs" / "alarms.md").read_text(encoding="utf-8")
+
+
+def fenced(language):
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_the_diagram_is_the_one_of_the_code():
+    assert fenced("mermaid") == [state_diagram()]
+    drawn = subprocess.run([sys.executable, "-m", "daqsvc.alarms.diagram"], capture_output=True, check=True)
+    assert drawn.stdout.decode() == state_diagram()
+
+
+def test_the_diagram_has_every_move_and_no_other():
+    drawn = set()
+    for line in state_diagram().splitlines()[2:]:
+        state, after, stimulus, note = re.fullmatch(r" +(\w+) --> (\w+): (\w+)(?: \((.*)\))?", line).groups()
+        drawn |= {
+            (state, stimulus, after, latching)
+            for latching in (False, True)
+            if note is None or (note == "latching") == latching
+        }
+    made = {
+        (state.value, stimulus.value, after.value, latching)
+        for latching in (False, True)
+        for (state, stimulus), after in moves(latching=latching).items()
+    }
+    assert drawn == made
+
+
+@pytest.mark.parametrize("word", [*AlarmState, *Verb, *sorted(RESERVED)])
+def test_every_state_verb_and_own_alarm_is_explained(word):
+    assert f"`{word}`" in TEXT
+
+
+def test_the_example_is_valid_has_every_key_and_the_defaults():
+    example, _ = map(tomllib.loads, fenced("toml"))
+    level, vote, both_sides, detector = example["alarms"]
+    assert LevelAlarm.model_validate(level).trip_multiply == 2.0
+    assert VotingAlarm.model_validate(vote).vote == 2
+    assert DiagnosisAlarm.model_validate(detector).evidence_nats == 18.0
+    handling = dict(example["alarm_handling"])
+    start_up = handling.pop("start_up")
+    assert handling == AlarmHandling().model_dump(exclude={"start_up"})
+    assert set(start_up) == set(StartUp.model_fields)
+    assert StartUp.model_validate(start_up).at_most_s == StartUp.model_fields["at_most_s"].default
+    assert LevelAlarm.model_validate(both_sides).setpoints == {
+        "danger_low": 5.0,
+        "alert_low": 10.0,
+        "alert": 65.0,
+        "danger": 75.0,
+    }
+    named = {*level, *both_sides, "sensors", "vote"}
+    assert named == set(LevelAlarm.model_fields) | set(VotingAlarm.model_fields)
+
+
+def test_every_measure_is_in_the_table_and_the_trend_value_has_every_key():
+    table = "".join(re.findall(r"^\| `.*`.*\|$", TEXT.split("| `measure` |")[1], re.MULTILINE))
+    assert all(f"`{measure}`" in table for measure in get_args(Measure))
+    _, example = map(tomllib.loads, fenced("toml"))
+    (sensor,) = example["sensors"]
+    assert TrendValue.model_validate(sensor).ok_between == (-40.0, 125.0)
+    assert set(sensor) == set(TrendValue.model_fields) - {"sensitivity_mv_per_unit", "zero_v"}
+    assert Levels.model_validate(example["pipeline"]["levels"]) == Levels()

@@ -1,0 +1,42 @@
+"""Alarm events in the log: each, unless they come faster than anybody reads."""
+
+from __future__ import annotations
+
+import logging
+
+from support.alarm_rig import AlarmRig
+
+from daqsvc.alarm_log import LINE_EVERY_NS, LINES, AlarmLog
+from daqsvc.alarms.manager import LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+
+
+def test_a_flood_is_counted_once_a_second_and_what_comes_after_it_is_named(caplog):
+    caplog.set_level(logging.INFO, "daqsvc.alarm_log")
+    rig = AlarmRig(LevelRule("vibration-x", "probe-x", "rms", Setpoint(alert=4.0)))
+    raised, returned = [event for value in (5.0, 1.0) for event in rig.rms(value)]
+    log = AlarmLog(rig.clock)
+    for _ in range(LINES):
+        log.say(raised)
+    log.sum_up()
+    assert len(caplog.records) == LINES
+    assert {record.levelname for record in caplog.records} == {"WARNING"}
+    assert raised.message in caplog.records[0].getMessage()
+    caplog.clear()
+    for _ in range(500):
+        log.say(raised)
+    log.sum_up()
+    log.sum_up()
+    (record,) = caplog.records
+    assert record.getMessage().startswith("500 alarm events came too fast for this log")
+    caplog.clear()
+    rig.clock.t_ns += LINE_EVERY_NS
+    log.say(returned)
+    log.say(returned)
+    (record,) = caplog.records
+    assert (record.levelname, returned.message in record.getMessage()) == ("INFO", True)
+    rig.clock.t_ns += 10 * LINES * LINE_EVERY_NS
+    caplog.clear()
+    for _ in range(2 * LINES):
+        log.say(raised)
+    assert len(caplog.records) == LINES, "what is not needed is not saved up"

@@ -1,0 +1,123 @@
+"""A speed that is wrong is refused, put right, or said not to be confirmed: no part is named by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.fft
+from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
+
+from daqsvc.bearing.race import race_test
+from daqsvc.bearing.race.rival import refuse_rivals
+from daqsvc.bearing.race.verdict import PartEvidence
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.harmonics import ShaftRate, shaft_rate, slow_series
+
+SHAFT_HZ = 29.5
+SECONDS = 4.0
+BINS_HZ = 1.0 / SECONDS
+
+
+def shaft_of(lines_hz: list[float], stated_hz: float, seed: int = 0) -> ShaftRate:
+    """The shaft as found in lines of these frequencies and noise, with an envelope that is noise alone."""
+    t = np.arange(int(SECONDS * 2000)) / 2000.0
+    random = np.random.default_rng(seed)
+    series = random.standard_normal(len(t)) + sum(np.cos(2 * np.pi * hz * t + hz) for hz in lines_hz)
+    envelope = random.standard_exponential(len(t) // 2)
+    slow = slow_series(scipy.fft.rfft(series), BINS_HZ, stated_hz)
+    return shaft_rate(*slow, envelope, SECONDS, stated_hz, 0.012, BEARING.cage)
+
+
+def harmonics(shaft_hz: float, orders: range = range(1, 7)) -> list[float]:
+    return [order * shaft_hz for order in orders]
+
+
+def test_the_true_speed_is_confirmed() -> None:
+    shaft = shaft_of(harmonics(SHAFT_HZ), SHAFT_HZ)
+    assert shaft.seen
+    assert not shaft.doubt
+
+
+@pytest.mark.parametrize("error", [-0.028, -0.018, -0.014, 0.014, 0.018, 0.028])
+def test_a_speed_wrong_by_less_than_three_percent_is_put_right(error: float) -> None:
+    shaft = shaft_of(harmonics(SHAFT_HZ), (1.0 + error) * SHAFT_HZ)
+    assert shaft.rate_hz == pytest.approx(SHAFT_HZ, rel=1e-3)
+    assert shaft.seen
+
+
+def test_wrong_speeds_are_hardly_ever_confirmed() -> None:
+    random = np.random.default_rng(5)
+    confirmed, trials = 0, 60
+    for seed in range(trials):
+        factor = 1.0 + random.choice([-1.0, 1.0]) * random.uniform(0.04, 0.3)
+        try:
+            confirmed += shaft_of(harmonics(SHAFT_HZ), factor * SHAFT_HZ, seed).seen
+        except UnfitError:
+            continue
+    assert confirmed <= 0.03 * trials
+
+
+def test_noise_confirms_no_speed() -> None:
+    assert sum(shaft_of([], SHAFT_HZ, seed).seen for seed in range(40)) <= 1
+
+
+@pytest.mark.parametrize(("mains_hz", "stated_hz"), [(60.0, 29.95), (50.0, 24.9), (50.0, 49.95)])
+def test_lines_of_the_mains_confirm_no_speed(mains_hz: float, stated_hz: float) -> None:
+    shaft = shaft_of(harmonics(mains_hz, range(1, 5)), stated_hz)
+    assert not shaft.seen
+    assert "mains" in shaft.doubt or "only even" in shaft.doubt
+
+
+def test_lines_of_the_mains_pull_no_speed_away() -> None:
+    lines = harmonics(29.53) + harmonics(60.0, range(1, 4))
+    assert shaft_of(lines, 29.95).rate_hz == pytest.approx(29.53, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(0.5, "only even harmonics stand out"), (2.0, "half orders stand out")]
+)
+def test_half_and_double_the_speed_are_not_confirmed(factor: float, said: str) -> None:
+    shaft = shaft_of(harmonics(SHAFT_HZ, range(1, 16)), factor * SHAFT_HZ)
+    assert not shaft.seen
+    assert said in shaft.doubt
+    assert f"{60.0 * SHAFT_HZ:.0f} rpm" in shaft.doubt
+
+
+@pytest.mark.parametrize("rate_hz", [10_000.0, 16_000.0, 9_000.0])
+@pytest.mark.parametrize("part", ["inner", "outer", "ball"])
+def test_a_wrong_sampling_rate_is_refused(part: str, rate_hz: float) -> None:
+    samples = strikes(part, strength=1.5)
+    assert race_test(samples, RATE_HZ, SPEED_RPM, BEARING).verdict == part
+    with pytest.raises(UnfitError, match="shaft speed or sample rate is wrong"):
+        race_test(samples, rate_hz, SPEED_RPM, BEARING)
+
+
+def part_evidence(z: float, depth: float, order: float, limit: float) -> PartEvidence:
+    return PartEvidence(z, depth, 1.0, z * depth, 5.0, 0.3, limit, 1e-4, order)
+
+
+def test_a_part_is_not_named_where_its_lines_and_the_harmonics_agree_on_another_speed() -> None:
+    # Lines of the inner race at 29.5 Hz; stated so that they lie where the ball's would.
+    stated_hz = SHAFT_HZ * BEARING.inner / BEARING.ball_pass
+    # Only two harmonics: too few to refuse the speed as such.
+    shaft = shaft_of(harmonics(SHAFT_HZ, range(1, 3)), stated_hz, seed=3)
+    assert not shaft.seen
+    nothing = part_evidence(0.0, 0.05, 4.0, 3.0)
+    ball = part_evidence(20.0, 0.8, BEARING.ball_pass, 7.7)
+    evidence = {"inner": nothing, "outer": nothing, "ball": ball}
+    with pytest.raises(UnfitError, match=r"lines of the ball at .* those of the inner race at 17\d\d rpm"):
+        refuse_rivals(evidence, BEARING, shaft, 0.015)
+    refuse_rivals(evidence | {"ball": nothing}, BEARING, shaft, 0.015)
+
+
+def test_a_speed_that_harmonics_speak_against_leaves_no_sure_normal() -> None:
+    t = np.arange(60_000) / RATE_HZ
+    shaft_hz = SPEED_RPM / 60.0
+    half = sum(np.cos(2 * np.pi * k * 0.5 * shaft_hz * t + k) for k in range(1, 16))
+    verdict = race_test(
+        np.random.default_rng(0).standard_normal(len(t)) + 0.3 * half, RATE_HZ, SPEED_RPM, BEARING
+    )
+    assert not verdict.speed_seen
+    assert any("half orders" in note for note in verdict.notes)
+    assert verdict.verdict == "normal"
+    assert verdict.probability["normal"] <= 0.5

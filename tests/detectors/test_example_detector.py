@@ -1,0 +1,101 @@
+"""The worked example of docs/detectors.md: raised by knocks, held where samples are missing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from support.example_packages import DETECTOR, DOCS, installed
+from support.machine_files import MOTOR, problems_of
+
+from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.detector import Window
+from daqsvc.settings import describe, parse_machine_file
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from daqsvc.settings import MachineFile
+
+pytestmark = pytest.mark.integration
+TABLE = '[pipeline.crest]\nsensor = "accel-de"\nalert = 5.0\n'
+ALARM = '[[alarms]]\nname = "knocks"\ndetector = "crest"\n'
+
+
+@pytest.fixture(autouse=True)
+def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    yield from installed(DETECTOR, tmp_path / "site", monkeypatch)
+
+
+def machine(*more: str) -> MachineFile:
+    return parse_machine_file("\n".join([MOTOR.read_text(), *(more or (TABLE, ALARM))]), MOTOR)
+
+
+def detector() -> Any:
+    [found] = [detector for detector in detectors(machine()) if detector.name == "crest"]
+    return found
+
+
+def window(made: Any, signal: NDArray[Any], first: int = 0) -> Window:
+    samples = np.zeros((len(signal), len(machine().streams[made.stream].layout.channel_names)), np.float32)
+    samples[:, made._columns[0]] = signal
+    return Window(first, samples, 10**9, 1e9 / made.block)
+
+
+def test_its_alarm_follows_it() -> None:
+    assert "crest" in machine().detectors
+    assert "knocks" in [rule.alarm for rule in alarm_rules(machine())]
+    assert "sensor accel-de, alert 5.0" in " ".join(describe(machine()).split())
+
+
+def test_knocks_raise_it_and_their_end_clears_it() -> None:
+    made = detector()
+    made.warm()
+    t = np.arange(2 * made.block) / made.block
+    quiet = np.sin(2 * np.pi * 50 * t)
+    knocking = quiet.copy()
+    knocking[made.block // 2] = 40.0
+    first, second = made.process(window(made, knocking))
+    assert (first.decision, first.severity, first.changed, first.quality) == ("alert", "alert", True, "good")
+    assert first.statistics["crest_factor"] == pytest.approx(
+        np.abs(knocking[: made.block]).max() / knocking[: made.block].std(), rel=1e-2
+    )
+    assert (second.decision, second.changed) == ("normal", True)
+    assert second.statistics["crest_factor"] == pytest.approx(np.sqrt(2), rel=1e-2)
+    assert (first.first_index, first.end_index, second.end_index) == (0, made.block, 2 * made.block)
+    assert second.t_ns - first.t_ns == pytest.approx(1e9, rel=1e-6)
+
+
+def test_missing_samples_and_silence_hold_the_decision() -> None:
+    made = detector()
+    knocking = np.sin(np.arange(made.block) / 9.0)
+    knocking[7] = 40.0
+    [alert] = made.process(window(made, knocking))
+    torn = np.where(np.arange(made.block) < made.block // 4, np.nan, 0.0)
+    [held] = made.process(window(made, torn, made.block))
+    assert (held.decision, held.severity, held.changed) == (alert.decision, alert.severity, False)
+    assert (held.quality, held.missing_share) == ("missing", pytest.approx(0.25, abs=0.01))
+    [silent] = made.silent(3.0, 5 * 10**9)
+    assert (silent.decision, silent.quality, silent.t_ns) == ("alert", "missing", 5 * 10**9)
+    [dead] = made.process(window(made, np.zeros(made.block)))
+    assert (dead.decision, dead.statistics["crest_factor"]) == ("normal", 0.0)
+
+
+def test_what_is_wrong_in_its_table_is_said() -> None:
+    text = MOTOR.read_text()
+    [misspelt] = problems_of(f"{text}\n{TABLE.replace('alert', 'alret')}", MOTOR)
+    assert "pipeline.crest.alret = 5.0: unknown key. Remedy: did you mean alert?" in str(misspelt)
+    [nobody] = problems_of(f"{text}\n{TABLE.replace('accel-de', 'accel-d')}", MOTOR)
+    assert nobody.message == "there is no such sensor"
+    assert nobody.remedy.startswith('did you mean "accel-de"?')
+
+
+def test_the_documentation_shows_the_example_as_it_is() -> None:
+    text = (DOCS / "detectors.md").read_text()
+    for name in ("crest.py", "pyproject.toml"):
+        assert (DETECTOR / name).read_text().strip() in text, f"docs/detectors.md has another {name}"

@@ -1,0 +1,175 @@
+"""The pipeline: order, catching up, overruns, and a detector that breaks its contract."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.acquisition.ring import SampleRing
+from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.silence import Patience
+
+if TYPE_CHECKING:
+    from daqsvc.diagnosis.detector import Window
+
+pytestmark = pytest.mark.integration
+CLOCK = SystemClock()
+
+
+class Listener:
+    """Remembers its windows; raises on demand, or waits."""
+
+    def __init__(self, name: str, block: int, *, fail_at: int | None = None) -> None:
+        self.name, self.stream, self.block = name, "s", block
+        self.windows: list[Window] = []
+        self.threads: set[str] = set()
+        self.fail_at = fail_at
+        self.go_on = threading.Event()
+        self.go_on.set()
+        self.warmed = False
+
+    def warm(self) -> None:
+        self.warmed = True
+
+    def process(self, window: Window) -> list[Diagnosis]:
+        self.go_on.wait(5)
+        self.threads.add(threading.current_thread().name)
+        self.windows.append(window)
+        if len(self.windows) - 1 == self.fail_at:
+            raise ZeroDivisionError("a detector broke its contract")
+        end = window.first_index + len(window.samples)
+        return [Diagnosis("m", self.name, window.t_end_ns, "s", window.first_index, end, "N")]
+
+    def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
+        return [Diagnosis("m", self.name, t_ns, "s", 0, 0, "N", quality="missing", reason=f"{silence_s:g} s")]
+
+
+def write(ring: SampleRing, n: int) -> None:
+    first = ring.end_index
+    samples = np.arange(first, first + n, dtype=np.float32)[:, None]
+    ring.write(SampleBlock("s", first, samples, 1000 * first, 1000.0))
+
+
+async def test_every_detector_sees_every_sample_in_order_off_the_loop() -> None:
+    ring = SampleRing("s", ("a",), 1000)
+    detectors = [Listener("one", 7), Listener("two", 16)]
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, detectors, said.append, CLOCK)
+    await pipeline.warm()
+    assert all(d.warmed for d in detectors)
+    running = asyncio.create_task(pipeline.run())
+    for n in (3, 30, 5, 100, 1, 60):
+        write(ring, n)
+        await asyncio.sleep(0.002)
+    ring.close()
+    await running
+    for detector in detectors:
+        got = np.concatenate([w.samples[:, 0] for w in detector.windows])
+        whole = 199 // detector.block * detector.block
+        np.testing.assert_array_equal(got, np.arange(whole))
+        assert all(w.t_end_ns == 1000 * (w.first_index + len(w.samples) - 1) for w in detector.windows)
+        assert all(name.startswith("kernel") for name in detector.threads)
+        assert [d.first_index for d in said if d.detector == detector.name] == [
+            w.first_index for w in detector.windows
+        ]
+    assert not [t for t in threading.enumerate() if t.name.startswith("kernel")]
+
+
+async def test_a_detector_that_is_too_slow_learns_exactly_what_it_missed() -> None:
+    ring = SampleRing("s", ("a",), 50)
+    slow = Listener("slow", 10)
+    pipeline = Pipeline({"s": ring}, [slow], lambda _: None, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    slow.go_on.clear()
+    write(ring, 10)
+    await asyncio.sleep(0.05)
+    write(ring, 175)
+    slow.go_on.set()
+    await asyncio.sleep(0.05)
+    ring.close()
+    await running
+    assert [(w.first_index, len(w.samples), w.skipped) for w in slow.windows] == [(0, 10, 0), (135, 50, 125)]
+    assert pipeline.counters["slow"].samples_skipped == 125
+
+
+async def test_an_outage_longer_than_the_ring_is_no_fault_of_the_detector(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    ring = SampleRing("s", ("a",), 16)
+    quick = Listener("quick", 4)
+    pipeline = Pipeline({"s": ring}, [quick], lambda _: None, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    write(ring, 8)
+    await asyncio.sleep(0.02)
+    block = SampleBlock("s", 108, np.full((4, 1), 1.0, np.float32), 108_000, 1000.0, lost_before=100)
+    ring.write(block)
+    await asyncio.sleep(0.02)
+    ring.close()
+    await running
+    # The windows after the outage know of all that lies between; the figures, of what was there to be had.
+    assert [(w.first_index, len(w.samples), w.skipped) for w in quick.windows] == [(0, 8, 0), (96, 16, 88)]
+    assert pipeline.counters["quick"].samples_skipped == 0
+    assert not caplog.records
+
+
+async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10, fail_at=0)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK)
+    running = asyncio.create_task(pipeline.run())
+    for _ in range(3):
+        write(ring, 10)
+        await asyncio.sleep(0.02)
+    ring.close()
+    await running
+    assert pipeline.counters["broken"].failures == 1
+    assert [d.first_index for d in said] == [10, 20]
+    assert sum("detector broken failed on samples 0 to 10" in r.message for r in caplog.records) == 1
+
+
+async def test_a_silence_is_said_once_and_again_after_the_next() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [Listener("one", 10)], said.append, clock)
+    running = asyncio.create_task(pipeline.run())
+    silences = []
+    for second in range(1, 16):
+        if second in {1, 2, 8}:
+            write(ring, 10)
+        for _ in range(4):
+            await asyncio.sleep(0.005)
+            clock.advance_to(clock.monotonic_ns() + 250_000_000)
+        silences.append(sum(d.quality == "missing" for d in said))
+    assert silences[:3] == [0, 0, 0]
+    assert silences[4:7] == [1, 1, 1]
+    assert silences[7:9] == [1, 1]
+    assert silences[11:] == [2, 2, 2, 2]
+    ring.close()
+    await running
+
+
+async def test_a_stream_that_is_sampled_once_a_minute_is_silent_after_minutes_only() -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    said: list[Diagnosis] = []
+    pipeline = Pipeline({"s": ring}, [Listener("one", 1)], said.append, clock, patience={"s": Patience(60e9)})
+    running = asyncio.create_task(pipeline.run())
+    await asyncio.sleep(0.005)
+    silent_at = []
+    for half_seconds in range(1, 1000):
+        if half_seconds in {1, 121, 481}:  # the values of the second and the third minute are lost
+            write(ring, 1)
+        clock.advance_to(clock.monotonic_ns() + 500_000_000)
+        for _ in range(4):
+            await asyncio.sleep(0)
+        silent_at += [half_seconds / 2] * (len([d for d in said if d.quality == "missing"]) - len(silent_at))
+    assert silent_at == [481 / 2 + 210.0]
+    ring.close()
+    await running

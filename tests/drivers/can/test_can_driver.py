@@ -1,0 +1,222 @@
+"""The CAN driver on python-can's virtual bus, and on one that fails in every way we know."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import can
+import numpy as np
+import pytest
+from support.fake_can import FaultyBus
+from support.running_drivers import QuickClock, begun, until
+
+from drivers.base import BusPort, DeviceAbsentError, StreamSpec
+from drivers.can.driver import CanDriver
+from drivers.frames import FrameLayout
+from sim_hw.bus_socket_wire import overflow_message
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.acquisition.samples import SampleBlock
+
+pytestmark = pytest.mark.integration
+PER_FRAME = 10
+
+
+def layout(frame_id: int = 0x101) -> FrameLayout:
+    return FrameLayout.plain(
+        frame_id=frame_id,
+        length=64,
+        channels=[
+            ("x", 16, "signed", 1.0, 0.0),
+            ("y", 16, "signed", 1.0, 0.0),
+            ("k", 16, "signed", 1.0, 0.0),
+        ],
+        samples_per_frame=PER_FRAME,
+        counter_byte=0,
+        counter_bits=16,
+        first_byte=2,
+        crc_byte=62,
+    )
+
+
+def message(frame: int, **changes: Any) -> can.Message:
+    samples = np.full((1, PER_FRAME, 3), float(frame % 1000))
+    data = layout().encode(np.array([frame * PER_FRAME], np.int64), samples)[0].tobytes()
+    return can.Message(
+        **({"arbitration_id": 0x101, "is_extended_id": False, "is_fd": True, "data": data} | changes)
+    )
+
+
+def port(blocks: list[SampleBlock], **changes: Any) -> BusPort:
+    arguments: dict[str, Any] = {
+        "name": "can0",
+        "options": {"interface": "faulty", "channel": "test", "fd": True},
+        "streams": [StreamSpec("shaft", layout(), 1000.0)],
+        "clock": QuickClock(),
+        "deliver": blocks.append,
+    }
+    return BusPort(**(arguments | changes))
+
+
+@pytest.fixture(autouse=True)
+def _renew() -> None:
+    FaultyBus.renew()
+
+
+async def test_frames_of_a_virtual_bus_become_blocks() -> None:
+    blocks: list[SampleBlock] = []
+    options = {"interface": "virtual", "channel": "test_frames_become_blocks", "fd": True}
+    driver = CanDriver(port(blocks, options=options))
+    async with begun(driver):
+        await until(lambda: driver.link.state == "up")
+        with can.Bus(
+            interface="virtual", channel=options["channel"], protocol=can.CanProtocol.CAN_FD
+        ) as sender:
+            for frame in range(100):
+                sender.send(message(frame))
+            await until(lambda: driver.streams["shaft"][0].samples_received == 100 * PER_FRAME)
+    got = np.concatenate([b.samples for b in blocks])
+    assert (got[:, 0] == np.repeat(np.arange(100), PER_FRAME)).all()
+    assert blocks[0].first_index == 0
+    assert driver.streams["shaft"][0].samples_lost == 0
+
+
+async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks))
+    short = message(1).data[:40]
+    strays = [
+        *[message(0, arbitration_id=0x7FF)] * 3,
+        *[message(0, is_extended_id=True)] * 2,
+        *[message(1, data=short)] * 4,
+        message(1, data=bytes(8), is_fd=False),
+        can.Message(arbitration_id=0x101, is_remote_frame=True, is_extended_id=False, dlc=8),
+        can.Message(arbitration_id=4, is_error_frame=True),
+        message(1, data=bytes(64)),  # CRC wrong
+    ]
+    with caplog.at_level(logging.WARNING):
+        async with begun(driver):
+            for k, stray in enumerate(strays):
+                FaultyBus.inbox.put(stray)
+                FaultyBus.inbox.put(message(k))
+            await until(lambda: driver.streams["shaft"][0].frames_received == len(strays) + 1)
+    counters = driver.streams["shaft"][0]
+    assert driver.counters.frames_unknown == 5
+    assert driver.counters.unknown_ids == {"0x7ff (11 bit)": 3, "0x101 (29 bit)": 2}
+    assert counters.frames_wrong_length == 5
+    assert counters.frames_corrupt == 1
+    assert (driver.counters.frames_remote, driver.counters.frames_error) == (1, 1)
+    assert (counters.samples_received, counters.samples_lost) == (len(strays) * PER_FRAME, 0)
+    said = [r.message for r in caplog.records]
+    assert sum("0x7ff (11 bit) the first of them" in text for text in said) == 1
+    assert sum("CRC does not match" in text for text in said) == 1
+    assert len(said) == 3, "every kind is said once, however many there are"
+    assert sum("bytes, its layout 64" in text for text in said) == 1
+
+
+@pytest.mark.parametrize(
+    ("failure", "reason"),
+    [
+        (can.CanOperationError("Network is down", 100), "Network is down"),
+        (OSError(19, "No such device"), "No such device"),
+        (RuntimeError("adapter went mad"), "its reader failed: adapter went mad"),
+        (can.Message(arbitration_id=0x40, is_error_frame=True), "bus-off"),
+    ],
+)
+async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
+    failure: Any, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks))
+    with caplog.at_level(logging.WARNING):
+        async with begun(driver):
+            for frame in range(5):
+                FaultyBus.inbox.put(message(frame))
+            await until(lambda: driver.streams["shaft"][0].frames_received == 5)
+            FaultyBus.open_errors += [can.CanInitializationError("still away")] * 3
+            FaultyBus.inbox.put(failure)
+            await until(lambda: driver.link.losses == 1)
+            await until(lambda: FaultyBus.opened == 2)
+            for frame in range(7, 12):
+                FaultyBus.inbox.put(message(frame))
+            await until(lambda: driver.streams["shaft"][0].samples_received >= 10 * PER_FRAME)
+    assert driver.streams["shaft"][0].samples_lost == 2 * PER_FRAME
+    assert driver.streams["shaft"][0].samples_received == 10 * PER_FRAME
+    said = [r.message for r in caplog.records]
+    lost = [r.message for r in caplog.records if "is lost" in r.message]
+    assert len(lost) == 1
+    assert reason in lost[0]
+    assert sum(text.endswith("is back") for text in said) == 1
+    assert FaultyBus.closed == FaultyBus.opened
+
+
+async def test_an_adapter_that_reports_bus_off_by_its_state_is_opened_again() -> None:
+    driver = CanDriver(port([]))
+    async with begun(driver):
+        await until(lambda: driver.link.state == "up")
+        FaultyBus.dead = True
+        await until(lambda: driver.counters.bus_off >= 1)
+        FaultyBus.dead = False
+        await until(lambda: driver.link.state == "up")
+
+
+async def test_a_hundred_losses_leave_no_thread_behind() -> None:
+    import threading
+
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks))
+    before = threading.active_count()
+    async with begun(driver):
+        for k in range(100):
+            await until(lambda: driver.link.state == "up")
+            FaultyBus.inbox.put(message(k))
+            FaultyBus.inbox.put(can.CanOperationError("down"))
+            await until(lambda k=k: driver.link.losses == k + 1)
+        await until(lambda: driver.link.state == "up")
+        assert sum(t.name.startswith("can-reader") for t in threading.enumerate()) == 1
+    assert FaultyBus.closed == FaultyBus.opened
+    assert driver.streams["shaft"][0].samples_received == 100 * PER_FRAME
+    readers = [t for t in threading.enumerate() if t.name.startswith("can-reader")]
+    assert not readers, f"{threading.active_count()} threads, {before} before"
+
+
+async def test_absent_at_start_follows_the_policy() -> None:
+    FaultyBus.open_errors = [can.CanInitializationError("no such interface")]
+    with pytest.raises(DeviceAbsentError, match=r"'can0'.*no such interface"):
+        await CanDriver(port([], start="error")).run()
+    FaultyBus.open_errors = [can.CanInitializationError("no such interface")]
+    ignoring = CanDriver(port([], start="ignore"))
+    await ignoring.run()
+    assert ignoring.counters.open_failures == 1
+    FaultyBus.open_errors = [OSError("no"), can.CanInitializationError("no"), ValueError("no")]
+    retrying = CanDriver(port([]))
+    async with begun(retrying):
+        await until(lambda: retrying.link.state == "up")
+    assert retrying.counters.open_failures == 3
+
+
+async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks, streams=[StreamSpec("shaft", layout(), 1000.0, 10_000_000_000)]))
+    async with begun(driver):
+        for frame in (0, 1, 3):
+            FaultyBus.inbox.put(message(frame))
+        await until(lambda: driver.streams["shaft"][0].frames_received == 3)
+        assert not blocks
+    assert [b.first_index for b in blocks] == [0, 3 * PER_FRAME]
+    assert blocks[1].lost_before == PER_FRAME
+
+
+async def test_the_virtual_bus_tells_of_its_overflows_as_a_controller_does(tmp_path: Path) -> None:
+    path = str(tmp_path / "can0")
+    blocks: list[SampleBlock] = []
+    driver = CanDriver(port(blocks, options={"interface": "unixbus", "channel": path, "fd": True}))
+    async with begun(driver):
+        await until(lambda: driver.link.state == "up")
+        with can.Bus(interface="unixbus", channel=path, fd=True, hub="join") as peer:
+            peer.send(overflow_message(0.0, path))
+            await until(lambda: driver.counters.frames_error == 1)
+    assert (driver.counters.rx_overflows, driver.counters.overruns) == (1, 1)

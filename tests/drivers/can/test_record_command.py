@@ -1,0 +1,206 @@
+"""``daqsvc record`` on the virtual bus between processes, stopped and killed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import can
+import pytest
+from support.brokers import free_port
+from support.can_recordings import numbers
+from support.paths import ROOT
+
+from daqsvc.commands.record import ENDINGS
+from daqsvc.commands.signals import signals_to_end
+from sim_hw.bus_socket import UnixBus
+from sim_hw.bus_socket_hub import Hub
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+RIG = ROOT / "config" / "machines" / "virtual-rig.toml"
+PATIENCE_S = 60.0
+FRAMES = 300
+
+
+def eventually(true: Callable[[], bool], what: str) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < until_s, what
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    text = RIG.read_text(encoding="utf-8").replace("/tmp/daqsvc-can0", str(tmp_path / "bus"))  # noqa: S108
+    path = tmp_path / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[UnixBus]:
+    hub = Hub(str(tmp_path / "bus"))
+    hub.start()
+    try:
+        with UnixBus(str(tmp_path / "bus"), fd=True, hub="join") as end:
+            yield end
+    finally:
+        hub.stop()
+
+
+@contextlib.contextmanager
+def recording(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "daqsvc", "record", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def refused(*arguments: str | Path) -> str:
+    command = [sys.executable, "-m", "daqsvc", "record", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    return done.stderr
+
+
+def send(bus: UnixBus, first: int, frames: int) -> None:
+    for number in range(first, first + frames):
+        bus.send(can.Message(arbitration_id=0x300, is_extended_id=False, data=number.to_bytes(8, "little")))
+
+
+def send_until_it_is_recorded(bus: UnixBus, log: Path) -> int:
+    """Send frames of number 0 until one is in the file: then the recorder listens. How many were sent."""
+    sent = 0
+
+    def arrived() -> bool:
+        nonlocal sent
+        send(bus, 0, 1)
+        sent += 1
+        return log.exists() and log.stat().st_size > 0
+
+    eventually(arrived, "nothing is recorded")
+    return sent
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_is_recorded_is_printed_when_it_is_stopped(
+    bus: UnixBus, machine: Path, tmp_path: Path, ending: str
+) -> None:
+    log = tmp_path / f"run{ending}"
+    with recording(machine, "--out", log) as process:
+        sent = send_until_it_is_recorded(bus, log)
+        send(bus, 1, FRAMES)
+        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        # All of them end it alike; SIGHUP comes when its terminal goes.
+        process.send_signal(signals_to_end()[ENDINGS.index(ending) % len(signals_to_end())])
+        output, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said
+    summary = json.loads(output)
+    found = numbers(log)
+    assert [number for number in found if number] == list(range(1, FRAMES + 1))
+    assert len(found) <= sent + FRAMES
+    assert (summary["bus"], summary["files"]) == ("can0", [str(log)])
+    assert (summary["frames_recorded"], summary["frames_unrecorded"]) == (len(found), 0)
+    assert summary["bytes"] == log.stat().st_size
+    assert summary["frames_unknown"] == len(found)
+    assert summary["streams"]["shaft"] == {"samples_received": 0, "samples_lost": 0}
+
+
+@pytest.mark.parametrize("ending", [".blf", ".asc", ".log"])
+def test_a_recorder_that_is_killed_leaves_what_it_has_written(
+    bus: UnixBus, machine: Path, tmp_path: Path, ending: str
+) -> None:
+    log = tmp_path / f"run{ending}"
+    with recording(machine, "--bus", "can0", "--out", log) as process:
+        send_until_it_is_recorded(bus, log)
+        send(bus, 1, FRAMES)
+        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        process.kill()
+    with can.LogReader(log) as reader:
+        times = [message.timestamp for message in reader]
+    assert [number for number in numbers(log) if number] == list(range(1, FRAMES + 1))
+    assert times == sorted(times)
+    if ending != ".asc":
+        assert abs(times[0] - log.stat().st_mtime) < PATIENCE_S, "the file does not say when it was recorded"
+
+
+def _last(log: Path) -> int:
+    """The last number in a file that is being written; its end may be half a line."""
+    try:
+        return numbers(log)[-1]
+    except (IndexError, ValueError):
+        return -1
+
+
+def test_it_ends_after_the_time_that_is_given(bus: UnixBus, machine: Path, tmp_path: Path) -> None:
+    with recording(machine, "--out", tmp_path / "run.log", "--duration", "0.5") as process:
+        output, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "has carried no frame" in said
+    assert json.loads(output)["files"] == []
+    assert not (tmp_path / "run.log").exists()
+    assert bus.recv(0) is None
+
+
+def test_what_cannot_be_recorded_is_said_in_one_line(machine: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken.blf"
+    taken.write_bytes(b"")
+    assert "is there already" in refused(machine, "--out", taken)
+    assert "ends in none of .blf, .asc, .log" in refused(machine, "--out", tmp_path / "run.mf4")
+    assert "there is no folder" in refused(machine, "--out", tmp_path / "nowhere" / "run.log")
+    assert "has no CAN bus of this name; CAN buses" in refused(
+        machine, "--bus", "can1", "--out", tmp_path / "run.log"
+    )
+    modbus = RIG.parent / "modbus-gap-voltages.toml"
+    assert "there is none" in refused(modbus, "--out", tmp_path / "run.log")
+
+
+@pytest.mark.long
+def test_the_service_records_while_it_watches(machine: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "can"
+    folder.mkdir()
+    text = machine.read_text(encoding="utf-8").replace(
+        "fd = true\n", 'fd = true\nrecord = { folder = "can", format = "candump" }\n'
+    )
+    text = text.replace("127.0.0.1:1883", f"127.0.0.1:{free_port()}")
+    machine.write_text(text, encoding="utf-8")
+    daqsvc = [sys.executable, "-m", "daqsvc"]
+    with subprocess.Popen([*daqsvc, "run", str(machine), "--store", str(tmp_path / "store")]) as service:
+        try:
+            eventually((tmp_path / "bus").exists, "the service does not open its bus")
+            command = [*daqsvc, "sim", str(machine), "--scenario", "healthy", "--duration", "2"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+            sent = json.loads(done.stdout)["streams"]["shaft"]["samples_sent"]
+            eventually(lambda: _last_count(folder) == sent - 10, "the last frame is not recorded")
+            service.send_signal(signal.SIGTERM)
+            assert service.wait(PATIENCE_S) == 0
+        finally:
+            service.kill()
+    assert _counts(folder) == list(range(0, sent, 10))
+
+
+def _counts(folder: Path) -> list[int]:
+    """The counters of the rig's frames in the only file of a folder."""
+    [path] = folder.iterdir()
+    lines = path.read_text(encoding="ascii").splitlines()
+    return [int.from_bytes(bytes.fromhex(line.split("##")[1][1:5]), "little") for line in lines]
+
+
+def _last_count(folder: Path) -> int:
+    try:
+        return _counts(folder)[-1]
+    except (IndexError, ValueError):
+        return -1

@@ -1,0 +1,68 @@
+"""Registers whose float is no number: such values are missing, whichever way they are read."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import math
+import struct
+
+import numpy as np
+import pytest
+from support.modbus_lines import LoopClock, Rig, options_of, responding, simulate
+
+from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from sim_hw.nodes.modbus_node import PlannedReply
+from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
+
+pytestmark = pytest.mark.integration
+FIELDS = (RegisterField("x", 0, "float32"), RegisterField("y", 2, "float64"))
+SAMPLE = sample_record(list(FIELDS))
+SENT = [(1.5, -2.0), (math.inf, 1.0), (2.5, -math.inf), (math.nan, 3.0), (3.4e38, 1e39), (-1.5, 0.25)]
+ABSENT = 4  # 1e39 is more than any float32
+LAYOUTS = {
+    "registers": TrendLayout(1, "holding", RegisterRecord(FIELDS, (RegisterRun(0, 6),))),
+    "fifo": Fifo(1, 33, Count(0, 32), SAMPLE, poll_ns=20_000_000),
+    "ring": Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=20_000_000),
+    "waveform": Waveform(1, "holding", 0, 100, len(SENT), SAMPLE, poll_ns=20_000_000),
+}
+
+
+@pytest.mark.parametrize("way", LAYOUTS)
+def test_what_is_no_number_is_missing_and_counted(way, caplog):
+    layout = LAYOUTS[way]
+    rig = Rig(options_of(serial=False), {"s": (layout, 10.0)}, clock=LoopClock())
+    rows = np.frombuffer(b"".join(struct.pack(">fd", *row) for row in SENT), np.uint8).reshape(len(SENT), 12)
+
+    async def main():
+        unit = ModbusUnit()
+        store = store_for(unit, layout)
+        if way == "registers":
+            store.put(0, rows[:1])
+        async with responding({1: unit}, lambda *_: PlannedReply(), serial=False), rig.running():
+            if way == "waveform":
+                await asyncio.sleep(0.1)
+                store.put(0, rows)
+            else:
+                for k in range(len(SENT)):
+                    store.put(k, rows[k : k + 1])
+                    await asyncio.sleep(0.1)
+            await asyncio.sleep(3.0)
+
+    with caplog.at_level(logging.WARNING):
+        simulate(main)
+    with np.errstate(over="ignore"):
+        told = np.array(SENT).astype(np.float32)
+    told[~np.isfinite(told)] = np.nan
+    samples = rig.samples("s")
+    # What registers show is read again until it changes, and a ring begins with what has been in it before.
+    changes = [row for row, _ in itertools.groupby(map(repr, samples.tolist()))]
+    assert changes[-len(told) :] == list(map(repr, told.tolist()))
+    assert rig.counters("s").values_absent == ABSENT
+    assert rig.counters("s").samples_lost == 0
+    (said,) = [record.message for record in caplog.records if "are missing" in record.message]
+    assert said.startswith(
+        "stream 's': 1 of its values are no measurements" if way != "waveform" else "stream 's'"
+    )

@@ -1,0 +1,175 @@
+"""The Modbus examples: checked, described, and run as a service against a device on a virtual line."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+
+import numpy as np
+import pytest
+from support.brokers import eventually
+from support.live_service import running
+from support.machine_files import MACHINES, problems_of
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.settings import describe, load_machine_file, parse_machine_file
+from drivers.make import bus_drivers
+from drivers.modbus.build import modbus_layout
+from drivers.modbus.driver import ModbusDriver
+from drivers.modbus.line import WriteRefusedError
+from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
+from sim_hw.nodes.modbus_unit import ModbusUnit, encode
+from sim_hw.nodes.pacing import RealTimePacer
+
+pytestmark = pytest.mark.integration
+PUMP = MACHINES / "modbus-vibration-temperature.toml"
+GAPS = MACHINES / "modbus-gap-voltages.toml"
+
+
+def edited(path, *changes):
+    text = path.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+async def test_probes_on_an_analogue_module_are_read_by_the_service(tmp_path):
+    unit = ModbusUnit()
+    server = ModbusTcpServer({1: unit})
+    await server.start()
+    where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
+    text = edited(GAPS, ('host = "192.0.2.20"', where), ("rate_hz = 10.0", "rate_hz = 50.0"))
+    machine = parse_machine_file(text, GAPS)
+    layout = modbus_layout(machine, "gap")
+    (run,) = layout.record.runs
+    assert (run.address, run.count) == (0, 2)
+    gap_v = np.stack([np.linspace(-12.0, -8.0, 60), np.linspace(-8.5, -11.5, 60)], axis=1)
+    # From the beginning, however long the service takes before the ramp is played.
+    unit.put(layout.table, run.address, encode(layout.record, gap_v[:1])[0])
+    async with running(machine, tmp_path) as service:
+        node = ModbusNode(unit, layout, gap_v, 50.0)
+        await node.play(RealTimePacer(SystemClock()))
+        counters = service.drivers[0].streams["gap"][0]
+        await eventually(lambda: counters.samples_received > 60, "the ramp has been polled")
+        ring = service.rings["gap"]
+        seen = ring.read(ring.oldest_index, ring.end_index - ring.oldest_index)
+        assert service.figures()["buses"]["io"]["up"] == 1
+        assert service.figures()["buses"]["io"]["timeouts"] == 0
+    server.stop()
+    # 0.61 mV a count: the ends of the ramps are there to half of that.
+    assert seen[~np.isnan(seen[:, 0])][-1] == pytest.approx([-8.0, -11.5], abs=0.00031)
+    polled = seen[~np.isnan(seen[:, 0]), 0]  # a poll that a busy machine came too late for is a row of NaN
+    assert (np.diff(polled) >= 0.0).all()
+
+
+async def test_a_reply_of_the_vibration_sensor_means_what_its_maker_says(tmp_path):
+    # Registers 16 to 21 of a QM42VT1 in a published example: 0.0046 in/s, 0.108 mm/s, 78.65 F, 25.9 C,
+    # 0.0071 in/s, 0.182 mm/s.
+    unit = ModbusUnit()
+    unit.map("holding", 0, 64)
+    unit.put("holding", 16, bytes.fromhex("002E006C06250206004700B6"))
+    unit.put("holding", 32, struct.pack(">6H", 0, 1500, 0, 600, 0, 2500))
+    link = tmp_path / "ttyUSB0"
+    server = ModbusRtuServer({1: unit}, link)
+    server.start()
+    text = edited(PUMP, ("/dev/ttyUSB0", str(link)), ("rate_hz = 1.0", "rate_hz = 20.0"))
+    machine = parse_machine_file(text, PUMP)
+    async with running(machine, tmp_path) as service:
+        received = lambda name: service.drivers[0].streams[name][0].samples_received  # noqa: E731
+        await eventually(lambda: min(received("drive-end"), received("other-end")) > 5, "both are polled")
+        first = service.rings["drive-end"].read(service.rings["drive-end"].oldest_index, 1)[0]
+        other = service.rings["other-end"].read(service.rings["other-end"].oldest_index, 1)[0]
+        polls = service.drivers[0].counters.requests
+        assert polls < received("drive-end") + received("other-end"), "one request reads both sensors"
+    server.stop()
+    assert first == pytest.approx([0.108, 0.182, 25.9])
+    assert other == pytest.approx([1.5, 2.5, 30.0])
+
+
+async def test_nothing_is_written_but_what_the_machine_file_allows():
+    unit = ModbusUnit()
+    unit.map("holding", 490, 20)
+    server = ModbusTcpServer({1: unit})
+    await server.start()
+    allowed = "timeout_ms = 200.0\nwrites = [{ unit = 1, address = 500, count = 2 }]"
+    where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
+    text = edited(GAPS, ('host = "192.0.2.20"', where), ("timeout_ms = 200.0", allowed))
+    machine = parse_machine_file(text, GAPS)
+    (driver,) = bus_drivers(machine, SystemClock(), lambda _block: None)
+    assert isinstance(driver, ModbusDriver)
+    task = asyncio.create_task(driver.run())
+    await eventually(lambda: driver.link.state == "up", "the line is up")
+    await driver.write(1, 500, [7, 8])
+    assert unit.get("holding", 500, 2) == b"\0\7\0\10"
+    for number, address, values in [(1, 501, [1, 2]), (1, 499, [1]), (2, 500, [1])]:
+        with pytest.raises(WriteRefusedError, match=rf"registers {address} to .* of unit {number} must not"):
+            await driver.write(number, address, values)
+    assert unit.get("holding", 499, 4) == b"\0\0\0\7\0\10\0\0"
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    server.stop()
+
+
+@pytest.mark.parametrize("path", [PUMP, GAPS], ids=lambda path: path.stem)
+def test_the_examples_say_what_line_they_are_on(path):
+    machine = load_machine_file(path)
+    assert "Modbus" in describe(machine)
+    assert "values polled in holding registers" in describe(machine)
+
+
+RING = """
+way = "ring"
+unit = 1
+count = { address = 0 }
+address = 16
+depth = 64
+channels = [{ name = "x", place = 0, type = "int16" }, { name = "y", place = 1, type = "int16" }]
+"""
+REGISTERS = GAPS.read_text(encoding="utf-8").split("[streams.gap.layout]")[1].split("[[sensors]]")[0]
+
+
+FIFO = RING.replace('"ring"', '"fifo"').replace("depth = 64\n", "").replace("count = { address = 0 }\n", "")
+WAVEFORM = FIFO.replace('"fifo"', '"waveform"') + "block_id = 0\nsamples = 1024\n"
+
+
+@pytest.mark.parametrize(
+    ("layout", "key", "message"),
+    [
+        (RING.replace("64", "65"), "depth", "is not a power of two"),
+        (
+            RING.replace('place = 1, type = "int16"', 'place = 124, type = "int32"'),
+            "channels",
+            "room for 125",
+        ),
+        (RING.replace("address = 16", "address = 65_500"), "address", "leaves no room"),
+        (RING.replace("depth = 64", "depth = 32_768"), "address", "leaves no room"),
+        (RING.replace('"ring"', '"rings"'), "way", "registers"),
+        (REGISTERS.replace("unit = 1", "unit = 1\nforbidden = [[1, 4]]"), "channels[1].address", "forbidden"),
+        (
+            REGISTERS.replace("offset = -20.0 },    # V", "bits = [10, 7] },"),
+            "channels[0].bits",
+            "no part of",
+        ),
+        (FIFO + "acknowledge = 9", "acknowledge", "does not allow it"),
+        (WAVEFORM + "trigger = { address = 9 }", "trigger.address", "does not allow it"),
+        (WAVEFORM + "page = { select = 9, registers = 100 }", "page.select", "does not allow it"),
+    ],
+)
+def test_what_does_not_fit_is_told(layout, key, message):
+    text = GAPS.read_text(encoding="utf-8").replace(REGISTERS, layout + "\n")
+    problems = problems_of(text, GAPS)
+    found = [problem for problem in problems if problem.key == f"streams.gap.layout.{key}"]
+    assert found, [str(problem) for problem in problems]
+    assert message in str(found[0])
+
+
+def test_a_layout_of_registers_needs_a_modbus_line_and_the_other_way_round():
+    text = edited(GAPS, ('driver = "modbus"\ntransport = "tcp"\nhost = "192.0.2.20"\ntimeout_ms = 200.0',
+                         'driver = "can"\ninterface = "socketcan"\nchannel = "can0"'))  # fmt: skip
+    assert any("is no Modbus line" in problem.message for problem in problems_of(text, GAPS))
+    can = '[streams.gap.layout]\nid = 1\nlength = 8\ncounter = { byte = 0, bits = 8, counts = "frames" }\n'
+    can += 'first_byte = 1\nsamples_per_frame = 1\nchannels = [{ name = "x", type = "int16", scale = 1.0 }, '
+    can += '{ name = "y", type = "int16", scale = 1.0 }]\n'
+    text = GAPS.read_text(encoding="utf-8").replace("[streams.gap.layout]" + REGISTERS, can)
+    assert any("its bus is a Modbus line" in problem.message for problem in problems_of(text, GAPS))

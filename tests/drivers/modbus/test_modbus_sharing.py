@@ -1,0 +1,228 @@
+"""Streams of one unit and one rate share requests where their registers lie together, and nothing else."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.modbus_lines import LoopClock, Rig, options_of, responding, simulate
+
+from drivers.modbus.layouts import TrendLayout, shared_runs
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
+from sim_hw.nodes.modbus_node import PlannedReply
+from sim_hw.nodes.modbus_unit import ModbusUnit
+
+pytestmark = pytest.mark.integration
+GAP_8 = RunLimits(max_gap=8)
+
+
+def trend(addresses, limits=GAP_8, unit=1, table="holding"):
+    fields = tuple(RegisterField(f"r{address}", address, "uint16") for address in addresses)
+    return TrendLayout(
+        unit, table, RegisterRecord(fields, plan_runs([f.run for f in fields], limits)), limits
+    )
+
+
+def units():
+    """Units 1 and 2, whose every register tells the unit and its own address."""
+    made = {}
+    for unit in (1, 2):
+        made[unit] = ModbusUnit()
+        for table in ("holding", "input"):
+            words = 1000 * unit + np.arange(300)
+            made[unit].put(table, 0, words.astype(">u2").tobytes())
+    return made
+
+
+def polled(streams, seconds, plan=lambda *_: PlannedReply()):
+    """What the driver has read in simulated time, and the requests that it took: unit, function, run."""
+    rig = Rig(options_of(serial=True, timeout_ms=50.0, demote_after=30), streams, clock=LoopClock())
+    asked = []
+
+    def noted(unit, pdu):
+        asked.append(
+            (unit, pdu[0], RegisterRun(int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")))
+        )
+        return plan(unit, pdu)
+
+    async def main():
+        async with responding(units(), noted, serial=True), rig.running():
+            await asyncio.sleep(seconds)
+
+    simulate(main)
+    for name, (layout, _) in streams.items():
+        rig.check_books(name)
+        expected = [1000 * layout.unit + field.address for field in layout.record.fields]
+        assert (rig.samples(name) == expected).all()
+    return rig, asked
+
+
+def watched(streams, unit_side, seconds):
+    """The driver after some simulated time with such units; its books close."""
+    rig = Rig(options_of(serial=True, timeout_ms=50.0), streams, clock=LoopClock())
+
+    async def main():
+        async with responding(unit_side, lambda *_: PlannedReply(), serial=True), rig.running():
+            await asyncio.sleep(seconds)
+
+    simulate(main)
+    for name in streams:
+        rig.check_books(name)
+    return rig
+
+
+def without_register(address):
+    """Units, the first of which refuses whatever includes that register (illegal data address)."""
+    unit_side = units()
+    answer = unit_side[1].answer
+    unit_side[1].answer = lambda pdu: b"\x83\2" if pdu[2] <= address < pdu[2] + pdu[4] else answer(pdu)
+    return unit_side
+
+
+def test_two_streams_of_one_gateway_are_read_in_one_request():
+    streams = {"drive-end": (trend([16, 18, 20]), 10.0), "other-end": (trend([24, 26]), 10.0)}
+    rig, asked = polled(streams, 3.0)
+    assert set(asked) == {(1, 3, RegisterRun(16, 11))}
+    for name in streams:
+        assert rig.counters(name).samples_received == pytest.approx(30, abs=1)
+        assert rig.counters(name).samples_lost == 0
+    assert rig.driver.counters.requests == pytest.approx(30, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("other", "rate_hz"),
+    [
+        (trend([24]), 5.0),  # another schedule
+        (trend([24], table="input"), 10.0),
+        (trend([24], unit=2), 10.0),
+        (trend([40]), 10.0),  # too far away
+        (trend([24], RunLimits(max_gap=2)), 10.0),  # its own limit is narrower
+        (trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(22, 1),))), 10.0),
+        (
+            trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(20, 1),))),
+            10.0,
+        ),  # what the first one reads
+    ],
+)
+def test_what_does_not_belong_together_is_read_apart(other, rate_hz):
+    streams = {"one": (trend([16, 20]), 10.0), "other": (other, rate_hz)}
+    rig, asked = polled(streams, 2.0)
+    assert {run for *_, run in asked} == {RegisterRun(16, 5), *other.record.runs}
+    assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 0
+
+
+def test_a_request_that_fails_costs_a_sample_of_those_in_it_and_of_nobody_else():
+    # One request for both ends, another for the gearbox; every third of the second kind is not answered.
+    streams = {
+        "drive-end": (trend([16]), 10.0),
+        "gearbox": (trend([18, 90]), 10.0),
+        "other-end": (trend([20]), 10.0),
+    }
+    count = [0]
+
+    def plan(_unit, pdu):
+        count[0] += pdu[2] == 90
+        return PlannedReply("exception" if pdu[2] == 90 and count[0] % 3 == 0 else "none")
+
+    rig, asked = polled(streams, 6.05, plan)
+    assert {run for *_, run in asked} == {RegisterRun(16, 5), RegisterRun(90, 1)}
+    refused = rig.driver.counters.exceptions["server device failure"]
+    assert refused == pytest.approx(20, abs=1)
+    for name in ("drive-end", "other-end"):
+        assert rig.counters(name).samples_lost == 0
+        assert rig.counters(name).samples_received == pytest.approx(60, abs=1)
+    # The last one may have been refused: it is known as lost with the next.
+    assert refused - 1 <= rig.counters("gearbox").samples_lost <= refused
+    assert rig.counters("gearbox").samples_received == rig.counters("drive-end").samples_received - refused
+
+
+def test_a_unit_that_has_not_what_lies_between_is_asked_by_stream(caplog):
+    streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
+    with caplog.at_level(logging.WARNING):
+        rig = watched(streams, without_register(18), 3.0)
+    assert rig.driver.counters.exceptions == {"illegal data address": 1}
+    for name, value in (("one", 1016), ("other", 1020)):
+        assert (rig.samples(name) == value).all()
+        assert rig.counters(name).samples_received == pytest.approx(30, abs=1)
+        assert rig.counters(name).samples_lost == 0
+    (said,) = [record.message for record in caplog.records if "polled by itself" in record.message]
+    assert (
+        "streams 'one' and 'other': unit 1 refuses function 3: illegal data address (registers 16 to 20)"
+        in said
+    )
+
+
+def test_streams_that_were_parted_are_tried_together_again():
+    """A gateway that refused everything while it started is asked once for both, as before."""
+    streams = {"one": (trend([16]), 1.0), "other": (trend([20]), 1.0)}
+    unit_side = units()
+    answer, asked = unit_side[1].answer, []
+
+    def starting(pdu):
+        asked.append(RegisterRun(pdu[2], pdu[4]))
+        return b"\x83\2" if len(asked) <= 7 else answer(pdu)
+
+    unit_side[1].answer = starting
+    rig = watched(streams, unit_side, 300.0)
+    assert asked[:9] == [RegisterRun(16, 5), *[RegisterRun(16, 1), RegisterRun(20, 1)] * 4]
+    assert set(asked[-100:]) == {RegisterRun(16, 5)}
+    for name in streams:
+        assert rig.counters(name).samples_received == pytest.approx(297, abs=2)
+
+
+def test_who_is_refused_for_good_is_named_alone_and_costs_the_others_nothing(caplog):
+    streams = {name: (trend([at]), 1.0) for name, at in (("a", 16), ("b", 18), ("c", 20))}
+    with caplog.at_level(logging.WARNING):
+        rig = watched(streams, without_register(18), 1000.0)
+    for name in ("a", "c"):
+        assert rig.counters(name).samples_lost == 0
+        assert rig.counters(name).samples_received == pytest.approx(1000, abs=1)
+    assert rig.counters("b").samples_received == 0
+    parted, refused = [record.message for record in caplog.records]
+    assert parted.startswith("streams 'a', 'b' and 'c': unit 1 refuses function 3: illegal data address")
+    assert refused.startswith(
+        "stream 'b': unit 1 refuses function 3: illegal data address (registers 18 to 18)"
+    )
+
+
+def test_a_refusal_that_says_nothing_of_the_registers_leaves_them_together():
+    busy = iter([PlannedReply(), PlannedReply("exception")])
+    streams = {"one": (trend([16]), 10.0), "other": (trend([20]), 10.0)}
+    rig, asked = polled(streams, 2.0, lambda *_: next(busy, PlannedReply()))
+    assert set(asked) == {(1, 3, RegisterRun(16, 5))}
+    assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 1
+
+
+limits = st.builds(
+    RunLimits,
+    st.integers(0, 20),
+    st.integers(60, 125),
+    st.lists(st.builds(RegisterRun, st.integers(0, 310), st.integers(1, 6)), max_size=3).map(tuple),
+)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(st.tuples(st.sets(st.integers(0, 300), min_size=1, max_size=12), limits), min_size=1, max_size=5)
+)
+def test_shared_requests_are_fewer_and_read_for_each_stream_only_what_it_allows(wishes):
+    layouts = []
+    for addresses, allowed in wishes:
+        taken = {a for run in allowed.forbidden for a in range(run.address, run.end)}
+        if addresses - taken:
+            layouts.append(trend(sorted(addresses - taken), allowed))
+    runs = shared_runs(layouts)
+    if runs is None:
+        return
+    assert len(runs) < sum(len(layout.record.runs) for layout in layouts)
+    read = [address for run in runs for address in range(run.address, run.end)]
+    assert len(read) == len(set(read))
+    for layout in layouts:
+        assert layout.limits is not None
+        assert {field.address for field in layout.record.fields} <= set(read)
+        assert not set(read) & {a for run in layout.limits.forbidden for a in range(run.address, run.end)}
+        assert all(run.count <= layout.limits.max_count for run in runs)

@@ -1,0 +1,291 @@
+"""The serial driver on pseudo-terminals: from the machine file to blocks, and a port that others want too."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import os
+import termios
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from support.brokers import eventually
+from support.machine_files import MACHINES
+
+from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.settings import parse_machine_file
+from drivers.base import BusPort, StreamSpec
+from drivers.make import bus_drivers, stream_layout
+from drivers.serial import reader as serial_reader
+from drivers.serial.driver import SerialDriver, framing_of
+from drivers.serial.lines import TextLayout
+from drivers.serial.reader import ReceivedBytes
+from sim_hw.link_faults import LinkFaults
+from sim_hw.nodes.pacing import DrivenPacer
+from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import SerialNode
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+    from pathlib import Path
+
+    from daqsvc.acquisition.samples import SampleBlock
+
+pytestmark = pytest.mark.integration
+PROBES = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"
+CASING = "/dev/serial/by-id/usb-Raspberry_Pi_Pico_E66118604B826C2A-if00"
+LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+
+
+class QuickClock(SystemClock):
+    """Back-off at a hundredth of its length."""
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        await asyncio.sleep(duration_ns / 1e11)
+
+
+def lines_driver(path: Path, blocks: list[SampleBlock], **options: Any) -> SerialDriver:
+    given = {"port": str(path), "framing": "lines", **options}
+    spec = StreamSpec("x", LINE, 100.0)
+    return SerialDriver(BusPort("ser0", given, [spec], QuickClock(), blocks.append))
+
+
+@contextlib.asynccontextmanager
+async def running(*drivers: SerialDriver) -> AsyncIterator[None]:
+    tasks = [asyncio.create_task(driver.run()) for driver in drivers]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def until(true: Callable[[], bool], what: str) -> None:
+    await eventually(true, what)
+
+
+async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) -> None:
+    text = (MACHINES / "serial-probes.toml").read_text()
+    text = text.replace(PROBES, str(tmp_path / "probes")).replace(CASING, str(tmp_path / "casing"))
+    machine = parse_machine_file(text, tmp_path / "machine.toml")
+    clock = DrivenClock()
+    blocks: dict[str, list[SampleBlock]] = {"shaft": [], "casing": []}
+    drivers = bus_drivers(machine, clock, lambda block: blocks[block.stream].append(block))
+    faults = LinkFaults(drop=0.02, duplicate=0.02, corrupt=0.02, reorder=0.02, seed=5)
+    rng = np.random.default_rng(3)
+    nodes: dict[str, SerialNode] = {}
+    sent: dict[str, Any] = {}
+    with PseudoTerminal(tmp_path / "probes") as probes, PseudoTerminal(tmp_path / "casing") as casing:
+        for stream, bus, cable, seconds in (("shaft", "probes", probes, 2), ("casing", "casing", casing, 2)):
+            layout = stream_layout(machine, stream)
+            rate_hz = machine.streams[stream].rate_hz
+            framing = framing_of(machine.buses[bus].model_dump(), [StreamSpec(stream, layout, rate_hz)])
+            sent[stream] = rng.normal(0, 5, (int(seconds * rate_hz), len(layout.channels)))
+            nodes[stream] = SerialNode(cable, framing, stream, layout, sent[stream], rate_hz, faults=faults)
+        async with running(*drivers):
+            await until(lambda: all(driver.link.state == "up" for driver in drivers), "both ports are open")
+
+            def behind() -> int:
+                done = [node.injected for node in nodes.values()]
+                seen = sum(c.frames_received for driver in drivers for c, _ in driver.streams.values())
+                return sum(d.frames_in - d.lost for d in done) - seen
+
+            pacer = DrivenPacer(clock, behind, 64)
+            await asyncio.gather(*(node.play(pacer) for node in nodes.values()))
+            await until(lambda: behind() <= 0, "all frames are in")
+    for driver in drivers:
+        for stream, (counters, _) in driver.streams.items():
+            done = nodes[stream].injected
+            assert min(done.dropped, done.duplicated, done.corrupted, done.reordered) > 0
+            assert counters.samples_received + counters.samples_lost == nodes[stream].samples_sent
+            assert counters.samples_lost == done.lost * nodes[stream]._per_frame
+            assert counters.frames_duplicate == done.duplicated
+            for block in blocks[stream]:
+                took = sent[stream][block.first_index : block.end_index]
+                np.testing.assert_allclose(block.samples, took, atol=0.1 if stream == "shaft" else 1e-5)
+            assert nodes[stream].frames_unsent == 0
+
+
+async def test_a_port_that_another_program_has_is_waited_for(tmp_path: Path) -> None:
+    with PseudoTerminal(tmp_path / "port") as cable:
+        other = os.open(cable.path, os.O_RDWR | os.O_NOCTTY)
+        fcntl.flock(other, fcntl.LOCK_EX)
+        first, second = (lines_driver(cable.path, []) for _ in range(2))
+        async with running(first):
+            await until(lambda: "another program has it open" in first.link.reason, "the port is refused")
+            os.close(other)
+            await until(lambda: first.link.state == "up", "the port is free")
+            async with running(second):
+                await until(lambda: second.counters.open_failures > 1, "a second reader is refused")
+                assert first.link.state == "up"
+            assert "stop that program" in second.link.reason
+
+
+async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog: Any) -> None:
+    blocks: list[SampleBlock] = []
+    driver = lines_driver(tmp_path / "port", blocks)
+    with caplog.at_level(logging.INFO):
+        async with running(driver):
+            await until(lambda: driver.counters.open_failures > 2, "there is no port")
+            with PseudoTerminal(tmp_path / "port") as cable:
+                await until(lambda: driver.link.state == "up", "the port is there")
+                os.write(cable.fd, b"half a line\n1,1\n#\n2,2\nwhat?\n3,3\n")
+                await until(lambda: driver.counters.frames_malformed == 2, "all is read")
+            await until(lambda: driver.link.state == "down", "the plug is pulled")
+    said = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(said) == 4
+    assert f"there is no {tmp_path / 'port'}; plug the device in, or correct port" in said[0]
+    assert said[1].endswith("is there now")
+    assert "compare baud, parity, framing and checksum with the device's" in said[2]
+    assert "unplugged" in said[3]
+    assert [block.samples[:, 0].tolist() for block in blocks] == [[1.0, 2.0, 3.0]] or len(blocks) > 1
+    assert driver.counters.bytes_garbage == 12 + 2 + 6
+    assert driver.counters.bytes_received == 32
+    assert driver.counters.resyncs == 2
+
+
+async def test_errors_of_the_uart_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = iter([(1, 2, 3, 4), (2, 4, 3, 2**31 + 4), (2, 9, 3, -(2**31) + 5)])
+    last = (2, 9, 3, -(2**31) + 5)
+    monkeypatch.setattr(serial_reader, "_line_errors", lambda _: serial_reader.LineErrors(*next(looks, last)))
+    monkeypatch.setattr(serial_reader, "LINE_ERRORS_EVERY_NS", 0)
+    driver = lines_driver(tmp_path / "port", [])
+    with PseudoTerminal(tmp_path / "port"):
+        async with running(driver):
+            await until(lambda: driver.counters.overruns == 7, "the errors are counted")
+    counters = driver.counters
+    assert (counters.framing_errors, counters.parity_errors, counters.breaks) == (1, 0, 2**31 + 1)
+
+
+async def test_the_settings_reach_the_port(tmp_path: Path) -> None:
+    options = {"baud": 250_000, "stop_bits": 2, "flow_control": "xon-xoff", "low_latency": True}
+    driver = lines_driver(tmp_path / "port", [], **options)
+    with PseudoTerminal(tmp_path / "port") as cable:
+        async with running(driver):
+            await until(lambda: driver.link.state == "up", "the port is open")
+            spare = os.open(cable.path, os.O_RDWR | os.O_NOCTTY)
+            try:
+                flags, _, control, local, _, speed, _ = termios.tcgetattr(spare)
+            finally:
+                os.close(spare)
+    assert control & termios.CSTOPB
+    assert flags & termios.IXON
+    assert not local & termios.ICANON
+    assert speed not in {termios.B115200, termios.B9600}
+
+
+async def test_a_port_that_takes_its_time_to_close_does_not_hold_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released = threading.Event()
+    close = serial_reader.close_port
+
+    def slow(device: Any) -> None:
+        assert released.wait(10)
+        close(device)
+
+    monkeypatch.setattr(serial_reader, "close_port", slow)
+    driver = lines_driver(tmp_path / "port", [])
+    with PseudoTerminal(tmp_path / "port") as cable:
+        task = asyncio.create_task(driver.run())
+        await until(lambda: driver.link.state == "up", "the port is open")
+        cable.unplug()
+        turns = 0
+        for _ in range(50):
+            await asyncio.sleep(0.001)
+            turns += 1
+        released.set()
+        assert turns == 50
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def test_a_framing_that_fails_costs_the_link_and_not_the_service(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    driver = lines_driver(tmp_path / "port", [])
+
+    def fail(data: bytes) -> None:
+        raise ZeroDivisionError("as if by mistake")
+
+    with PseudoTerminal(tmp_path / "port") as cable, monkeypatch.context() as patch:
+        patch.setattr(driver._framing, "cut", fail)
+        async with running(driver):
+            await until(lambda: driver.link.state == "up", "the port is open")
+            os.write(cable.fd, b"1,1\n")
+            await until(lambda: driver.counters.reader_failures == 1, "the failure is counted")
+            patch.undo()
+            await until(lambda: driver.link.losses == 1, "the link is given up")
+            await until(lambda: driver.link.state == "up", "the port is open again")
+            os.write(cable.fd, b"1,1\n2,2\n3,3\n")
+            await until(lambda: driver.streams["x"][0].frames_received > 1, "samples arrive")
+    assert "as if by mistake" in caplog.text
+
+
+async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp_path: Path) -> None:
+    told: list[str] = []
+    blocks: list[SampleBlock] = []
+    driver = lines_driver(tmp_path / "port", blocks, checksum="xor")
+    begun, released = threading.Event(), threading.Event()
+    cut, take, tick = driver._framing.cut, driver.take, driver.tick
+
+    def slowly(data: bytes) -> Any:
+        begun.set()
+        assert released.wait(10)
+        return cut(data)
+
+    driver._framing.cut = slowly  # type: ignore[method-assign]
+    driver.take = lambda batch: (told.append(f"{batch.bytes_read} bytes"), take(batch))[1]  # type: ignore[method-assign]
+    driver.tick = lambda now_ns: (told.append("quiet"), tick(now_ns))[1]  # type: ignore[method-assign]
+    lines = driver._framing.encode("x", np.arange(2), np.ones((2, 1, 1)))
+    with PseudoTerminal(tmp_path / "port") as cable:
+        async with running(driver):
+            await until(lambda: driver.link.state == "up", "the port is open")
+            reader = next(t for t in threading.enumerate() if isinstance(t, serial_reader.SerialReader))
+            os.write(cable.fd, lines[0])
+            await until(begun.is_set, "the first batch is being cut")
+            await asyncio.sleep(0)
+            told.clear()
+            waiting = reader._jobs.qsize()
+            os.write(cable.fd, lines[1])
+            # Two more: one may still say that nothing had come by then.
+            await until(lambda: reader._jobs.qsize() > waiting + 1, "reading goes on")
+            assert told == []
+            cable.unplug()
+            await until(lambda: not reader.is_alive(), "the port has been found gone")
+            assert driver.link.state == "up"
+            released.set()
+            await until(lambda: driver.link.losses == 1, "the link is lost")
+    assert [what for what in told if what != "quiet"] == [f"{len(line)} bytes" for line in lines]
+    assert told[0] != "quiet"
+    assert "quiet" in told[1:]
+    assert sum(len(block.samples) for block in blocks) == 2
+
+
+def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: Path) -> None:
+    stamped = TextLayout(("t", "x"), ("x",), np.ones(1), np.zeros(1), time="t", time_unit="ms")
+    specs = [StreamSpec("x", stamped, 100.0)]
+    options = {"port": str(tmp_path), "framing": "lines"}
+    blocks: list[SampleBlock] = []
+    driver = SerialDriver(BusPort("ser0", options, specs, DrivenClock(), blocks.append))
+    lines = [b"%d,%d\n" % (10 * k, k) for k in range(800)]
+    lines[300], lines[310], lines[320] = b"3000,1e999\n", b"3100,1e39\n", b"3200,-1e400\n"
+    lines[500], lines[501] = lines[501], lines[500]
+    framing = framing_of(options, specs)
+    for k, line in enumerate(lines):
+        found = framing.cut(line)
+        driver.take(ReceivedBytes(len(line), found, {"x": np.full(len(found.frames), 10_000_000 * k)}))
+    driver._assemblers["x"].flush()
+    values = np.concatenate([block.samples[:, 0] for block in blocks])
+    expected = np.arange(1, 800, dtype=np.float32)
+    expected[[299, 309, 319]] = np.nan
+    np.testing.assert_array_equal(values, expected)
+    counters, time_base = driver.streams["x"]
+    assert (counters.samples_received, counters.samples_lost, counters.values_absent) == (799, 0, 3)
+    assert (counters.frames_reordered, counters.frames_rejected, time_base.restarts) == (1, 0, 0)

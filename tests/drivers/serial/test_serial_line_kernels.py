@@ -1,0 +1,116 @@
+"""Numbers, checksums and time stamps in lines of text, against what Python itself makes of them."""
+
+from __future__ import annotations
+
+import binascii
+import functools
+import operator
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from drivers.serial.framing import Pieces
+from drivers.serial.line_kernels import check_lines
+from drivers.serial.lines import DeviceTime, TextLayout
+
+pytestmark = pytest.mark.property
+NUMBERS = st.one_of(
+    st.floats(allow_nan=False, allow_infinity=False).map(repr),
+    st.floats(-1e6, 1e6).map(lambda x: f"{x:.6f}"),
+    st.integers(-(10**20), 10**20).map(str),
+    st.integers(0, 2**40).map(str),
+    st.text("0123456789+-.eE ", max_size=12),
+    st.text("0123456789.", min_size=1, max_size=30),
+)
+
+
+def pieces(lines: list[bytes]) -> Pieces:
+    """Lines as they are cut out of what a port brings."""
+    buffer = np.frombuffer(b"\n".join(lines) + b"\n", np.uint8).copy()
+    stops = np.cumsum([len(line) + 1 for line in lines]) - 1
+    starts = np.concatenate(([0], stops[:-1] + 1))
+    return Pieces(buffer, starts, stops, stops + 1)
+
+
+def layout(**changes) -> TextLayout:
+    """A counter or a time, a value, and a column that nobody asked for between them."""
+    given = {"columns": ("seq", "spare", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
+    return TextLayout(**(given | {"counter": "seq"} | changes))
+
+
+def number(text: str, kind: type) -> float | None:
+    """What Python makes of a field; None if it is no number, or one that no device means."""
+    try:
+        return kind(text) if not set(text) - set("0123456789+-.eE ") else None
+    except ValueError:
+        return None
+
+
+@given(st.lists(st.tuples(NUMBERS, st.sampled_from(["", "?", "1.5"]), NUMBERS), min_size=1, max_size=8))
+@example([("1", "", " 1. "), ("1", "", ".5e+01"), ("1", "", "."), ("1", "", "1e"), ("1", "", "1 2")])
+@example([("1", "", "9007199254740993"), ("1", "", "1e23"), ("1", "", "1e999"), ("1", "", "-0")])
+@example([(counter, "", "1") for counter in (" 7 ", "+7", "-0", "7.", "7e0", "", "9" * 30)])
+def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, str]]) -> None:
+    stream = layout(scale=np.array([0.1]), offset=np.array([-3.0]))
+    lines = stream.read(pieces([",".join(row).encode() for row in rows]))
+    counters, values = [number(row[0], int) for row in rows], [number(row[2], float) for row in rows]
+    good = [
+        counter is not None and 0 <= counter < 2**32 and value is not None
+        for counter, value in zip(counters, values, strict=True)
+    ]
+    assert lines.mine.all()
+    assert lines.good.tolist() == good
+    assert lines.places.tolist() == [counter for counter, ok in zip(counters, good, strict=True) if ok]
+    with np.errstate(over="ignore"):
+        want = np.array([value for value, ok in zip(values, good, strict=True) if ok], float) * 0.1 - 3.0
+        np.testing.assert_array_equal(lines.samples[:, 0, 0], want.astype(np.float32))
+
+
+@given(st.lists(NUMBERS, min_size=1, max_size=8))
+def test_times_are_those_of_python_to_the_last_bit(stamps: list[str]) -> None:
+    stream = layout(counter=None, time="seq", time_unit="ms")
+    lines = stream.read(pieces([f"{stamp},,1".encode() for stamp in stamps]))
+    read = [number(stamp, float) for stamp in stamps]
+    assert lines.places.tolist() == [ms / 1e3 for ms in read if ms is not None and abs(ms / 1e3) <= 1e12]
+
+
+@given(st.lists(st.text("ab,1", max_size=8), min_size=1, max_size=8))
+def test_a_line_belongs_to_the_stream_that_its_first_field_names(texts: list[str]) -> None:
+    lines = layout(prefix="a").read(pieces([text.encode() for text in texts]))
+    assert lines.mine.tolist() == [text.split(",")[0] == "a" for text in texts]
+    assert lines.good.tolist() == [
+        text.split(",")[0] == "a"
+        and len(text.split(",")) == 4
+        and all(number(text.split(",")[k], int) is not None for k in (1, 3))
+        for text in texts
+    ]
+
+
+@pytest.mark.parametrize("digits", [2, 4])
+@given(
+    data=st.lists(st.tuples(st.text("$!*aF0", max_size=9), st.sampled_from(["", "*", "x", "0"])), max_size=6)
+)
+def test_checksums_are_those_of_the_library(digits: int, data: list[tuple[str, str]]) -> None:
+    texts, lines = [], []
+    for k, (text, tail) in enumerate(data):
+        body = text.encode()[text[:1] in {"$", "!"} :]
+        right = binascii.crc_hqx(body, 0xFFFF) if digits == 4 else functools.reduce(operator.xor, body, 0)
+        given = b"%0*x" % (digits, right)
+        texts.append(text.encode())
+        lines.append(text.encode() + b"*" + (given.upper() if k % 2 else given) + tail.encode())
+    cut = pieces([*lines, b"no star"])
+    ends, intact = check_lines(cut.buffer, cut.starts, cut.stops, digits)
+    assert intact.tolist() == [not tail for _, tail in data] + [False]
+    for k in np.flatnonzero(intact):
+        assert cut.buffer[cut.starts[k] : ends[k]].tobytes() == texts[k]
+    assert ends[-1] == cut.starts[-1]
+
+
+@given(st.lists(st.floats(0.0, 1e4), max_size=30), st.floats(0.1, 1e5))
+def test_counts_do_not_depend_on_how_stamps_come_in(stamps: list[float], rate_hz: float) -> None:
+    times_s = np.array(stamps)
+    apart = DeviceTime(rate_hz)
+    counts = [int(apart.count(times_s[k : k + 1])[0]) for k in range(len(stamps))]
+    assert DeviceTime(rate_hz).count(times_s).tolist() == counts

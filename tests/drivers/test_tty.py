@@ -1,0 +1,104 @@
+"""Lines of real devices, parity and all, on pseudo-terminals, which have none."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import termios
+
+import numpy as np
+import pytest
+from support.modbus_lines import Rig, until
+
+from daqsvc.acquisition.clock import SystemClock
+from drivers.base import BusPort, StreamSpec
+from drivers.modbus.layouts import TrendLayout
+from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from drivers.serial.driver import SerialDriver
+from drivers.serial.lines import TextLayout
+from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
+from sim_hw.nodes.modbus_node import ModbusRtuServer
+from sim_hw.nodes.modbus_unit import ModbusUnit
+from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+
+pytestmark = pytest.mark.integration
+TREND = TrendLayout(1, "input", RegisterRecord((RegisterField("x", 0, "int16"),), (RegisterRun(0, 1),)))
+LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+
+
+class HastyClock(SystemClock):
+    """Waits a tenth of what it is asked to."""
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        await super().sleep_ns(duration_ns // 10)
+
+
+def told(caplog):
+    return [record.message for record in caplog.records if "is a pseudo-terminal" in record.message]
+
+
+@pytest.mark.parametrize("parity", [None, "odd"])  # even by default
+async def test_modbus_units_on_a_pseudo_terminal_are_read_with_the_parity_of_the_real_line(
+    parity, tmp_path, caplog
+):
+    unit = ModbusUnit()
+    unit.put("input", 0, b"\0\7")
+    server = ModbusRtuServer({1: unit}, tmp_path / "ttyUSB0")
+    options = {"transport": "rtu", "serial_port": str(tmp_path / "ttyUSB0"), "timeout_ms": 100.0}
+    rig = Rig(options | ({"parity": parity} if parity else {}), {"s": (TREND, 100.0)}, clock=HastyClock())
+    with caplog.at_level(logging.WARNING):
+        async with rig.running() as driver:
+            for plugged in (1, 2):  # the second opening is another one for the warning, too
+                server.start()
+                seen = rig.counters("s").samples_received
+                await until(lambda seen=seen: rig.counters("s").samples_received > seen + 3)
+                server.stop()
+                await until(lambda plugged=plugged: driver.link.losses == plugged)
+    assert (rig.samples("s") == 7.0).all()
+    (said,) = told(caplog)
+    assert f"Modbus RTU bus 'mb' ({tmp_path / 'ttyUSB0'}) is a pseudo-terminal" in said
+    assert f"instead of parity {parity or 'even'!r} and 8 data bits" in said
+
+
+async def test_a_serial_device_on_a_pseudo_terminal_is_opened_and_opened_again(tmp_path, caplog):
+    blocks = []
+    given = {"port": str(tmp_path / "port"), "framing": "lines", "parity": "even", "data_bits": 7}
+    spec = StreamSpec("x", LINE, 100.0)
+    driver = SerialDriver(BusPort("ser0", given, [spec], HastyClock(), blocks.append))
+    with caplog.at_level(logging.WARNING), PseudoTerminal(tmp_path / "port") as cable:
+        for _ in range(2):  # the C library fails at the second attempt to set what the first could not
+            task = asyncio.create_task(driver.run())
+            await until(lambda: driver.link.state == "up")
+            before = driver.counters.bytes_received
+            os.write(cable.fd, b"1,1\n")
+            await until(lambda before=before: driver.counters.bytes_received == before + 4)
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+    assert driver.counters.open_failures == 0
+    assert len(told(caplog)) == 1
+    assert "instead of parity 'even' and 7 data bits" in told(caplog)[0]
+
+
+def test_what_a_pseudo_terminal_carries_anyway_is_not_talked_about(tmp_path, caplog):
+    with PseudoTerminal(tmp_path / "port"):
+        characters = CharacterFormat("serial port 'p'", Character(8, "none"))
+        assert characters.on(tmp_path / "port") == Character(8, "none")
+    assert not told(caplog)
+
+
+def test_other_ports_are_opened_as_asked(tmp_path):
+    asked = Character(7, "even")
+    (tmp_path / "file").touch()
+    for port in (tmp_path / "nothing", tmp_path / "file", "/dev/null", "socket://127.0.0.1:1"):
+        assert not is_pseudo_terminal(port)
+        assert CharacterFormat("serial port 'p'", asked).on(port) == asked
+
+
+def test_a_pseudo_terminal_is_known_by_its_link(tmp_path):
+    with PseudoTerminal(tmp_path / "port") as cable:
+        assert is_pseudo_terminal(tmp_path / "port")
+        assert termios.tcgetattr(cable.fd)
+    assert not is_pseudo_terminal(tmp_path / "port")

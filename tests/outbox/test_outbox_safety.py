@@ -1,0 +1,176 @@
+"""A store that others may write to is refused, with who owns it and what to do; links are not followed."""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import contextmanager
+
+import pytest
+from support.paths import ROOT
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.audit import AuditError, AuditLog
+from daqsvc.outbox.journal import Journal
+from daqsvc.outbox.limits import OutboxLimits
+from daqsvc.outbox.messages import OutboxError
+from daqsvc.outbox.reading import read_journal
+
+STRANGER = 61234
+
+is_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+
+
+def opened(store):
+    journal = Journal(
+        store / "outbox.sqlite", lambda: 10**18, OutboxLimits(ballast_bytes=4096, reserve_bytes=0)
+    )
+    journal.open()
+    return journal
+
+
+@contextmanager
+def refused(store, *words):
+    with pytest.raises(OutboxError) as caught:
+        opened(store)
+    for word in words:
+        assert word in str(caught.value)
+    yield
+
+
+@pytest.fixture
+def _anything_goes():
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o2777, 0o1777])
+def test_a_volume_that_root_made_for_all_is_refused_with_what_helps_there(tmp_path, mode, monkeypatch):
+    """An emptyDir of Kubernetes, and a service that is not root: chmod alone would lock it out."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can make a directory of root's")
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    volume.chmod(mode)
+    monkeypatch.setattr(os, "geteuid", lambda: 4711)
+    owned = f"chown 4711 {volume} && chmod 700 {volume}, as root (on Kubernetes: in an init container)"
+    with refused(volume, f"the store {volume} has mode {mode:04o}", owned):
+        pass
+    if mode & stat.S_ISVTX:
+        opened(volume / "store").close()
+    else:
+        with refused(volume / "store", f"{volume}, above the store", f"chmod go-w {volume}, or chmod +t it"):
+            pass
+
+
+@pytest.mark.usefixtures("_anything_goes")
+def test_a_new_store_is_its_owners_alone_whatever_the_umask(tmp_path):
+    store = tmp_path / "above" / "store"
+    journal = opened(store)
+    journal.close()
+    assert stat.S_IMODE(store.stat().st_mode) == 0o700
+    assert stat.S_IMODE(store.parent.stat().st_mode) == 0o755
+    assert {stat.S_IMODE(path.stat().st_mode) for path in store.iterdir()} == {0o600}
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o757, 0o1777])
+def test_a_store_that_others_may_write_is_refused(tmp_path, mode):
+    store = tmp_path / "store"
+    store.mkdir()
+    store.chmod(mode)
+    with refused(store, f"mode {mode:04o}", f"chmod go-w {store}"):
+        assert list(store.iterdir()) == []
+
+
+@is_root
+def test_a_store_for_a_group_of_others_is_refused_and_for_ones_own_is_not(tmp_path):
+    store = tmp_path / "store"
+    store.mkdir()
+    store.chmod(0o770)
+    opened(store).close()
+    os.chown(store, 0, STRANGER)
+    with refused(store, "mode 0770"):
+        pass
+
+
+def test_a_store_below_what_others_may_write_is_refused_unless_names_are_kept_there(tmp_path):
+    (tmp_path / "shared").mkdir()
+    (tmp_path / "shared").chmod(0o777)
+    with refused(tmp_path / "shared" / "store", "above the store", "mode 0777"):
+        pass
+    (tmp_path / "shared").chmod(0o1777)
+    opened(tmp_path / "shared" / "store").close()
+
+
+@is_root
+@pytest.mark.parametrize("whose", ["the store", "above", "a file"])
+def test_what_belongs_to_another_user_is_refused(tmp_path, whose):
+    store = tmp_path / "above" / "store"
+    opened(store).close()
+    path = {"the store": store, "above": store.parent, "a file": store / "outbox.sqlite"}[whose]
+    os.chown(path, STRANGER, 0)
+    with refused(store, f"belongs to user {STRANGER}", "runs as root", str(path)):
+        pass
+
+
+@is_root
+def test_a_link_of_another_user_is_not_gone_behind(tmp_path):
+    opened(tmp_path / "real").close()
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "real")
+    opened(link).close()
+    os.chown(link, STRANGER, STRANGER, follow_symlinks=False)
+    with refused(link, f"a symbolic link of user {STRANGER}"):
+        pass
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "outbox.sqlite",
+        "outbox.sqlite-wal",
+        "outbox.sqlite.sequence",
+        "outbox.sqlite.lock",
+        "outbox.sqlite.ballast",
+    ],
+)
+def test_no_file_of_the_store_is_written_through_a_link(tmp_path, name):
+    store, victim = tmp_path / "store", tmp_path / "victim"
+    opened(store).close()
+    victim.write_bytes(b"precious")
+    (store / name).unlink(missing_ok=True)
+    (store / name).symlink_to(victim)
+    with refused(store, "symbolic link", str(victim), "remove it"):
+        assert victim.read_bytes() == b"precious"
+
+
+def test_a_link_is_not_read_either(tmp_path):
+    opened(tmp_path / "real").close()
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "outbox.sqlite").symlink_to(tmp_path / "real" / "outbox.sqlite")
+    with pytest.raises(OutboxError, match="symbolic link"):
+        read_journal(tmp_path / "store")
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+async def test_the_audit_log_is_a_file_of_its_own(tmp_path, kind):
+    """A pipe would wait for a reader for ever."""
+    path, victim = tmp_path / "audit.jsonl", tmp_path / "victim"
+    if kind == "link":
+        path.symlink_to(victim)
+    else:
+        os.mkfifo(path)
+    with pytest.raises(
+        AuditError, match="symbolic link" if kind == "link" else "no regular file|No such device"
+    ):
+        await AuditLog(path, SystemClock()).asked(AlarmCommand(verb=Verb.RESET, alarm="a", by="me"), "here")
+    assert not victim.exists()
+
+
+def test_no_document_has_a_store_where_everybody_may_write():
+    root = ROOT
+    files = [root / "README.md", *root.glob("docs/**/*.md"), *root.glob("config/**/*.toml")]
+    for path in files:
+        assert "--store /tmp" not in path.read_text(), path

@@ -1,0 +1,36 @@
+"""The guards of conftest.py really fail a test that leaves something behind."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from support.paths import ROOT
+
+LEAKY = """
+import asyncio, threading
+
+async def test_task():
+    test_task.kept = asyncio.create_task(asyncio.sleep(30), name="left-behind")
+
+def test_thread():
+    threading.Thread(target=threading.Event().wait, args=(5,), name="still-there", daemon=True).start()
+
+async def test_clean():
+    await asyncio.gather(asyncio.sleep(0), asyncio.to_thread(int))
+"""
+
+
+def test_leaks_fail_the_test_that_leaves_them(tmp_path: Path) -> None:
+    here = ROOT / "tests"
+    (tmp_path / "conftest.py").write_text((here / "conftest.py").read_text())
+    (tmp_path / "test_leaky.py").write_text(LEAKY)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_mode=auto"]
+    command.append(str(tmp_path))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(here), *sys.path])}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
+    assert "1 failed" in done.stdout or "errors" in done.stdout
+    assert "tasks that outlive the test: ['left-behind']" in done.stdout
+    assert "threads that outlive the test: ['still-there']" in done.stdout
+    assert "2 errors" in done.stdout
+    assert "3 passed" in done.stdout  # the bodies pass, their clean-up does not

@@ -1,0 +1,170 @@
+"""Each fault leaves its own mark on the synchronous vector, and what none of them leaves gets no name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.rotor_orbits import HEALTHY, ROTOR, SPEED_RAD_S
+
+from daqsvc.rotor.laval import compliance, unbalance_response
+from daqsvc.rotor.synchronous.healthy import Healthy
+from daqsvc.rotor.synchronous.signatures import damping_misfit, likelihoods
+from daqsvc.rotor.synchronous.vectors import HARMONICS
+
+ORDER = np.array(HARMONICS)
+VARIANCE = np.full(5, (0.004 * abs(HEALTHY[1])) ** 2)
+
+
+def healthy(speed=1.0, *, laval=True, ellipticity=0.0, rotor=ROTOR):
+    baseline = HEALTHY.copy()
+    baseline[1] = 10.0 * complex(unbalance_response(speed, 0.18))
+    baseline[2] = ellipticity * abs(baseline[1]) * np.exp(0.4j)
+    return Healthy(baseline, speed * SPEED_RAD_S, rotor, laval)
+
+
+def judged(change, machine, variance=VARIANCE):
+    scores = likelihoods(np.asarray(change, dtype=complex), variance, machine, machine.baseline + change)
+    best = max(scores, key=scores.get)
+    return best, scores
+
+
+def only(k, value):
+    change = np.zeros(5, dtype=complex)
+    change[HARMONICS.index(k)] = value
+    return change
+
+
+def pulse(angle_rad, force_um, speed=1.0, width=0.6):
+    """Response to a push in the direction of ``force_um`` at one angle of the shaft."""
+    passed = compliance(ORDER * speed, 0.18)
+    return force_um * passed * np.exp(-((ORDER * width) ** 2) / 2.0 - 1j * ORDER * angle_rad)
+
+
+def wall_at(angle_rad, machine, depth_um):
+    """A rub where the whirl reaches furthest in its direction at this shaft angle."""
+    outwards = machine.baseline[1] * np.exp(1j * angle_rad)
+    return -depth_um * outwards / abs(outwards)
+
+
+def test_no_change_is_normal():
+    best, scores = judged(0.002 * abs(HEALTHY[1]) * np.exp(1j * np.arange(5)), healthy())
+    assert best == "normal"
+    assert scores["normal"] == 0.0
+
+
+@pytest.mark.parametrize("speed", [0.6, 1.0, 1.3])
+def test_1x_that_shrinks_is_unbalance(speed):
+    machine = healthy(speed)
+    change = only(1, -0.6 * machine.baseline[1])
+    best, scores = judged(change, machine)
+    assert best == "unbalance"
+    others = [name for name in scores if name != "unbalance"]
+    assert all(scores["unbalance"] - scores[name] > 5.0 for name in others)
+
+
+def test_at_the_critical_speed_growth_in_phase_is_unbalance_or_damping_and_nothing_else():
+    machine = healthy(1.0)
+    _, scores = judged(only(1, 0.8 * machine.baseline[1]), machine)
+    assert scores["unbalance"] == scores["damping_loss"]
+    others = [name for name in scores if name not in {"unbalance", "damping_loss"}]
+    assert all(scores["unbalance"] - scores[name] > 5.0 for name in others)
+
+
+def test_below_the_critical_speed_no_loss_of_damping_doubles_1x():
+    machine = healthy(0.6)
+    _, scores = judged(only(1, machine.baseline[1]), machine)
+    assert scores["unbalance"] - scores["damping_loss"] > 5.0
+
+
+@pytest.mark.parametrize("left", [0.3, 0.6, 0.8])
+@pytest.mark.parametrize("speed", [0.8, 1.0, 1.1])
+def test_a_loss_of_damping_is_never_taken_out_of_the_group(left, speed):
+    machine = healthy(speed)
+    ratio = complex(unbalance_response(speed, 0.18 * left) / unbalance_response(speed, 0.18))
+    change = only(1, machine.baseline[1] * (ratio - 1.0))
+    assert damping_misfit(change, VARIANCE, machine) < 5.0
+
+
+@pytest.mark.parametrize("direction_deg", [-90.0, 30.0, 180.0])
+def test_a_moved_mean_position_is_a_static_load(direction_deg):
+    best, scores = judged(only(0, 8.0 * np.exp(1j * math.radians(direction_deg))), healthy())
+    assert best == "static_load"
+    assert scores["static_load"] - scores["unmodelled"] > 5.0
+
+
+@pytest.mark.parametrize("stiffness", [0.9, 0.75, 0.6])
+@pytest.mark.parametrize("speed", [0.7, 1.0])
+def test_a_softer_shaft_moves_position_and_1x_together(stiffness, speed):
+    machine = healthy(speed)
+    damped = 2j * 0.18 * speed
+    ratio = (1.0 - speed**2 + damped) / (stiffness - speed**2 + damped)
+    change = only(1, machine.baseline[1] * (ratio - 1.0)) + only(0, -10.0j * (1.0 / stiffness - 1.0))
+    best, scores = judged(change, machine)
+    assert best == "stiffness_loss"
+    assert scores["stiffness_loss"] - max(s for n, s in scores.items() if n != best) > 5.0
+
+
+@pytest.mark.parametrize("angle_deg", [20.0, 140.0, 300.0])
+@pytest.mark.parametrize("speed", [0.5, 1.0])
+def test_a_push_inwards_once_a_revolution_is_a_rub(angle_deg, speed):
+    machine = healthy(speed)
+    # The wall stands where the whirl leads to and the disc already lies, off the centre.
+    machine.baseline[0] = 0.3 * machine.baseline[1] * np.exp(1j * math.radians(angle_deg))
+    change = pulse(math.radians(angle_deg), wall_at(math.radians(angle_deg), machine, 3.0), speed)
+    best, scores = judged(change, machine)
+    assert best == "rub"
+    assert scores["rub"] - scores["unmodelled"] > 5.0
+
+
+def test_a_push_along_the_sag_is_not_called_a_rub():
+    """A crack at half the critical speed has the harmonics of a rub, but pulls the other way."""
+    machine = healthy(0.5)
+    change = pulse(math.radians(180.0), -1.0j, speed=0.5)
+    best, scores = judged(change, machine)
+    assert best == "unmodelled"
+    assert scores["unmodelled"] - scores["rub"] > 5.0
+
+
+def test_2x_alone_is_unmodelled():
+    best, scores = judged(only(-2, 4.0), healthy())
+    assert best == "unmodelled"
+    assert all(scores["unmodelled"] - s > 5.0 for n, s in scores.items() if n != best)
+
+
+def test_an_orbit_that_fills_the_clearance_touches_whatever_its_shape():
+    machine = healthy()
+    change = only(1, -72.0j) + only(-1, 3.0) + only(2, 2.5j)
+    best, _ = judged(change, machine)
+    assert best == "rub"
+    wide = healthy(rotor=replace(ROTOR, clearance_um=1000.0))
+    assert judged(change, wide)[0] == "unmodelled"
+
+
+def test_an_elliptic_orbit_grows_in_both_senses_with_the_unbalance():
+    machine = healthy(laval=False, ellipticity=0.3)
+    factor = 0.7 * np.exp(0.5j)
+    change = only(1, factor * machine.baseline[1]) + only(-1, np.conj(factor) * machine.baseline[2])
+    best, scores = judged(change, machine)
+    assert best == "unbalance"
+    assert scores["unbalance"] - scores["unmodelled"] > 5.0
+
+
+def test_without_a_laval_rotor_position_and_1x_together_are_still_stiffness():
+    machine = healthy(laval=False, ellipticity=0.2)
+    change = only(0, 6.0 - 3.0j) + only(1, 9.0j) + only(-1, 3.0)
+    best, scores = judged(change, machine)
+    assert best == "stiffness_loss"
+    assert scores["stiffness_loss"] - scores["unmodelled"] > 5.0
+
+
+def test_a_mean_position_that_nobody_knows_says_nothing():
+    blind = VARIANCE.copy()
+    blind[0] = 1e8
+    machine = healthy(0.7)
+    _, scores = judged(only(0, 30.0), machine, blind)
+    assert scores["static_load"] < 1.0
+    best, _ = judged(only(0, 30.0) + only(1, 10.0j), machine, blind)
+    assert best == "unbalance"

@@ -1,0 +1,53 @@
+"""What a bus loses, and a controller that goes off it, reach whoever takes the alarms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from support.live_service import running
+from support.machine_files import MACHINES
+
+from daqsvc.alarms.states import Level
+from daqsvc.settings import parse_machine_file
+from drivers.can.batches import DecodedBatch
+from drivers.can.errors import ErrorCounts
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.service import Service
+    from drivers.can.driver import CanDriver
+
+pytestmark = pytest.mark.integration
+MOTOR = MACHINES / "motor-accelerometer.toml"
+
+
+def how(service: Service, alarm: str) -> tuple[Level, str]:
+    status = service.alarms.manager.alarms[alarm]
+    return status.level, status.message
+
+
+async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -> None:
+    text = MOTOR.read_text().replace('interface = "socketcan"', 'interface = "virtual"')
+    machine = parse_machine_file(text.partition("[mqtt]")[0], MOTOR)
+    async with running(machine, tmp_path / "store") as service:
+        driver: CanDriver = service.drivers[0]  # type: ignore[assignment]
+        service.alarms.tick()
+        assert "bus-overrun/can0" not in service.alarms.manager.alarms, "nothing has happened"
+        driver.take(DecodedBatch(notes={"frames_overrun": 3}))
+        driver.take(DecodedBatch(errors=ErrorCounts({"bus_off": 1}, "bus-off")))
+        service.alarms.tick()
+        level, message = how(service, "bus-overrun/can0")
+        assert level is Level.ALERT
+        assert "what bus can0 carries is lost" in message
+        assert how(service, "bus-controller/can0")[0] is Level.DANGER
+        assert "bus-recording/can0" not in service.alarms.manager.alarms
+        driver.counters.frames_unrecorded += 1
+        service.alarms.tick()
+        level, message = how(service, "bus-recording/can0")
+        assert level is Level.ALERT
+        assert "frames of bus can0 are missing from its recording" in message
+        driver.take(DecodedBatch(errors=ErrorCounts({"restarts": 1}, "error-active")))
+        service.alarms.tick()
+        assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"

@@ -1,0 +1,125 @@
+"""A wrong rate, and a counter that stands still, reach a person as a quality alarm of a running service.
+
+Meanwhile no limit is judged by such a stream: nothing is raised by it, and nothing returns to normal.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+from support.brokers import eventually
+from support.live_service import running
+from support.machine_files import LAVAL
+from support.rogue_buses import machine_text
+from support.rogue_devices import NOMINAL_HZ, Phase, RogueDevices
+
+from daqsvc.settings import parse_machine_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.service import Service
+
+pytestmark = pytest.mark.integration
+WRONG, STILL = ("can", "tcp"), ("cobs", "rtu")
+KINDS = (*WRONG, *STILL)
+LIMIT = """
+[[alarms]]
+name = "limit-{0}"
+sensor = "s-{0}"
+measure = "rms"
+alert = 1.0
+danger = 3.0
+"""
+RATE_WRONG = re.compile(rf"the device sends (9[5-9]|10[0-5])(\.\d+)? Hz, the file says {NOMINAL_HZ:g}\b")
+COUNTER_STILL = "the device's counter stands still at 77; check the device"
+
+
+class Events:
+    """What the alarms of a service have said."""
+
+    def __init__(self, service: Service) -> None:
+        self.all: list[AlarmEvent] = []
+        manager, take = service.alarms.manager, service.alarms.manager.take
+
+        def heard(diagnosis):  # type: ignore[no-untyped-def]
+            events = take(diagnosis)
+            self.all += events
+            return events
+
+        manager.take = heard  # type: ignore[method-assign]
+
+    def of(self, alarm: str) -> list[str]:
+        return [event.kind.value for event in self.all if event.alarm == alarm]
+
+    def words(self, alarm: str) -> list[str]:
+        return [event.message for event in self.all if event.alarm == alarm]
+
+
+@pytest.mark.long
+async def test_streams_in_doubt_are_quality_alarms_and_no_others(tmp_path: Path) -> None:
+    await be_in_doubt(tmp_path, and_recover=False)
+
+
+@pytest.mark.long
+async def test_streams_in_doubt_are_judged_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("support.brokers.PATIENCE_S", 60.0)
+    await be_in_doubt(tmp_path, and_recover=True)
+
+
+async def be_in_doubt(folder: Path, *, and_recover: bool) -> None:
+    """Play wrong rates and still counters to a service; then, if asked to, what is right again."""
+    with RogueDevices(folder, 3) as devices:
+        text = machine_text(KINDS, devices) + "".join(map(LIMIT.format, KINDS))
+        machine = parse_machine_file(text, LAVAL)
+        async with running(machine, folder / "store") as service:
+            events = Events(service)
+            await eventually(lambda: all(d.link.state == "up" for d in service.drivers[:1]), "the bus is up")
+            devices.play(machine, KINDS, [Phase("loud", values="loud")], 0.1)
+            nodes = {node.name: node for node in devices.nodes}
+            for name in WRONG:
+                nodes[name].phases = [Phase("twice", per_s=2 * NOMINAL_HZ, values="loud")]
+            for name in WRONG:
+                await eventually(
+                    lambda n=name: any(map(RATE_WRONG.search, events.words(f"sensor-ok/s-{n}"))),
+                    f"{name}: the rate is said",
+                )
+                assert RATE_WRONG.match(service.figures()["streams"][name]["doubt"])
+            # One that is asked would answer all the same, and its counter stand still.
+            nodes["can"].phases = [Phase("stopped", per_s=0.0)]
+            nothing = "no samples of can for "
+            await eventually(lambda: nothing in events.words("sensor-ok/s-can")[-1], "the device has stopped")
+            assert service.figures()["streams"]["can"]["doubt"].startswith(nothing)
+            for name in STILL:
+                await eventually(lambda n=name: events.of(f"limit-{n}"), f"{name}: the limit is passed")
+                nodes[name].phases = [Phase("still", counter="still")]
+            for name in STILL:
+                await eventually(
+                    lambda n=name: any(COUNTER_STILL in said for said in events.words(f"sensor-ok/s-{n}")),
+                    f"{name}: the counter is said",
+                )
+                assert events.of(f"limit-{name}") == ["raised"], "quiet values of a counter that stands still"
+                assert service.figures()["streams"][name]["doubt"] == COUNTER_STILL
+                nodes[name].phases = [Phase("calm")]
+            for name in WRONG:
+                assert events.of(f"limit-{name}") == [], "loud values at a wrong rate"
+                nodes[name].phases = [Phase("loud", values="loud")]
+            if not and_recover:
+                return
+            for name in STILL:
+                await eventually(lambda n=name: "returned" in events.of(f"limit-{n}"), f"{name}: it is quiet")
+                # Good again is what has been good for some seconds.
+                await eventually(
+                    lambda n=name: events.of(f"sensor-ok/s-{n}")[-1] == "returned",
+                    f"{name}: it is good again",
+                )
+            for name in WRONG:
+                await eventually(lambda n=name: "raised" in events.of(f"limit-{n}"), f"{name}: it is judged")
+                # Good again is what has been good for some seconds.
+                await eventually(
+                    lambda n=name: events.of(f"sensor-ok/s-{n}")[-1] == "returned",
+                    f"{name}: it is good again",
+                )

@@ -1,0 +1,84 @@
+"""A key that is called as other tools call it is recognised; one in the wrong place is shown its own."""
+
+from __future__ import annotations
+
+import pytest
+from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
+
+from daqsvc.settings.aliases import _WORDS, meant_key
+from daqsvc.settings.models import MachineFile
+from daqsvc.settings.schema import _homes
+
+PUMP = MACHINES / "modbus-vibration-temperature.toml"
+SERIAL = MACHINES / "serial-probes.toml"
+
+
+@pytest.mark.parametrize(
+    ("path", "old", "new", "meant"),
+    [
+        (PUMP, "baud = 19_200", "baudrate = 19_200", "baud"),
+        (PUMP, "baud = 19_200", "baud_rate = 19_200", "baud"),
+        (PUMP, "serial_port =", "port =", "serial_port"),
+        (PUMP, "serial_port =", "device =", "serial_port"),
+        (PUMP, "unit = 1", "slave_id = 1", "unit"),
+        (PUMP, "address = 17", "register = 17", "address"),
+        (PUMP, "timeout_ms = 500.0", "timeout = 500.0", "timeout_ms"),
+        (PUMP, "alert_low = 2.0", "low = 2.0", "alert_low"),
+        (SERIAL, "baud = ", "baudrate = ", "baud"),
+        (SERIAL, "rate_hz", "fs", "rate_hz"),
+        (LAVAL, "rate_hz = 640.0", "sample_rate = 640.0", "rate_hz"),
+        (LAVAL, "rate_hz = 640.0", "sampling-rate = 640.0", "rate_hz"),
+        (LAVAL, "rate_hz = 640.0", "samplin_rate = 640.0", "rate_hz"),
+        (LAVAL, "id = 0x101", "can_id = 0x101", "id"),
+        (LAVAL, "length = 64", "dlc = 64", "length"),
+        (LAVAL, "byte_order =", "endianness =", "byte_order"),
+        (LAVAL, "alert = 40.0", "warning = 40.0", "alert"),
+        (LAVAL, "danger = 60.0", "trip = 60.0", "danger"),
+        (LAVAL, "deadband = 2.0", "hysteresis = 2.0", "deadband"),
+        (LAVAL, "speed_rpm = 600.0", "rpm = 600.0", "speed_rpm"),
+        (LAVAL, "damping_ratio = 0.18  ", "zeta = 0.18  ", "damping_ratio"),
+        (LAVAL, "ca_file =", "ca =", "ca_file"),
+        (LAVAL, "username =", "user =", "username"),
+        (LAVAL, "url =", "broker =", "url"),
+        (LAVAL, "directory =", "path =", "directory"),
+        (LAVAL, "window_s = 0.5", "averaging_time = 0.5", "window_s"),
+        (LAVAL, "sensitivity_mv_per_unit = 7.87 ", "mv_per_um = 7.87 ", "sensitivity_mv_per_unit"),
+        (TRIAXIAL, '"x", signals = ', '"x", signal = ', "signals"),
+        (MOTOR, "bitrate = 500_000", "baudrate = 500_000", "bitrate"),
+    ],
+)
+def test_a_word_of_the_trade_is_understood(path, old, new, meant):
+    text, line = changed(path, (old, new))
+    # The one problem: the value under the wrong name is taken for what was meant.
+    (problem,) = problems_of(text, path)
+    assert (problem.line, problem.message) == (line, "unknown key")
+    assert problem.remedy == f"did you mean {meant}?"
+
+
+@pytest.mark.parametrize(
+    ("path", "old", "new", "home"),
+    [
+        (SERIAL, "[streams.casing]", '[streams.casing]\nseparator = ","', "[streams.NAME.layout]"),
+        (LAVAL, 'bus = "can0"', 'bus = "can0"\nring_s = 30.0', "[pipeline]"),
+        (LAVAL, "[pipeline]", "[pipeline]\nlatching = true", "[[alarms]]"),
+        (LAVAL, "[pipeline]", "[pipeline]\ntopic_root = 'x'", "[mqtt]"),
+    ],
+)
+def test_a_key_in_the_wrong_table_is_shown_its_place(path, old, new, home):
+    text, _ = changed(path, (old, new))
+    (problem,) = problems_of(text, path)
+    assert problem.message == "unknown key"
+    assert problem.remedy == f"move it to {home}, where it belongs"
+
+
+def test_every_word_leads_to_a_key_that_there_is():
+    keys = set(_homes(MachineFile))
+    assert {key for meant in _WORDS for key in meant} <= keys
+    for meant, words in _WORDS.items():
+        for word in words.split():
+            assert meant_key(word, meant) in meant, word
+
+
+def test_what_is_called_by_no_word_is_not_guessed():
+    assert meant_key("flux_capacitor", ["rate_hz", "baud"]) is None
+    assert meant_key("baudrate", ["rate_hz"]) is None

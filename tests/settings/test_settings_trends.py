@@ -1,0 +1,273 @@
+"""Machine files with trend values: what becomes of them, and the combinations that cannot be."""
+
+from __future__ import annotations
+
+import pytest
+from support.machine_files import LAVAL, MACHINES, MOTOR, changed, only_problem, problems_of
+
+from daqsvc.alarms.rules import LevelRule
+from daqsvc.alarms.setpoints import Setpoint
+from daqsvc.alarms.start_up import StartUp
+from daqsvc.alarms.voting import VotingRule
+from daqsvc.assembly_alarms import alarm_handling, alarm_rules
+from daqsvc.assembly_mqtt import mqtt_settings
+from daqsvc.detectors.levels.detector import LevelDetector
+from daqsvc.detectors.levels.trends import TrendDetector
+from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.reading import Reading
+from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings.describe import describe
+
+PUMP = MACHINES / "modbus-vibration-temperature.toml"
+GAPS = MACHINES / "modbus-gap-voltages.toml"
+SPEED = """
+[[sensors]]
+name = "shaft-speed"
+type = "trend"
+stream = "drive-end"
+channel = "speed"
+unit = "rpm"
+
+[alarm_handling.start_up]
+detector = "levels/shaft-speed"
+measure = "value"
+between = [100.0, 2700.0]
+"""
+SPEED_REGISTER = '{ name = "speed", address = 23, type = "uint16" },\n'
+FIRST_REGISTER = '{ name = "vz", address = 17'
+MQTT = (
+    '[mqtt]\nurl = "mqtt://127.0.0.1"\ninsecure = true\n\n[mqtt.home_assistant]\nenabled = true\n\n[pipeline]'
+)
+PROBE_Y = 'channel = "y"\nunit = "um"\nsensitivity_mv_per_unit = 7.87\nzero_v = -10.0\ngap_ok_v'
+GAP_ALARM = """[[alarms]]
+name = "position"
+sensor = "probe-x"
+measure = "gap_voltage"
+alert_low = -12.0
+alert = -8.0
+deadband = 0.2
+
+[mqtt]"""
+
+
+def starting_up(*more):
+    """The pump with a speed among its registers, by which its start-up is known."""
+    return [
+        (FIRST_REGISTER, SPEED_REGISTER + "  " + FIRST_REGISTER),
+        ("[pipeline]", SPEED + "\n[pipeline]"),
+        ("alert = 2.8", "alert = 2.8\ntrip_multiply = 2.0"),
+        *more,
+    ]
+
+
+def test_a_pump_becomes_detectors_rules_and_readings():
+    text, _ = changed(PUMP, ("[pipeline]", MQTT))
+    machine = parse_machine_file(text, PUMP)
+    assert machine.warnings == ()
+    made = detectors(machine)
+    assert [(type(one), one.name, one.block) for one in made] == [
+        (TrendDetector, "trends/drive-end", 1),
+        (TrendDetector, "trends/other-end", 1),
+    ]
+    vibration, _, temperature, _ = alarm_rules(machine)
+    assert isinstance(vibration, VotingRule)
+    assert (vibration.sensors, vibration.vote, vibration.measure) == (("de-axial", "de-radial"), 1, "value")
+    assert isinstance(temperature, LevelRule)
+    assert temperature.setpoint == Setpoint(80.0, 95.0, 2.0, 10 * 10**9, 10 * 10**9, 2.0, None)
+    told = mqtt_settings(machine).home_assistant
+    assert Reading("levels/de-temperature", "statistics", "value", "degC") in told.readings
+    assert not [reading for reading in told.readings if reading.key != "value"]
+    assert "sensor-ok/nde-radial" in told.services
+
+
+def test_a_value_a_minute_is_shown_until_it_is_missed():
+    text, _ = changed(PUMP, ("[pipeline]", MQTT))
+    machine = parse_machine_file(text.replace("rate_hz = 1.0", "rate_hz = 0.0166667"), PUMP)
+    stale_s = {reading.stale_s for reading in mqtt_settings(machine).home_assistant.readings}
+    assert stale_s == {210}
+    fast = mqtt_settings(parse_machine_file(text, PUMP)).home_assistant.readings
+    assert {reading.stale_s for reading in fast} == {120}
+
+
+def test_a_stream_may_have_waveforms_and_trend_values():
+    text, _ = changed(GAPS, ('channel = "y"\nunit = "V"\nok_between', PROBE_Y))
+    text = text.replace('name = "probe-y"\ntype = "trend"', 'name = "probe-y"\ntype = "proximity"')
+    text = text.replace('"probe-y"\nmeasure = "value"', '"probe-y"\nmeasure = "gap_voltage"')
+    level, trend = detectors(parse_machine_file(text, GAPS))
+    assert (type(level), level.name, level.block) == (LevelDetector, "levels/gap", 20)
+    assert (type(trend), trend.name, trend.block) == (TrendDetector, "trends/gap", 20)
+    speaking = [said.detector for one in (level, trend) for said in one.silent(2.0, 0)]
+    assert speaking == ["levels/probe-y", "levels/probe-x"]
+
+
+def test_the_levels_of_a_window_are_described_as_one():
+    text = describe(load_machine_file(GAPS))
+    assert "-11..-9 V" in text
+    assert "OK -18 to -2 V" in text
+
+
+def test_a_gap_voltage_of_a_proximity_probe_has_a_window_too():
+    machine = parse_machine_file(changed(LAVAL, ("[mqtt]", GAP_ALARM))[0], LAVAL)
+    rule = alarm_rules(machine)[-1]
+    assert rule.setpoint == Setpoint(alert=-8.0, deadband=0.2, alert_low=-12.0)
+    assert "-12..-8 V" in describe(machine)
+
+
+def test_a_speed_that_is_polled_tells_of_a_start_up():
+    machine = parse_machine_file(changed(PUMP, *starting_up())[0], PUMP)
+    assert machine.warnings == ()
+    assert alarm_handling(machine).start_up == StartUp(
+        detector="levels/shaft-speed", measure="value", between=(100.0, 2700.0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "replacements", "key", "message", "remedy"),
+    [
+        (
+            PUMP,
+            [('measure = "value"\nalert_low', 'measure = "rms"\nalert_low')],
+            "alarms[2].measure",
+            'needs a waveform, but "de-temperature" is a trend value',
+            'write measure = "value", with setpoints in degC',
+        ),
+        (
+            LAVAL,
+            [('measure = "rms"', 'measure = "value"')],
+            "alarms[0].measure",
+            'needs a trend value, but "probe-x" is a proximity probe',
+            'write measure = "rms" or "peak", with setpoints in um, or type = "trend"',
+        ),
+        (
+            MOTOR,
+            [('measure = "rms"', 'measure = "gap_voltage"')],
+            "alarms[0].measure",
+            "is an accelerometer",
+            'measure = "rms"',
+        ),
+        (
+            LAVAL,
+            [("alert = 40.0", "alert_low = 1.0\nalert = 40.0")],
+            "alarms[0].alert_low",
+            "does not go with rms: only value and gap_voltage have lower setpoints",
+            "remove it",
+        ),
+        (
+            LAVAL,
+            [("alert = 40.0", "alert = -40.0")],
+            "alarms[0].alert",
+            "greater than 0: rms is never less",
+            "positive",
+        ),
+        (
+            PUMP,
+            [("alert_low = 2.0", "alert_low = 80.0")],
+            "alarms[2].alert_low",
+            "must be below alert = 80",
+            "correct one",
+        ),
+        (
+            PUMP,
+            [("alert_low = 2.0", "alert_low = 200.0")],
+            "alarms[2].alert_low",
+            "must be below alert = 80",
+            "swap",
+        ),
+        (
+            PUMP,
+            [("danger = 95.0", "danger = 120.0")],
+            "alarms[2].danger",
+            'never reached: it lies outside the OK limits -40 to 105 of "de-temperature"',
+            "ok_between",
+        ),
+        (
+            PUMP,
+            [("deadband = 2.0", "deadband = 78.0")],
+            "alarms[2].deadband",
+            "smaller than the 78 between alert_low and alert, or the alarm never returns",
+            "deadband = 3.9",
+        ),
+        (
+            PUMP,
+            [("deadband = 0.2", "deadband = 2.8")],
+            "alarms[0].deadband",
+            'smaller than the 2.8 that the OK limits 0 to 65 of "de-axial" leave beside alert',
+            "deadband = 0.14",
+        ),
+        (
+            PUMP,
+            [("ok_between = [0.0, 65.0]", "ok_between = [65.0, 0.0]")],
+            "sensors[0].ok_between",
+            "the lower limit must come first",
+            "write [0.0, 65.0]",
+        ),
+        (PUMP, [('unit = "mm/s" ', 'unit = " mm/s" ')], "sensors[0].unit", "is no unit", 'unit = "degC"'),
+        (
+            PUMP,
+            [('unit = "mm/s" ', 'unit = "degC" ')],
+            "alarms[0].sensors",
+            "one setpoint for sensors in degC and mm/s",
+            "one unit",
+        ),
+        (
+            PUMP,
+            [("[pipeline.levels]", "")],
+            "alarms[0].sensors",
+            "nothing measures their levels",
+            "[pipeline.levels]",
+        ),
+        (
+            PUMP,
+            starting_up(('measure = "value"\nbetween', "between")),
+            "alarm_handling.start_up.measure",
+            "is nothing that levels/shaft-speed states",
+            "value",
+        ),
+        (
+            PUMP,
+            starting_up(
+                ("alert = 80.0\n", "alert = -20.0\ntrip_multiply = 2.0\n"), ("alert_low = 2.0\n", "")
+            ),
+            "alarms[2].trip_multiply",
+            "multiplies alert and danger, which must be greater than 0 for that",
+            "remove it",
+        ),
+    ],
+)
+def test_what_cannot_be_is_named_with_a_remedy(path, replacements, key, message, remedy):
+    text, _ = changed(path, *replacements)
+    problem = problems_of(text, path)[0]
+    assert problem.key == key
+    assert message in problem.message
+    assert remedy in problem.remedy
+
+
+def test_a_waveform_that_is_polled_once_a_second_is_said_to_be_a_trend_value():
+    text, _ = changed(
+        PUMP,
+        ('type = "trend"                   # a level', 'type = "velocity" # a level'),
+        ("ok_between = [0.0, 65.0]", ""),
+    )
+    found = {problem.key: problem for problem in problems_of(text, PUMP)}
+    assert "1 Hz are fewer than 16 samples" in found["pipeline.levels.window_s"].message
+    assert 'or type = "trend" for sensors whose level' in found["pipeline.levels.window_s"].remedy
+    assert 'or type = "trend" for sensors whose level' in found["pipeline.levels.velocity_band_hz"].remedy
+    assert "is a velocity sensor" in found["alarms[0].measure"].message
+
+
+def test_a_band_has_no_effect_on_trend_values():
+    text, _ = changed(PUMP, ("[pipeline.levels]", "[pipeline.levels]\nvelocity_band_hz = [2.0, 1000.0]\n#"))
+    (warning,) = parse_machine_file(text, PUMP).warnings
+    assert warning.key == "pipeline.levels.velocity_band_hz"
+    assert "a trend value has the band of its device" in warning.message
+
+
+def test_a_gap_voltage_needs_a_sensitivity():
+    problem, _ = only_problem(
+        LAVAL,
+        ("[mqtt]", GAP_ALARM),
+        ("sensitivity_mv_per_unit = 7.87 ", "# "),
+        ("zero_v = -10.0", ""),
+    )
+    assert problem.key == "alarms[3].measure"
+    assert 'is not known: "probe-x" has no sensitivity_mv_per_unit' in problem.message

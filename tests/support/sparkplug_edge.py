@@ -1,0 +1,121 @@
+"""An edge node under test, and a machine whose alarms it tells."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING
+
+from support.brokers import LOOPBACK, eventually
+
+from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarms.commands import AlarmCommand, Verb
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
+from daqsvc.diagnosis.reading import Reading
+from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.publish.payloads import alarm_payload
+from daqsvc.publish.sparkplug.codec import DataType, Metric, Payload, encode
+from daqsvc.publish.sparkplug.edge import SparkplugEdge
+from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
+from daqsvc.publish.topics import Topics
+
+if TYPE_CHECKING:
+    from support.sparkplug_host import Host
+
+    from daqsvc.outbox.store import Outbox
+
+CLOCK = SystemClock()
+TOPICS = Topics("daqsvc", "lab", "edge-1")
+NODE = "spBv1.0/lab/{}/edge-1"
+REBIRTH = "Node Control/Rebirth"
+STATE = "Alarms/rig/rotor-fault/State"
+EVENT = "Alarms/rig/rotor-fault/Event"
+BOOLEAN, INT64, STRING, DOUBLE = 11, 4, 12, 10
+READINGS = (
+    Reading("bank", "statistics", "speed", "rpm"),
+    Reading("bank", "probabilities", "F1"),
+)
+
+
+def said(decision: str, severity: str = "alert", speed: float = 600.0) -> Diagnosis:
+    return Diagnosis(
+        machine="rig",
+        detector="bank",
+        t_ns=CLOCK.monotonic_ns(),
+        stream="shaft",
+        first_index=0,
+        end_index=64,
+        decision=decision,
+        changed=True,
+        severity=severity,
+        probabilities={"F1": 0.75},
+        statistics={"speed": speed},
+        sensors=("x",),
+        group=(decision,),
+    )
+
+
+class Machine:
+    """Alarms into the outbox, as the service puts them there."""
+
+    def __init__(self, outbox: Outbox, alarms: tuple[str, ...] = ("rotor-fault",)) -> None:
+        self._outbox = outbox
+        self._manager = AlarmManager(
+            Identity("lab", "edge-1", "rig"), [DiagnosisRule(name, "bank") for name in alarms], CLOCK
+        )
+
+    async def says(self, decision: str, severity: str = "alert") -> None:
+        await self._tell(self._manager.take(said(decision, severity)))
+
+    async def shelves(self) -> None:
+        command = AlarmCommand(verb=Verb.SHELVE, alarm="rotor-fault", by="me", duration_s=60.0)
+        await self._tell(self._manager.execute(command))
+
+    async def _tell(self, events) -> None:
+        for event in events:
+            topic = TOPICS.alarm("rig", event.alarm)
+            await self._outbox.append(
+                topic,
+                lambda sequence, event=event: alarm_payload(event, sequence, "series").to_json(),
+                retain=True,
+            )
+
+    async def flips(self, times: int) -> None:
+        """Raise and return the alarm, so often; two events each time."""
+        for number in range(times):
+            await self.says(f"F{number}")
+            await self.says("N", "normal")
+
+
+@contextlib.asynccontextmanager
+async def edge_node(outbox, tmp_path, *ports, primary_host=None, protocol="5"):
+    settings = SparkplugSettings(
+        group="lab",
+        edge_node="edge-1",
+        device="rig",
+        machine="rig",
+        servers=tuple(Server(LOOPBACK, port, tls=False) for port in ports),
+        client_id="edge-1-sparkplug",
+        memory=tmp_path / "sparkplug.json",
+        primary_host=primary_host,
+        alarms=("rotor-fault",),
+        readings=READINGS,
+    )
+    mqtt = MqttSettings(LOOPBACK, ports[0], "edge-1", protocol=protocol)
+    edge = SparkplugEdge(settings, mqtt, outbox, TOPICS, CLOCK)
+    running = asyncio.create_task(edge.run())
+    try:
+        yield edge
+    finally:
+        await edge.stop(5.0)
+        await running
+
+
+def rebirth(*, value: object = True, name: str = REBIRTH, datatype: DataType = DataType.BOOLEAN) -> bytes:
+    return encode(Payload(1, None, (Metric(name=name, timestamp_ms=1, datatype=datatype, value=value),)))
+
+
+async def born(host: Host, times: int = 1) -> None:
+    await eventually(lambda: len(host.of("DBIRTH")) >= times, f"birth number {times}")
