@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from daqsvc.alarms.states import AlarmState, Level
-    from daqsvc.diagnosis.record import DataQuality, Diagnosis
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.dsp.quality import DataQuality
 
 
 @dataclass(frozen=True, slots=True)

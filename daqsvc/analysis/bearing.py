@@ -25,8 +25,8 @@ from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import compare_residual
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.finding import find
-from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:

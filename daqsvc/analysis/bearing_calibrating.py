@@ -12,9 +12,9 @@ from daqsvc.analysis.setup import RefusedError
 from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
-from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.detectors.bearing.settings import Bearing
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

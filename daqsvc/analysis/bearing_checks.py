@@ -8,8 +8,8 @@ import numpy as np
 
 from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.analysis.quality import count_bad
-from daqsvc.bearing.race.quality import OFFSET_NOTE
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.accelerometers import OFFSET_NOTE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,8 +12,8 @@ from daqsvc.analysis.acceleration import M_S2_PER_UNIT
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import PLACES
-from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:

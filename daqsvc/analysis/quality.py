@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.analysis.setup import RefusedError
-from daqsvc.detectors.shaft.probe_checks import clipped_at
+from daqsvc.dsp.quality.clipped import clipped_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

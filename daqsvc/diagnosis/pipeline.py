@@ -16,7 +16,7 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.diagnosis.silence import Patience
+from daqsvc.dsp.quality.missing import Patience
 from daqsvc.supervision import Supervisor, over
 from daqsvc.threads import call_in_thread
 

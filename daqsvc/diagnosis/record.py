@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from daqsvc.dsp.quality import DataQuality
+
 Severity = Literal["normal", "alert", "danger"]
-DataQuality = Literal["good", "missing", "not_ok"]
 
 
 @dataclass(frozen=True, slots=True)

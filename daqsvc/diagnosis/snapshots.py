@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.diagnosis.silence import Patience
+from daqsvc.dsp.quality.missing import Patience
 
 if TYPE_CHECKING:
     from daqsvc.settings.buses import Block

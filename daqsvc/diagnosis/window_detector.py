@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.record import Severity
+    from daqsvc.dsp.quality import DataQuality
     from daqsvc.settings.models import MachineFile
 
 

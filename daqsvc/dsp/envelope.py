@@ -188,3 +188,18 @@ def hann(samples: int) -> Envelope:
     window = np.hanning(samples + 1)[:samples].astype(np.float32)
     window.setflags(write=False)
     return window
+
+
+def levelled(envelope: Envelope, holes: Real) -> Envelope:
+    """An envelope with its own mean where nothing of the machine is left: no line comes of it, none is lost.
+
+    Args:
+        envelope: ``[n]``.
+        holes: ``[holes, 2]``, their beginnings and ends as shares of its length.
+    """
+    if not len(holes):
+        return envelope
+    inside = np.zeros(len(envelope), dtype=np.bool_)
+    for first, last in np.rint(holes * len(envelope)).astype(np.int64):
+        inside[first:last] = True
+    return np.where(inside, envelope[~inside].mean(), envelope)

@@ -13,7 +13,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel
 from daqsvc.acquisition.clock import iso_utc
 from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import HOLDS, AlarmState, Level
-from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
+from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.dsp.quality import DataQuality  # noqa: TC001 - pydantic reads it
 from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from daqsvc.alarms.quality import LASTING
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.detectors.levels.detector import GapCheck, LevelChannel, LevelDetector
-from daqsvc.detectors.levels.partial import MOST_MISSING
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.quality.missing import MOST_MISSING
 
 WINDOW = 1000
 SECOND_NS = 1_000_000_000

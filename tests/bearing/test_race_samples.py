@@ -11,13 +11,12 @@ from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
 from daqsvc.bearing.race.confidence import MOST_MARGIN, doubted
-from daqsvc.bearing.race.prewhitening import Prewhitening
-from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.spikes import despiked
-from daqsvc.bearing.race.stuck import stuck
-from daqsvc.bearing.race.transients import blanked, find_transients, levelled, merged
+from daqsvc.dsp.envelope import levelled
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.accelerometers import checked
+from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged
+from daqsvc.dsp.quality.stuck import dropouts
 
 REVOLUTION = round(60.0 * RATE_HZ / SPEED_RPM)
 BAND_HZ = (400.0, 0.48 * RATE_HZ)
@@ -29,7 +28,7 @@ def judge(samples: np.ndarray) -> object:
 
 
 def check(samples: np.ndarray) -> object:
-    return checked(samples, RATE_HZ, SPEED_RPM, RaceRules())
+    return checked(samples, RATE_HZ, SPEED_RPM, (RaceRules().low_hz, RaceRules().high_hz))
 
 
 def ringing(height: float, seconds: float = 0.02, hz: float = 2200.0) -> np.ndarray:
@@ -170,15 +169,15 @@ def test_drop_outs_to_a_value_beyond_all_others_are_no_clipping(level: float) ->
     assert "the channel stands still 10 times" in judge(samples).repairs[0]
     clipped = np.clip(strikes("inner", seed=18), -2.5, 2.5)
     clipped[1_000:1_010] = 2.5
-    assert not stuck(clipped).any()
+    assert not dropouts(clipped).any()
 
 
 def test_a_coarse_converter_rests_by_itself() -> None:
-    assert not stuck(np.round(0.6 * strikes(None, seed=13))).any()
+    assert not dropouts(np.round(0.6 * strikes(None, seed=13))).any()
     fine = strikes(None, seed=13)
-    assert not stuck(fine).any()
+    assert not dropouts(fine).any()
     fine[500:506] = fine[499]
-    assert np.flatnonzero(stuck(fine)).tolist() == [499, 500, 501, 502, 503, 504, 505]
+    assert np.flatnonzero(dropouts(fine)).tolist() == [499, 500, 501, 502, 503, 504, 505]
 
 
 def test_normal_is_never_sure_of_samples_that_were_put_right() -> None:

@@ -32,7 +32,7 @@ from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
-from daqsvc.diagnosis.record import DataQuality, Diagnosis
+from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.mqtt import MqttSettings
 from daqsvc.publish.payloads import status_payload
 from daqsvc.publish.settings import HomeAssistantSettings
@@ -40,6 +40,7 @@ from daqsvc.service import LoopLag
 
 if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
+    from daqsvc.dsp.quality import DataQuality
 
 CLOCK = SystemClock()
 RIG = Identity("lab", "edge-1", "rig")

@@ -15,9 +15,9 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.diagnosis import pipeline as pipeline_module
-from daqsvc.diagnosis import silence
 from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.dsp.quality import missing
 from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class _Counting:
 
 async def test_what_one_detector_does_is_no_matter_to_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pipeline_module, "HANG_S", 0.1)
-    monkeypatch.setattr(silence, "SILENCE_NS", 0)
+    monkeypatch.setattr(missing, "SILENCE_NS", 0)
     monkeypatch.setattr(pipeline_module, "LOOK_NS", 10_000_000)
     may_end = threading.Event()
     hanging = [_Counting(f"hangs-{n}", lambda: may_end.wait(60) or None) for n in range(3)]

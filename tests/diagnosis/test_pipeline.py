@@ -14,7 +14,7 @@ from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.diagnosis.silence import Patience
+from daqsvc.dsp.quality.missing import Patience
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Window

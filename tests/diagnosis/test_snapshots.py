@@ -24,7 +24,7 @@ from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.diagnosis.silence import SILENT_PERIODS, UNKNOWN_NS, Patience
+from daqsvc.dsp.quality.missing import SILENT_PERIODS, UNKNOWN_NS, Patience
 from daqsvc.settings import describe, parse_machine_file
 
 RATE_HZ = 3200.0

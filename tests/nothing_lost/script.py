@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.diagnosis.record import DataQuality, Diagnosis, Severity
+from daqsvc.diagnosis.record import Diagnosis, Severity
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from daqsvc.dsp.quality import DataQuality
 
 HOUR_S = 3600
 PAUSES_S = (0.0, 0.0, 0.005, 0.03, 0.07)

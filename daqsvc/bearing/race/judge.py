@@ -19,12 +19,10 @@ from daqsvc.bearing.race.confidence import MOST_DOUBT, MOST_MARGIN, doubted
 from daqsvc.bearing.race.decision import RACES, decide
 from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
 from daqsvc.bearing.race.null import false_alarm_probability
-from daqsvc.bearing.race.quality import checked
 from daqsvc.bearing.race.rival import refuse_rivals
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.scoring import EnvelopeView, Scales, view_of
 from daqsvc.bearing.race.track import shaft_track
-from daqsvc.bearing.race.transients import levelled
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
@@ -34,7 +32,8 @@ from daqsvc.bearing.race.verdict import (
     RaceLine,
     RaceVerdict,
 )
-from daqsvc.dsp.envelope import line_power, squared_envelope, whiten
+from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
+from daqsvc.dsp.quality.accelerometers import checked
 from daqsvc.dsp.speed.harmonics import shaft_rate, slow_series
 
 if TYPE_CHECKING:
@@ -169,7 +168,7 @@ def race_features(
     samples: NDArray[np.floating], rate_hz: float, speed_rpm: float, bearing: BearingOrders, rules: RaceRules
 ) -> RaceFeatures:
     """Measure what the decision rests on; arguments and errors as of `race_test`."""
-    sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, rules)
+    sound = checked(np.asarray(samples, dtype=np.float64), rate_hz, speed_rpm, (rules.low_hz, rules.high_hz))
     length = scipy.fft.prev_fast_len(len(sound.values), real=True)
     spectrum = scipy.fft.rfft(sound.values[:length])
     top_hz = min(TOP_SHARE * rate_hz, rules.high_hz)

@@ -22,9 +22,10 @@ from daqsvc.detectors.bearing.evaluation import (
 from daqsvc.detectors.bearing.finding import SOUND, find
 from daqsvc.detectors.bearing.learning import HealthyGathering
 from daqsvc.detectors.bearing.persistence import ConfirmedState, PersistenceFilter
-from daqsvc.detectors.bearing.quality import ClippedError, refuse_clipped
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.clipped import refuse_clipped
+from daqsvc.dsp.quality.missing import lacking
 from daqsvc.dsp.speed.steadiness import SpeedError, measure_speed
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.housed import HousedBearing
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.record import Severity
+    from daqsvc.dsp.quality import DataQuality
     from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 
     Floats = NDArray[np.float64]
@@ -47,8 +49,6 @@ MODEL = "bearing-race/1"
 _BLOCKS_PER_LOOK = 5
 _LEAST_LAST = 0.5
 """Part of a look that is worth a last one."""
-_MISSING = 0.01
-"""Part of a look's samples that may be missing; single ones are bridged."""
 _NO_LONGER_LARGE = 8.0
 """Danger stays until the innovations are less than so many times the healthy ones."""
 SAME_SPEED = 0.05
@@ -237,17 +237,15 @@ class BearingDetector:
         directions: dict[str, Direction] = {}
         for bearing in () if self._speed_unknown else self.bearings:
             signal = samples[:, bearing.column]
-            missing = int(np.isnan(signal).sum())
-            if missing > _MISSING * len(signal):
+            if lost := lacking(bearing.sensor, signal):
                 self._watches[bearing.name].forget()
-                lost = f"{missing} of {len(signal)} samples are missing"
-                unfit.append(("missing", f"{bearing.sensor}: {lost}; check the bus and the device"))
+                unfit.append(("missing", lost))
                 continue
             try:
                 refuse_clipped(signal)
                 race = self._watches[bearing.name].take(signal)
                 departed = self._departed(bearing, samples)
-            except (ClippedError, UnfitError, _StandsStillError) as error:
+            except (UnfitError, _StandsStillError) as error:
                 self._watches[bearing.name].forget()
                 unfit.append(("not_ok", f"{bearing.sensor}: {error}"))
                 continue
@@ -278,12 +276,8 @@ class BearingDetector:
         except SpeedError as error:
             self._speed_unknown = True
             self._begin_anew()
-            missing = int(np.isnan(volts).sum())
-            if missing > _MISSING * len(volts):
-                lost = f"{missing} of {len(volts)} samples are missing, and pulses with them"
-                yield "missing", f"{self.keyphasor.name}: {lost}; check the bus and the device"
-            else:
-                yield "not_ok", str(error)
+            lost = lacking(self.keyphasor.name, volts, ", and pulses with them")
+            yield ("missing", lost) if lost else ("not_ok", str(error))
             return
         before, tolerance = self._speed_rpm, self._race.speed_tolerance
         if speed.drift > tolerance:
@@ -433,12 +427,8 @@ class BearingDetector:
 def _lacking_pair(bearing: HousedBearing, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
     """What is against "normal" where the second accelerometer lacks samples: then no change can be seen."""
     for name, column in zip(bearing.sensors, bearing.columns, strict=True):
-        missing = int(np.isnan(samples[:, column]).sum())
-        if column != bearing.column and missing > _MISSING * len(samples):
-            yield (
-                "missing",
-                f"{name}: {missing} of {len(samples)} samples are missing; check the bus and the device",
-            )
+        if column != bearing.column and (lost := lacking(name, samples[:, column])):
+            yield "missing", lost
 
 
 class _StandsStillError(ValueError):

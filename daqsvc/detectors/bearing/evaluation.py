@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.direction import Direction
     from daqsvc.detectors.bearing.finding import BearingFinding
-    from daqsvc.diagnosis.record import DataQuality
+    from daqsvc.dsp.quality import DataQuality
 
 LARGE = 10.0
 """Innovations of so many times those of the healthy machine are danger."""

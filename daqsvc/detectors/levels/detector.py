@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from daqsvc.detectors.levels.partial import (
+from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
+from daqsvc.diagnosis.record import silence_reason
+from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, gapped_band_rms, levels
+from daqsvc.dsp.quality.missing import (
     LEAST_KNOWN_ERROR,
     MIN_PRESENT,
     MOST_ERROR,
@@ -17,21 +20,19 @@ from daqsvc.detectors.levels.partial import (
     nothing_known,
     partly_missing,
 )
-from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
-from daqsvc.diagnosis.record import silence_reason
-from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, gapped_band_rms, levels
-from daqsvc.dsp.standstill import StandstillWatch
+from daqsvc.dsp.quality.stuck import StandstillWatch
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.detectors.levels.partial import Bounds
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import DataQuality, Diagnosis
-    from daqsvc.dsp.standstill import Standstill
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality.missing import Bounds
+    from daqsvc.dsp.quality.stuck import Standstill
 
 _LEAST_SAMPLES = 4
 """Fewer make no spectrum."""

@@ -10,7 +10,8 @@ from daqsvc.diagnosis.record import Diagnosis
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.record import Severity
+    from daqsvc.dsp.quality import DataQuality
 
 NO_BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType({})
 """Of statistics that are all certain."""

@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.detectors.levels.partial import MOST_MISSING, not_judged, nothing_known, partly_missing
 from daqsvc.detectors.levels.statements import Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.diagnosis.silence import BRIDGED
+from daqsvc.dsp.quality.missing import BRIDGED, MOST_MISSING, not_judged, nothing_known, partly_missing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.detectors.levels.partial import Bounds
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import DataQuality, Diagnosis
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality.missing import Bounds
 
 VALUE = "value"
 """The one measure of a trend value."""

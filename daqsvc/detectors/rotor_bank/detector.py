@@ -15,9 +15,10 @@ from daqsvc.detectors.rotor_bank.statements import (
     BankDiagnosisBuilder,
     Moment,
 )
-from daqsvc.detectors.shaft.probe_checks import Verdict, stands_still
-from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
 from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality.missing import OBSERVED_SHARE
+from daqsvc.dsp.quality.probes import DEAD, RevolutionJudge, Verdict
+from daqsvc.dsp.quality.stuck import stands_still
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
@@ -43,10 +44,6 @@ _RETUNE = 0.003
 """Relative change of speed that the reference orbits follow; smaller ones are jitter of the edges."""
 _BLIND_REVOLUTIONS = 3.0
 """So long the angle is trusted without an edge."""
-_MISSING = 0.5
-"""Part of the last revolution's samples that the observers predict through."""
-_DEAD = 0.05
-"""A probe that moves less than this part of what it must is dead."""
 
 
 class RotorBankDetector:
@@ -151,7 +148,7 @@ class RotorBankDetector:
             modes=self._modes,
             rules=self._rules,
         )
-        self._judge = RevolutionJudge(probes, missing=_MISSING, pooled=1)
+        self._judge = RevolutionJudge(probes, missing=OBSERVED_SHARE, pooled=1)
         self._faults = {mode.name: fault_of(mode, rotor) for mode in self._modes}
         # Probes that are not at right angles share the noise unevenly; this is the mean of both axes.
         self._noise = noise_um / rotor.clearance_um / abs(spread)
@@ -163,7 +160,7 @@ class RotorBankDetector:
             edge=keyphasor.edge,
         )
         healthy = abs(self._bank_modes[0].rotor.orbit()) * rotor.clearance_um
-        self._least_motion_um = _DEAD * math.hypot(noise_um, healthy / math.sqrt(2.0))
+        self._least_motion_um = DEAD * math.hypot(noise_um, healthy / math.sqrt(2.0))
         self._watch = OrbitWatch(
             noise=self._noise,
             rest=self._bank_modes[0].rotor.rest,

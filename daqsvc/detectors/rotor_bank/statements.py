@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.detectors.rotor_bank.modes import RotorMode
-    from daqsvc.detectors.shaft.probe_checks import Verdict
+    from daqsvc.dsp.quality.probes import Verdict
     from daqsvc.rotor.bank import BankReport
     from daqsvc.rotor.decision import DecisionRules
 

@@ -16,10 +16,9 @@ from daqsvc.detectors.rotor_synchronous.vector_checks import (
     speed_verdict,
     static_position_missing,
 )
-from daqsvc.detectors.shaft.probe_checks import Verdict
-from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality.probes import RevolutionJudge, Verdict
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.detectors.shaft.probe_checks import Verdict
-    from daqsvc.diagnosis.record import DataQuality, Severity
+    from daqsvc.diagnosis.record import Severity
+    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality.probes import Verdict
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.watch import WatchReport, WatchRules

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.detectors.shaft.probe_checks import Verdict
-from daqsvc.detectors.shaft.probe_quality import blind_probe
+from daqsvc.dsp.quality.probes import Verdict, blind_probe
 from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE
 
 if TYPE_CHECKING:

@@ -6,6 +6,11 @@ same limits; where the limits differ, the reason stands beside them.
 
 from __future__ import annotations
 
+from typing import Literal
+
+DataQuality = Literal["good", "missing", "not_ok"]
+"""Of what a statement rests on: good, too little of it there, or not what a sound sensor delivers."""
+
 
 class UnfitError(ValueError):
     """Samples cannot be judged: they are not what a healthy sensor delivers, or not enough of it.

@@ -7,8 +7,8 @@ import pytest
 from support.gapped_signals import FRAMES, RATE_HZ, SHARES, SIGNALS, lost
 
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
-from daqsvc.detectors.levels.partial import MOST_MISSING
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.quality.missing import MOST_MISSING
 
 pytestmark = pytest.mark.statistical
 WINDOW = 1000

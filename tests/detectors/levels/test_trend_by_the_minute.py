@@ -20,7 +20,7 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.diagnosis.silence import Patience
+from daqsvc.dsp.quality.missing import Patience
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.layouts import TrendLayout

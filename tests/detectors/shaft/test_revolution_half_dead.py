@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from daqsvc.detectors.shaft.probe_quality import RevolutionJudge
 from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality.probes import RevolutionJudge
 
 PROBES = (Probe("probe-x", 0, 0.0), Probe("probe-y", 1, 90.0))
 TURN = 2 * np.pi * np.arange(64) / 64

@@ -1,8 +1,11 @@
-"""Whether a sensor was dead for a part of a window: it stood at one value for longer than it ever does.
+"""Whether a sensor stands still: it repeats one value for longer than it ever does.
 
 A coarse converter repeats its values, a square wave rests on two, and between impacts a quiet sensor stays
 at one. What tells a dead sensor from these is its own habit: how often a sample repeats the one before, and
-how long its other runs of one value are, in this window and in the good ones before.
+how long its other runs of one value are, in this window and in the good ones before (`StandstillWatch`).
+
+An accelerometer is searched for drop-outs besides, many short runs, by `dropouts`: the habit is taken from
+seconds of it at once, and what is found is bridged. A short window could not tell those runs from chance.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    Floats = NDArray[np.float64]
+
 _SURE_NATS = 30.0
 """A run is no chance if it was so improbable, given how often samples repeat: once in some 10^13 windows."""
 _LONGER = 6
@@ -24,6 +29,29 @@ _RUNS = 8
 """So many other runs are needed to know a habit."""
 _REMEMBERED = 8
 """Windows that the habit is taken from, besides the present one."""
+_DROP_STEPS = 4.0
+"""A drop is more than so many of the signal's finest steps."""
+
+DEAD_SHARE = 0.5
+"""Share of samples that repeat the one before, from which on an accelerometer is dead."""
+_LEAST_RUN = 4
+"""Three differences of nothing in a row."""
+_COARSE_RUN = 64
+_COARSE = 0.5
+"""Least difference over the median one beyond which a converter is coarse: its channel rests by itself."""
+_NEAR_LIMIT = 0.025
+"""So near to the extremes of all others, as a share of their range, a value is a limit."""
+_FALSE_RUNS = 1e-2
+"""Runs that a whole record shows by itself, at most."""
+
+
+def stands_still(probes: Floats) -> bool:
+    """Whether a probe repeats one value through a block, as none does that sees a turning shaft.
+
+    Args:
+        probes: float64 ``[n, 2]``.
+    """
+    return len(probes) > 2 and bool((probes == probes[0]).all(axis=0).any())
 
 
 class Standstill(NamedTuple):
@@ -98,3 +126,48 @@ class StandstillWatch:
             return False
         repeats = (samples - count + 1) / (samples + 2)  # share of samples like the one before (Laplace)
         return -run * math.log(repeats) >= _SURE_NATS
+
+
+def dropped_to(signal: Floats) -> Standstill | None:
+    """The value that a signal dropped to, or came back from, for a part of a revolution; None if it did not.
+
+    A flat crest rests on one value of a coarse converter, too, but is reached in its finest steps.
+    """
+    still = StandstillWatch().take(signal)
+    if still is None:
+        return None
+    steps = np.abs(np.diff(signal))
+    ends = steps[[i for i in (still.first - 1, still.first + still.samples - 1) if 0 <= i < len(steps)]]
+    return still if ends.max(initial=0.0) > _DROP_STEPS * steps[steps > 0].min(initial=np.inf) else None
+
+
+def dropouts(samples: Floats) -> NDArray[np.bool_]:
+    """Samples that belong to a run of one value, longer than the channel's own converter makes any.
+
+    Args:
+        samples: ``[n]``, all finite.
+
+    Returns:
+        ``[n]``; runs at the ends of the range are clipping and not marked.
+    """
+    n = len(samples)
+    steps = np.abs(np.diff(samples))
+    rests = steps == 0.0
+    if not (rests[2:] & rests[1:-1] & rests[:-2]).any():
+        return np.zeros(n, dtype=np.bool_)
+    starts = np.flatnonzero(np.concatenate(([True], steps != 0.0)))
+    lengths = np.diff(starts, append=n)
+    moving = steps[steps != 0.0]
+    repeated = min(float(np.mean(lengths > 1)), 0.99)
+    least = max(_LEAST_RUN, math.ceil(1.0 + math.log(_FALSE_RUNS / n) / math.log(max(repeated, 1e-9))))
+    if not len(moving) or moving.min() > _COARSE * np.median(moving):
+        least = max(least, _COARSE_RUN)
+    long = lengths >= least
+    rest = samples[np.repeat(~long, lengths)]
+    if not len(rest):
+        return np.zeros(n, dtype=np.bool_)
+    # A clipped channel comes to its limit steadily; what rests far beyond all the rest has dropped out.
+    low, high = float(rest.min()), float(rest.max())
+    near, values = _NEAR_LIMIT * (high - low), samples[starts]
+    clipped = (np.abs(values - low) <= near) | (np.abs(values - high) <= near)
+    return np.repeat(long & ~clipped, lengths)

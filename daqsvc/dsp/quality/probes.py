@@ -9,12 +9,14 @@ from __future__ import annotations
 import cmath
 import math
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.detectors.shaft.probe_checks import Verdict, clipped_at, stands_still
-from daqsvc.dsp.standstill import StandstillWatch
+from daqsvc.dsp.quality.clipped import clipped_at
+from daqsvc.dsp.quality.missing import REVOLUTION_SHARE
+from daqsvc.dsp.quality.stuck import dropped_to, stands_still
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -22,24 +24,28 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.probes import Probe
-    from daqsvc.dsp.standstill import Standstill
+    from daqsvc.dsp.quality import DataQuality
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
 
 POOLED_REVOLUTIONS = 4
 """So many revolutions together are searched for clipping."""
-_DROP_STEPS = 4.0
-"""A drop is more than so many of the signal's finest steps."""
-_MISSING = 0.25
-"""Part of a revolution's samples that may be missing."""
-_DEAD = 0.05
+DEAD = 0.05
 """A probe that moves less than this part of what it must is dead."""
 _SURE = 3.0
 _BELIEVED = 0.1
 """A probe is called blind if its motion is known to this part of the other's ..."""
 _CLEAR = 4.0
 """... or if it saw so many times the uncertainty when it was calibrated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the last revolution can be trusted, and why not."""
+
+    quality: DataQuality = "good"
+    reason: str = ""
 
 
 class RevolutionJudge:
@@ -53,7 +59,11 @@ class RevolutionJudge:
     """
 
     def __init__(
-        self, probes: tuple[Probe, Probe], *, missing: float = _MISSING, pooled: int = POOLED_REVOLUTIONS
+        self,
+        probes: tuple[Probe, Probe],
+        *,
+        missing: float = REVOLUTION_SHARE,
+        pooled: int = POOLED_REVOLUTIONS,
     ) -> None:
         self._probes = probes
         self._missing = missing
@@ -100,7 +110,7 @@ class RevolutionJudge:
                     f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
                     "check the probe, its cable and driver",
                 )
-            least = max(least_motion_um, _DEAD * float(deviations[1 - column]))
+            least = max(least_motion_um, DEAD * float(deviations[1 - column]))
             if deviations[column] < least:
                 return Verdict(
                     "not_ok",
@@ -114,7 +124,7 @@ class RevolutionJudge:
                         f"{probe.name}: clipped at {clipped:.6g} um; "
                         "check the gap and the range of the converter",
                     )
-            still = _dropped_to(known[:, column])
+            still = dropped_to(known[:, column])
             if still is not None:
                 return Verdict(
                     "not_ok",
@@ -122,19 +132,6 @@ class RevolutionJudge:
                     "samples of a revolution; check the probe, its cable and driver",
                 )
         return Verdict()
-
-
-def _dropped_to(signal: Floats) -> Standstill | None:
-    """The value that a signal dropped to, or came back from, for a part of a revolution; None if it did not.
-
-    A flat crest rests on one value of a coarse converter, too, but is reached in its finest steps.
-    """
-    still = StandstillWatch().take(signal)
-    if still is None:
-        return None
-    steps = np.abs(np.diff(signal))
-    ends = steps[[i for i in (still.first - 1, still.first + still.samples - 1) if 0 <= i < len(steps)]]
-    return still if ends.max(initial=0.0) > _DROP_STEPS * steps[steps > 0].min(initial=np.inf) else None
 
 
 def seen_by(vector: Complexes, axis_deg: float) -> float:
@@ -178,7 +175,7 @@ def blind_probe(
         known_by = _BELIEVED * amplitudes[seeing]
     else:
         known_by = min(known_by, seen_by(healthy, axes_deg[deaf]) / _CLEAR)
-    if doubt > known_by or amplitudes[deaf] > max(_DEAD * amplitudes[seeing], doubt):
+    if doubt > known_by or amplitudes[deaf] > max(DEAD * amplitudes[seeing], doubt):
         return ""
     return (
         f"{probes[deaf].name}: sees no 1X ({amplitudes[deaf]:.2g} um) where {probes[seeing].name} sees "
