@@ -26,7 +26,7 @@ from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.mqtt import MqttPublisher
-from daqsvc.publish.payloads import alarm_payload
+from daqsvc.publish.payloads import alarm_json
 from daqsvc.publish.restore import restore_alarms
 from daqsvc.publish.session import EarlierState
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
@@ -526,7 +526,7 @@ class AlarmService:
         try:
             committed = self.outbox.submit(
                 self._topic(event),
-                lambda sequence: alarm_payload(event, sequence, self.outbox.series).to_json(),
+                lambda sequence: alarm_json(event, sequence, self.outbox.series),
                 retain=True,
             )
         except OutboxError as error:

@@ -176,7 +176,8 @@ class Outbox:
 
         A crash in between only sends them again, with the same numbers.
         """
-        self._put(Batch(sent=list(sequences)))
+        self._refuse_unless_open()
+        self._writer.mark(sequences)
 
     async def pending(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that the broker has not acknowledged, in order, at most ``limit``."""
@@ -284,13 +285,16 @@ class Outbox:
         return await answer
 
     def _put(self, batch: Batch) -> None:
+        self._refuse_unless_open()
+        self._writer.put(batch)
+
+    def _refuse_unless_open(self) -> None:
         if self._ended is None or self._writer.is_closing or self._books.broken:
             state = "is not open yet" if self._ended is None else "is closed"
             raise OutboxError(
                 f"outbox {self._journal.path} {self._books.broken or state}; "
                 "messages can only pass while it is open"
             )
-        self._writer.put(batch)
 
 
 class _Books:

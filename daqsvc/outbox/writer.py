@@ -12,7 +12,7 @@ import logging
 import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
@@ -20,7 +20,7 @@ from daqsvc.outbox.files import FileError, is_corrupt
 from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError, OutboxMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from daqsvc.outbox.journal import Journal
 
@@ -166,6 +166,8 @@ class JournalWriter:
         self._reports = reports
         self._make_way = make_way
         self._work: queue.SimpleQueue[Batch] = queue.SimpleQueue()
+        self._marks: deque[int] = deque()
+        self._expects_marks = False
         self._closing = threading.Event()
         self._crowd = Crowd()
         self._waiting: dict[int, asyncio.Future[int]] = {}
@@ -207,6 +209,13 @@ class JournalWriter:
     def put(self, batch: Batch) -> None:
         """Have something done."""
         self._work.put(batch)
+
+    def mark(self, sequences: Iterable[int]) -> None:
+        """Have messages marked as sent with what is done next, or within `MARK_LINGER_S`; from one thread."""
+        self._marks.extend(sequences)
+        if not self._expects_marks:  # else the thread knows already: to wake it costs more than a mark
+            self._expects_marks = True
+            self._work.put(Batch())
 
     def close(self) -> None:
         """Do what waits, once, and end."""
@@ -319,7 +328,10 @@ class JournalWriter:
             try:
                 batch.add(self._work.get(timeout=linger_s) if patient else self._work.get_nowait())
             except queue.Empty:
-                return
+                break
+        self._expects_marks = False  # first: what comes from here on wakes the thread again
+        while self._marks:
+            batch.sent.append(self._marks.popleft())
 
     def _next(self) -> Batch:
         # Not one long wait: whatever interrupts a thread does so between two steps, and would take with it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import threading
@@ -62,6 +63,7 @@ UNANSWERED: Final = 100
 given up."""
 
 _AT_ONCE = 64
+_FLUSH_S = 0.01
 _MISC_S = 1.0
 _HEAD_BYTES = 64
 """More than the rest of a PUBLISH packet needs: fixed header, packet id, properties that we set."""
@@ -190,6 +192,7 @@ class Connection:
         self._held: Wire | None = None
         self._fd: int | None = None
         self._reads = False
+        self._writing: asyncio.Handle | None = None
         self._misc: asyncio.TimerHandle | None = None
         self._second_s = 0.0
         self._packets_before = 0
@@ -213,7 +216,6 @@ class Connection:
         self._client.on_subscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
         self._client.on_unsubscribe = lambda _client, _data, mid, codes, _told: self._granted(mid, codes)
         self._client.on_socket_register_write = lambda *_: self._write_later()
-        self._client.on_socket_unregister_write = lambda *_: self._write_no_more()
         self._client.on_socket_close = lambda *_: self._detach()
 
     async def open(self, patience_s: Callable[[float], float] | None = None) -> None:
@@ -415,8 +417,13 @@ class Connection:
     async def close(self, timeout_s: float) -> None:
         """Say goodbye to the broker, which drops the last will; let go after ``timeout_s`` at most."""
         if not self._ended.done():
-            self._client.disconnect()
-            await asyncio.wait({self._ended}, timeout=timeout_s)
+            # The library closes the socket with its last word: nothing may wait to be sent before that.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(timeout_s):
+                    while (wire := self._wire) is not None and wire.unsent:  # noqa: ASYNC110  rare, and short
+                        await asyncio.sleep(_FLUSH_S)
+                    self._client.disconnect()
+                    await asyncio.wait({self._ended})
         self.abandon()
 
     def abandon(self) -> None:
@@ -471,8 +478,7 @@ class Connection:
         self._held = wire
         self._fd = wire.fileno()
         self._read_again()
-        if self._client.want_write():
-            self._write_later()
+        self._write_later()
         self._misc = self._loop.call_later(_MISC_S, self._look_after)
 
     def _detach(self) -> None:
@@ -483,7 +489,9 @@ class Connection:
             return
         self._loop.remove_reader(self._fd)
         self._loop.remove_writer(self._fd)
-        self._fd, self._reads = None, False
+        if self._writing is not None:
+            self._writing.cancel()
+        self._fd, self._reads, self._writing = None, False, None
 
     def _shut(self) -> None:
         wire = self._client.socket()
@@ -496,16 +504,29 @@ class Connection:
         self._guarded(self._client.loop_misc)
 
     def _write_later(self) -> None:
-        if self._fd is not None:
-            self._loop.add_writer(self._fd, self._writable)
+        """Send once the event loop has done what it is at, so that packets go together."""
+        if self._fd is not None and self._writing is None:
+            self._writing = self._loop.call_soon(self._write)
 
-    def _write_no_more(self) -> None:
-        if self._fd is not None:
-            self._loop.remove_writer(self._fd)
-
-    def _writable(self) -> None:
+    def _write(self) -> None:
+        self._writing = None
         self._guarded(self._client.loop_write)
-        if not self._client.want_write():
+        wire = self._wire
+        if self._fd is None or wire is None:
+            return
+        try:
+            wire.flush()
+        except OSError:
+            while self._fd is not None:  # the library finds the connection broken, and says so in its way
+                self._guarded(self._client.loop_read)
+            return
+        if wire.unsent:
+            self._loop.add_writer(self._fd, self._write)
+            return
+        self._loop.remove_writer(self._fd)
+        if self._client.want_write():
+            self._write_later()
+        else:
             self._read_again()
 
     def _read_again(self) -> None:
@@ -541,7 +562,7 @@ class Connection:
         now_s = self._loop.time()
         if now_s - self._second_s >= 1.0:
             self._second_s, self._packets_before, self._asked_for = now_s, wire.packets, 0
-        if not self._client.want_write():
+        if not (self._client.want_write() or wire.unsent):
             self._owed_before = wire.packets
         if wire.packets - self._packets_before - self._asked_for > FLOOD_PER_S:
             self._read_no_more()

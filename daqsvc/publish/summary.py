@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
+from pydantic_core import from_json, to_json
 
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.record import Severity  # noqa: TC001 - pydantic reads the annotations
@@ -47,17 +47,6 @@ class SummaryPayload(Stamped):
     alarms: dict[str, StandingPayload]
 
 
-class _AlarmEvent(BaseModel):
-    """What is read of an alarm's message."""
-
-    alarm: str
-    state: AlarmState
-    level: Severity
-    occurrence: str | None
-    time: str
-    message: str
-
-
 class Summary:
     """The alarms of a machine, as the messages that the broker has acknowledged tell them.
 
@@ -82,7 +71,7 @@ class Summary:
         self._topics = topics
         self._prefix = topics.alarm_prefix(machine)
         self._alarms: dict[str, bytes] = {}
-        self._standings: dict[str, StandingPayload] = {}
+        self._standings: dict[str, dict[str, Any]] = {}
         self._rests_on = {alarm: frozenset(services) for alarm, services in rests_on.items()}
         self._resting: dict[str, list[str]] = {}
         for alarm, services in self._rests_on.items():
@@ -90,7 +79,7 @@ class Summary:
                 self._resting.setdefault(service, []).append(alarm)
         self._not_ok: set[str] = set()
         for name in alarms:
-            self._put(name, _untold())
+            self._put(name, _UNTOLD)
 
     def note(self, message: OutboxMessage) -> bool:
         """Take in a message of the outbox; whether it has told something of an alarm of the machine.
@@ -100,24 +89,22 @@ class Summary:
         """
         if not message.topic.startswith(self._prefix):
             return False
-        told = _AlarmEvent.model_validate_json(message.payload)
-        problem: Literal["ON", "OFF"] = "OFF" if told.state in _GONE else "ON"
-        self._put(
-            told.alarm,
-            StandingPayload(
-                problem=None if told.state in _HIDDEN else problem,
-                state=told.state,
-                level=told.level,
-                occurrence=told.occurrence,
-                time=told.time,
-                message=told.message,
-            ),
-        )
-        if told.alarm in self._resting:
-            (self._not_ok.discard if told.state in _GONE else self._not_ok.add)(told.alarm)
-            for alarm in self._resting[told.alarm]:
-                if alarm in self._standings:
-                    self._put(alarm, self._standings[alarm])
+        event = from_json(message.payload)
+        try:
+            alarm, state = str(event["alarm"]), AlarmState(event["state"])
+            standing = {
+                "problem": None if state in _HIDDEN else "OFF" if state in _GONE else "ON",
+                "state": state.value,
+                **{key: event[key] for key in ("level", "occurrence", "time", "message")},
+            }
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"the message on {message.topic} is no alarm's: {error!r}") from error
+        self._put(alarm, standing)
+        if alarm in self._resting:
+            (self._not_ok.discard if state in _GONE else self._not_ok.add)(alarm)
+            for resting in self._resting[alarm]:
+                if resting in self._standings:
+                    self._put(resting, self._standings[resting])
         return True
 
     def to_json(self, clock: Clock) -> bytes:
@@ -126,14 +113,14 @@ class Summary:
         empty = SummaryPayload(**stamp, machine=self._machine, alarms={}).to_json()
         return empty.removesuffix(_NO_ALARMS) + b'"alarms":{' + b",".join(self._alarms.values()) + b"}}"
 
-    def _put(self, name: str, standing: StandingPayload) -> None:
+    def _put(self, name: str, standing: dict[str, Any]) -> None:
+        """Keep how an alarm stands, as a `StandingPayload` is written."""
         self._standings[name] = standing
-        if standing.problem == "OFF" and self._rests_on.get(name, frozenset()) & self._not_ok:
-            standing = standing.model_copy(update={"problem": None})
-        self._alarms[name] = json.dumps(name, ensure_ascii=False).encode() + b":" + standing.to_json()
+        if standing["problem"] == "OFF" and self._rests_on.get(name, frozenset()) & self._not_ok:
+            standing = standing | {"problem": None}
+        self._alarms[name] = to_json(name) + b":" + to_json(standing)
 
 
-def _untold() -> StandingPayload:
-    return StandingPayload(
-        problem="OFF", state=AlarmState.NORMAL, level="normal", occurrence=None, time=None, message=""
-    )
+_UNTOLD: dict[str, Any] = StandingPayload(
+    problem="OFF", state=AlarmState.NORMAL, level="normal", occurrence=None, time=None, message=""
+).model_dump()

@@ -1,5 +1,7 @@
 """A socket that looks at what a broker sends, packet by packet, before the MQTT library does.
 
+What goes to the broker is collected, so that the packets of one turn of the event loop leave together.
+
 The library takes what a broker sends on trust: packets of up to 256 MiB, messages of QoS 2 that it keeps
 until they are released, kinds of packets that nobody asked for. Here, each packet's fixed header (MQTT 5
 and 3.1.1, section 2.1) is read first. What no broker may send ends the connection with a sentence.
@@ -7,6 +9,7 @@ and 3.1.1, section 2.1) is read first. What no broker may send ends the connecti
 
 from __future__ import annotations
 
+import contextlib
 import ssl
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +23,9 @@ CUT_TO: Final = 1 << 18
 """What is left of a larger message of MQTT 3.1.1: too much to be a command, so it is refused as too long."""
 
 _READ_BYTES = 1 << 16
+_UNSENT_BYTES = 1 << 18
+"""Bytes that may wait to be sent before no more are taken."""
+
 _CONNACK, _PUBLISH, _DISCONNECT = 2, 3, 14
 _ANSWERS = {4: "PUBACK", 9: "SUBACK", 11: "UNSUBACK", 13: "PINGRESP"}
 _LENGTH_BYTES = 4
@@ -52,6 +58,8 @@ class Wire:
         self._ready = bytearray()
         self._passing = 0
         self._discarding = 0
+        self._unsent = bytearray()
+        self._failure: OSError | None = None
 
     def recv(self, size: int) -> bytes:
         """Up to ``size`` bytes, none at the end.
@@ -79,17 +87,53 @@ class Wire:
     def _take(self, most: int) -> bytes:
         """What has arrived, at most so much; read in large pieces, for the library asks for single bytes."""
         if self._at == len(self._read):
+            if self._failure is not None:
+                raise self._failure
             self._read, self._at = self._inner.recv(_READ_BYTES), 0
         data = self._read[self._at : self._at + most]
         self._at += len(data)
         return data
 
     def send(self, data: bytes) -> int:
-        """Send what fits now; how many bytes that were."""
-        return self._inner.send(data)
+        """Take bytes that `flush` will send; how many were taken.
+
+        Each call of the system costs more than a message: of a flood, many go together.
+
+        Raises:
+            BlockingIOError: too many wait already.
+        """
+        if len(self._unsent) >= _UNSENT_BYTES:
+            raise BlockingIOError
+        self._unsent += data
+        return len(data)
+
+    @property
+    def unsent(self) -> int:
+        """Bytes that wait to be sent."""
+        return len(self._unsent)
+
+    def flush(self) -> None:
+        """Send what fits now.
+
+        Raises:
+            OSError: the connection is broken; `recv` gives what has arrived until then, and raises it, too.
+        """
+        try:
+            while self._unsent:
+                del self._unsent[: self._inner.send(self._unsent)]
+        except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError):
+            return
+        except OSError as error:
+            self._failure = error
+            with contextlib.suppress(OSError):  # perhaps the broker has said why it ends the connection
+                self._read, self._at = self._read[self._at :] + self._inner.recv(_READ_BYTES), 0
+            raise
 
     def close(self) -> None:
-        """Close the socket."""
+        """Send what still fits, and close the socket."""
+        if self._failure is None:
+            with contextlib.suppress(OSError):
+                self.flush()
         self._inner.close()
 
     def fileno(self) -> int:

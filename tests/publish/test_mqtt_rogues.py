@@ -360,10 +360,10 @@ async def test_nothing_is_read_while_too_many_acknowledgements_wait():
         wire.packets += 1
         made._hold_back(wire)
         assert not made._reads
-        made._writable()
+        made._write()
         assert not made._reads, "some are written, but not all"
         waits = False
-        made._writable()
+        made._write()
         assert made._reads
         wire.packets += OWED
         made._hold_back(wire)

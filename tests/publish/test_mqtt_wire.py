@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 
 import pytest
@@ -133,3 +134,71 @@ def test_a_broker_that_was_away_ended_no_connection_for_a_message():
         assert suspects.lost((topic,), 0.0) is None, "another one each time"
     suspects.settled()
     assert not suspects.careful
+
+
+class Counted:
+    """A socket that counts how often it is asked to send, and may be broken."""
+
+    def __init__(self, inner):
+        self._inner, self.sends, self.error = inner, 0, None
+
+    def __getattr__(self, name):
+        return getattr(self._inner, name)
+
+    def send(self, data):
+        self.sends += 1
+        if self.error is not None:
+            raise self.error
+        return self._inner.send(data)
+
+
+def test_the_packets_of_a_turn_leave_together_and_in_order(pair):
+    near, far = pair
+    counted = Counted(near)
+    wire = Wire(counted, mqtt5=True)
+    assert [wire.send(piece) for piece in (b"one", b"two", b"three")] == [3, 3, 5]
+    assert (counted.sends, wire.unsent) == (0, 11)
+    wire.flush()
+    assert (counted.sends, wire.unsent) == (1, 0)
+    assert far.recv(100) == b"onetwothree"
+
+
+def test_what_the_system_does_not_take_waits_and_of_too_much_nothing_is_taken(pair):
+    near, far = pair
+    wire = Wire(near, mqtt5=True)
+    sent, taken = b"", b""
+    with contextlib.suppress(BlockingIOError):
+        for number in range(1000):
+            sent += bytes([number % 251]) * wire.send(bytes([number % 251]) * 30_000)
+            wire.flush()
+    assert 0 < wire.unsent < 1_000_000, "it has ended before all of them"
+    while wire.unsent:
+        taken += far.recv(1 << 20)
+        wire.flush()
+    while len(taken) < len(sent):
+        taken += far.recv(1 << 20)
+    assert taken == sent
+
+
+def test_a_connection_that_breaks_gives_what_has_arrived_and_then_says_so(pair):
+    """An error of sending is told once; the broker's reason may have come before it."""
+    near, far = pair
+    counted = Counted(near)
+    wire = Wire(counted, mqtt5=True)
+    far.send(CONSENT)
+    wire.send(b"lost")
+    counted.error = OSError("no route to host")
+    with pytest.raises(OSError, match="no route"):
+        wire.flush()
+    assert wire.recv(2) + wire.recv(2) == CONSENT
+    with pytest.raises(OSError, match="no route"):
+        wire.recv(1)
+    wire.close()
+
+
+def test_the_last_word_is_sent_before_the_socket_is_closed(pair):
+    near, far = pair
+    wire = Wire(near, mqtt5=True)
+    wire.send(b"\xe0\x00")
+    wire.close()
+    assert far.recv(10) == b"\xe0\x00"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from daqsvc.acquisition.clock import DrivenClock
-from daqsvc.alarms.events import AlarmEvent, EventKind, Identity
+from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import (
@@ -18,6 +19,7 @@ from daqsvc.publish.payloads import (
     AvailabilityPayload,
     DiagnosisPayload,
     StatusPayload,
+    alarm_json,
     alarm_payload,
     availability_payload,
     diagnosis_payload,
@@ -97,6 +99,31 @@ def test_an_alarm_says_everything_that_the_event_knows():
     assert cause["evidence"] == {"F1/N": 17.5}
     assert cause["units"] == {"rms": "um"}
     assert (cause["decision"], cause["revolutions"], cause["monotonic_ns"]) == ("F1", 31.25, 4_000_000_000)
+
+
+def test_what_goes_to_the_disk_is_the_payload_though_nothing_validates_it():
+    doubts = (Doubt("levels", "not_ok", not_ok=True, reason="dead \N{MICRO SIGN}", sensors=("probe-x",)),)
+    held = replace(
+        EVENT,
+        holds=(AlarmState.SHELVED, AlarmState.SUPPRESSED),
+        to_state=AlarmState.SHELVED,
+        covered=AlarmState.ACTIVE_UNACKNOWLEDGED,
+        shelved_until_wall_ns=1_800_000_000_000_000_000,
+        by='A. "B"',
+        doubts=doubts,
+        cause=replace(
+            CAUSE,
+            first_index=np.int64(3),
+            revolutions=np.float32(1.5),
+            missing_share=np.float64(0.25),
+            bounds={"rms": (np.float64(1.0), math.inf)},
+            thresholds={"rms.alert": 4},
+            changed=np.True_,
+        ),
+    )
+    bare = replace(EVENT, occurrence=None, cause=replace(CAUSE, statistics={}, revolutions=None))
+    for event in (EVENT, held, bare):
+        assert alarm_json(event, 42, "series") == alarm_payload(event, 42, "series").to_json()
 
 
 def test_what_json_cannot_say_is_null():
