@@ -190,6 +190,8 @@ class CanDriver:
         self._assemblers = {s.name: assembler_of(s, port) for s in port.streams}
         self._open_source = open_source or _open_source
         self._said: set[str] = set()
+        self._is_fresh = False
+        """Whether nothing has come since the bus was opened: what its controller was then, nobody knows."""
         self._recorder: CanRecorder | None = None
 
     @property
@@ -214,7 +216,7 @@ class CanDriver:
     async def _attempt(self) -> Attempt:
         source = await self._open()
         self.link.up()
-        self.counters.controller_state = "error-active"
+        self._is_fresh = True
         before = self._frames
         reason = await self._receive(source)
         return Attempt(present=True, useful=self._frames > before, reason=reason)
@@ -265,9 +267,13 @@ class CanDriver:
             )
         if found.errors is not None:
             self._take_errors(found.errors)
-        elif found.data_frames and self.counters.controller_state == "bus-off":
+        elif found.data_frames and (
+            self.counters.controller_state == "bus-off"
+            or (self._is_fresh and self.counters.controller_state != "error-active")
+        ):
             # Whoever receives is on the bus again, even if the frame that said so was missed.
             self._take_errors(ErrorCounts(state="error-active"))
+        self._is_fresh &= not (found.errors or found.data_frames)
         for name, count in found.unknown.items():
             self._take_unknown(name, count)
         for stream, (count, length) in found.wrong_length.items():

@@ -100,6 +100,24 @@ async def test_bus_off_and_restart_in_one_batch_are_one_loss() -> None:
     assert (driver.link.state, driver.link.losses) == ("up", 1)
 
 
+async def test_a_bus_that_is_opened_again_keeps_its_state_until_something_comes(bus: StandInBus) -> None:
+    driver, device = driver_on(bus, []), CountingDevice(3, 3000.0)
+    passive = frame_bytes(ERROR | 0x4, bytes([0, 0x30, 0, 0, 0, 0, 0, 0]))
+    async with running(driver):
+        bus.send([sample_frame(device.frame()), passive])
+        await until(lambda: driver.counters.controller_state == "error-passive")
+        bus.unplug()
+        await until(lambda: driver.link.state == "down")
+        bus.plug_in()
+        await until(lambda: driver.link.state == "up")
+        assert driver.counters.controller_state == "error-passive", "an adapter that is silent says nothing"
+        bus.send([sample_frame(device.frame())])
+        await until(lambda: driver.counters.controller_state == "error-active")
+        bus.send([passive, sample_frame(device.frame())])
+        await until(lambda: driver.streams["s"][0].frames_received == 3)
+        assert driver.counters.controller_state == "error-passive", "frames alone do not make it active again"
+
+
 async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
