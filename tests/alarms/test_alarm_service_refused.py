@@ -140,3 +140,21 @@ async def test_an_alarm_that_stands_still_stands_after_damage_of_the_log(tmp_pat
     assert await states(desk) == stood
     assert desk.figures()["latched"] == 1
     await desk.close(1.0)
+
+
+async def test_ids_of_commands_that_are_gone_at_the_start_are_an_alarm(tmp_path) -> None:
+    async def damage():
+        desk = AlarmService(IDENTITY, [], tmp_path, CLOCK, None)
+        await desk.open()
+        try:
+            await desk.resume({})
+            desk.tick()
+            status = desk.manager.alarms.get("store/damage")
+            return None if status is None or not status.state.is_active else status.message
+        finally:
+            await desk.settle(5.0)
+            await desk.close(1.0)
+
+    assert await damage() is None, "a new store is sound"
+    (tmp_path / "command-ids").write_bytes(b"\xff" * 10)
+    assert "were damaged" in await damage()
