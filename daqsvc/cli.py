@@ -17,7 +17,7 @@ from daqsvc import kernel_cache
 from daqsvc.commands.alarm_commands import alarm_verbs
 from daqsvc.commands.alarms import AlarmsCommand
 from daqsvc.commands.analyze import AnalyzeCommand
-from daqsvc.commands.arguments import ArgumentParser
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
 from daqsvc.commands.calibrate import CalibrateCommand
 from daqsvc.commands.detectability import DetectabilityCommand
 from daqsvc.commands.example import ExampleCommand
@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
 
 COMMANDS = "daqsvc.commands"
-
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_BAD_FILE = 2
 
 
 class Command(Protocol):
@@ -71,7 +67,7 @@ class CheckCommand:
         """See `Command.run`."""
         machine = load(arguments.file)
         if machine is None:
-            return EXIT_BAD_FILE
+            return EXIT_USAGE
         kernel_cache.prepare()
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
@@ -81,7 +77,7 @@ class CheckCommand:
             check_files(machine)
         except AssemblyError as error:
             print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-            return EXIT_BAD_FILE
+            return EXIT_USAGE
         print(describe(machine))  # noqa: T201 - this is what the verb is for
         return EXIT_OK
 

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import ArgumentParser
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_USAGE, ArgumentParser
 from daqsvc.confined.small_toml import TomlFileError, read_toml
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from sim_hw.sim_command_order import SimNode
     from sim_hw.sim_command_signals import Signals
 
-EXIT_FAILED = 1
-EXIT_BAD_FILE = 2
 SCENARIO = "paper"
 OF_RECORDINGS = ("map", "fs", "max_memory")
 OF_PLANTS = ("snr_db",)
@@ -105,7 +103,7 @@ class SimCommand:
             return asyncio.run(_simulate(arguments))
         except MachineFileError as error:
             _say(str(error))
-            return EXIT_BAD_FILE
+            return EXIT_USAGE
         except (
             AssemblyError,
             LayoutError,

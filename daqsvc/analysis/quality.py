@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from daqsvc.analysis.setup import RefusedError
 from daqsvc.dsp.quality.clipped import clipped_at
+from daqsvc.recording.errors import RefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -8,6 +8,7 @@ import pwd
 import sys
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.option_types import alarm_id, duration, one_line
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 LEAST_ID = 4
 """Letters that the beginning of an occurrence's id must have to be one."""
-
-EXIT_OK, EXIT_FAILED, EXIT_BAD_FILE = 0, 1, 2
 
 
 class NoSuchAlarmError(Exception):
@@ -94,7 +93,7 @@ class AlarmVerb:
             )
             outcome = ask(store, request)
         except BadFileError:
-            return EXIT_BAD_FILE
+            return EXIT_USAGE
         except (StoreNotFoundError, NoSuchAlarmError, OutboxError, ControlError) as error:
             print(f"daqsvc {name}: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED

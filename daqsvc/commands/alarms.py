@@ -7,6 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.option_types import count
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 HISTORY = 20
 SLOW_DISK_S = 0.5
 """Events that ``--history`` shows if nobody says how many."""
-
-EXIT_OK, EXIT_FAILED, EXIT_BAD_FILE = 0, 1, 2
 
 
 class AlarmsCommand:
@@ -78,7 +77,7 @@ class AlarmsCommand:
                     # What goes wrong goes to stderr.
                     print(f"daqsvc alarms: {doubt}", file=sys.stderr)  # noqa: T201
         except BadFileError:
-            return EXIT_BAD_FILE
+            return EXIT_USAGE
         except (StoreNotFoundError, OutboxError) as error:
             print(f"daqsvc alarms: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED

@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from daqsvc.commands.analyze_arguments import (
-    add_machine_arguments,
-    add_output_arguments,
-    add_rotor_arguments,
-    misuse,
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.recording_options import (
+    add_analyze_options,
+    analyze_misuse,
+    by_bearing,
+    by_orders,
+    split_files,
 )
-from daqsvc.commands.analyze_bearing import add_bearing_arguments, bearing_analyst, bearing_misuse, by_bearing
-from daqsvc.commands.analyze_orders import add_order_arguments, by_orders, order_analyst, order_misuse
-from daqsvc.commands.option_types import SpeedOption
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable, Iterable, Iterator
 
-    from daqsvc.analysis.many import Analyst, Outcome
-    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.offline.runner import Outcome, Runner
     from daqsvc.settings import MachineFile
 
     Load: TypeAlias = Callable[[Path], MachineFile | None]
-
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
-EXIT_REFUSED = 3
 
 _FEW_PER_PROCESS = 3
 """A process of its own costs as much as so many short recordings."""
@@ -71,26 +65,12 @@ class AnalyzeCommand:
             "Exit code: 0 if every recording was judged, 3 if one could not be (its line says why), 2 for "
             "wrong usage, 1 if something else failed."
         )
-        parser.add_argument(
-            "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
-        )
-        add_rotor_arguments(parser)
-        add_order_arguments(parser)
-        add_bearing_arguments(parser)
-        add_machine_arguments(parser)
-        add_output_arguments(parser)
+        add_analyze_options(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
-        machine = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
-        recordings = arguments.files[1:] if machine is not None else arguments.files
-        if by_bearing(arguments):
-            wrong, make = bearing_misuse(arguments, machine), bearing_analyst
-        elif by_orders(arguments):
-            wrong, make = order_misuse(arguments, machine), order_analyst
-        else:
-            wrong, make = misuse(arguments, machine, recordings), None
-        if wrong:
+        machine, recordings = split_files(arguments)
+        if wrong := analyze_misuse(arguments, machine, recordings):
             self._parser.error(wrong)
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
@@ -98,112 +78,81 @@ class AnalyzeCommand:
         self._prepare_kernel_cache()
         if arguments.plot is not None and (wrong := _cannot_plot(arguments.plot)):
             return _fail(wrong, EXIT_FAILED)
-        if make is not None:
-            analyst = self._accelerometers(make, arguments)
-        else:
-            analyst = self._rotor(arguments) if machine is None else self._machine(machine, arguments)
-        if analyst is None:
-            return EXIT_USAGE
-        from daqsvc.analysis.many import WorkerLostError  # noqa: PLC0415
+        loaded = None
+        if machine is not None:
+            loaded = self._load(machine)
+            if loaded is None:
+                return EXIT_USAGE
+        from daqsvc.offline.runner import WorkerLostError  # noqa: PLC0415
 
+        try:
+            runner = _by_options(arguments) if machine is None else _by_file(machine, loaded, arguments)
+            runner.prepare()
+        except (OSError, ValueError) as error:
+            self._parser.error(str(error))
         figures = _figure_names(recordings, arguments.plot)
         processes = _processes(arguments.jobs, len(recordings))
         try:
-            return _tell(_outcomes(analyst, recordings, figures, processes), as_json=arguments.json)
+            return _tell(_outcomes(runner, recordings, figures, processes), as_json=arguments.json)
         except WorkerLostError as error:
             return _fail(str(error), EXIT_FAILED)
 
-    def _rotor(self, arguments: argparse.Namespace) -> Analyst | None:
-        """An analyst by the options; None after their error has been printed."""
-        from daqsvc.analysis.analyst import RotorAnalyst  # noqa: PLC0415
-        from daqsvc.analysis.setup import Keyphasor, RotorSetup  # noqa: PLC0415
-        from daqsvc.rotor.laval import LavalRotor  # noqa: PLC0415
-        from daqsvc.rotor.synchronous.departure import threshold_for  # noqa: PLC0415
-        from daqsvc.rotor.synchronous.watch import WatchRules  # noqa: PLC0415
 
-        keyphasor, speed = arguments.keyphasor, arguments.speed_rpm or SpeedOption(None)
-        try:
-            rules = WatchRules(
-                calibrate_revolutions=arguments.calibrate_revs,
-                false_alarms_per_1000_rev=arguments.false_alarms_per_1000_rev,
-                retry=False,
-            )
-            threshold_for(rules.false_alarms_per_1000_rev)
-            calibrations: tuple[Calibration, ...] = ()
-            if arguments.calibration is not None:
-                from daqsvc.rotor.calibration.file import load_healthy  # noqa: PLC0415
+def _by_file(machine: Path, loaded: MachineFile | None, arguments: argparse.Namespace) -> Runner:
+    """Judges by a machine file, which has been read here, and is read once more in each other process."""
+    from daqsvc.offline.machine_options import recording_options  # noqa: PLC0415
+    from daqsvc.offline.runner import Runner  # noqa: PLC0415
+    from daqsvc.settings import load_machine_file  # noqa: PLC0415
 
-                rotor, calibrations = load_healthy(arguments.calibration, speed.rpm, arguments.clearance_um)
-            else:
-                rotor = LavalRotor(
-                    natural_frequency_hz=arguments.natural_frequency_hz,
-                    damping_ratio=arguments.damping_ratio,
-                    natural_frequency_tolerance=arguments.natural_frequency_tolerance / 100.0,
-                    damping_tolerance=arguments.damping_tolerance / 100.0,
-                    clearance_um=arguments.clearance_um,
-                    static_sag_um=arguments.static_sag_um,
-                )
-            setup = RotorSetup(
-                probes=arguments.probes,
-                rotor=rotor,
-                speed_rpm=speed.rpm,
-                speed_step_rpm=speed.step_rpm,
-                unit=arguments.unit or "um",
-                keyphasor=None if keyphasor is None else Keyphasor(keyphasor, arguments.keyphasor_threshold),
-                follow_orbit=speed.orbit or arguments.follow_orbit,
-                rules=rules,
-                calibrations=calibrations,
-                ac_coupled=arguments.ac_coupled,
-                channels=arguments.map,
-                rate_hz=arguments.fs,
-            )
-        except (OSError, ValueError) as error:
-            self._parser.error(str(error))
-        return RotorAnalyst(setup)
+    options = recording_options(arguments, calibration=arguments.calibration)
+    return Runner(partial(load_machine_file, machine), options, machine=loaded)
 
-    def _accelerometers(
-        self, make: Callable[[argparse.Namespace], Analyst], arguments: argparse.Namespace
-    ) -> Analyst | None:
-        """An analyst of accelerometers; None after its error has been printed."""
-        try:
-            return make(arguments)
-        except ValueError as error:
-            self._parser.error(str(error))
 
-    def _machine(self, machine: str, arguments: argparse.Namespace) -> Analyst | None:
-        """An analyst by a machine file; None after its errors have been printed."""
-        loaded = self._load(Path(machine))
-        if loaded is None:
-            return None
-        from daqsvc.analysis.machine import MachineAnalyst  # noqa: PLC0415
+def _by_options(arguments: argparse.Namespace) -> Runner:
+    """Judges by what the options say.
 
-        try:
-            analyst = MachineAnalyst(
-                machine=machine,
-                channels=arguments.map,
-                rate_hz=arguments.fs,
-                unit=arguments.unit,
-                calibration=arguments.calibration,
-                read=[loaded],
-            )
-            analyst.check()
-        except (OSError, ValueError) as error:
-            self._parser.error(str(error))
-        return analyst
+    Raises:
+        ValueError: they contradict each other.
+    """
+    from daqsvc.offline import machine_options as options  # noqa: PLC0415
+    from daqsvc.offline.orders import order_detectors  # noqa: PLC0415
+    from daqsvc.offline.runner import Runner  # noqa: PLC0415
+
+    # Without the verb itself, which does not go to another process.
+    told = argparse.Namespace(**{k: v for k, v in vars(arguments).items() if k != "command"})
+    if by_bearing(told):
+        healthy = options.recording_options(
+            told,
+            in_memory=True,
+            patterns=True,
+            healthy=told.baseline,
+            healthy_channels=told.baseline_map,
+            healthy_rate_hz=told.baseline_fs,
+        )
+        return Runner(partial(options.bearing_machine, told), healthy)
+    if by_orders(told):
+        healthy = options.recording_options(told, in_memory=True, healthy=told.baseline)
+        detectors = partial(order_detectors, told.false_alarm_probability)
+        return Runner(partial(options.accelerometer_machine, told), healthy, detectors)
+    step_rpm = 0.0 if told.speed_rpm is None else told.speed_rpm.step_rpm
+    rotor = options.recording_options(
+        told, in_memory=True, calibration=told.calibration, speed_step_rpm=step_rpm
+    )
+    return Runner(partial(options.rotor_machine, told), rotor)
 
 
 def _outcomes(
-    analyst: Analyst, recordings: list[str], figures: list[str | None], processes: int
+    runner: Runner, recordings: list[str], figures: list[str | None], processes: int
 ) -> Iterator[Outcome]:
-    from daqsvc.analysis.many import judge_all  # noqa: PLC0415
-    from daqsvc.analysis.progress import progress_bar  # noqa: PLC0415
+    from daqsvc.offline.progress import progress_bar  # noqa: PLC0415
+    from daqsvc.offline.runner import judge_all  # noqa: PLC0415
 
     if len(recordings) == 1:
         with progress_bar(Path(recordings[0]).name) as bar:
-            outcome = analyst.judge(recordings[0], figures[0], bar.update)
+            outcome = runner.judge(recordings[0], figures[0], bar.update)
         yield outcome
         return
-    found = judge_all(analyst, recordings, figures, processes)
+    found = judge_all(runner, recordings, figures, processes)
     if sys.stdout.isatty():
         yield from found  # each line tells how far it is
         return

@@ -1,4 +1,7 @@
-"""The parser of the command line: what is wrong is said in one line, the usage only where it is asked for."""
+"""The parser of the command line, and the exit codes of its verbs.
+
+What is wrong is said in one line, the usage only where it is asked for.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,18 @@ import argparse
 import re
 from typing import Any, NoReturn
 
-EXIT_BAD_ARGUMENTS = 2
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+"""Wrong arguments, or a machine file that cannot be used."""
+EXIT_REFUSED = 3
+"""Of `analyze` and `calibrate`: a recording cannot be judged."""
+EXIT_LOST = 3
+"""Of `run`: something without which the service is useless was lost while it ran."""
+EXIT_HUNG = 4
+"""Of `run`: something hung while the service stopped."""
+EXIT_STUCK = 5
+"""Of `run`: the event loop stood still."""
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -19,4 +33,4 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
-        self.exit(EXIT_BAD_ARGUMENTS, f"{self.prog}: {message}; see {self.prog} --help\n")
+        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")

@@ -6,34 +6,29 @@ import asyncio
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.calibrate_arguments import add_calibrate_arguments, misuse
-from daqsvc.commands.calibrate_bearing import (
-    add_bearing_arguments,
-    bearing_misuse,
-    by_bearing,
-    calibrate_bearings,
-    shared_misuse,
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.recording_options import (
+    add_calibrate_options,
+    bearing_recording_misuse,
+    calibrate_misuse,
+    calibrates_bearing,
+    split_files,
 )
-from daqsvc.commands.option_types import SpeedOption
 from daqsvc.commands.signals import signals_to_end
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable, Sequence
+    from pathlib import Path
 
-    from daqsvc.analysis.calibrating import CalibrationSetup
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.offline.runner import Runner
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.file import CalibrationRecord
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
-
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
-EXIT_REFUSED = 3
 
 
 class CalibrateCommand:
@@ -66,102 +61,124 @@ class CalibrateCommand:
             "Exit code: 0 if the calibration was made, 3 if the data were refused (one line says why), 2 for "
             "wrong usage, 1 if something else failed."
         )
-        add_calibrate_arguments(parser)
-        add_bearing_arguments(parser)
+        add_calibrate_options(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
-        from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - pydantic
         from daqsvc.recording.recording import set_memory  # noqa: PLC0415 - each verb imports what it needs
 
         set_memory(arguments.max_memory)
         self._prepare_kernel_cache()
-        machine_path = arguments.files[0] if arguments.files[0].lower().endswith(".toml") else None
-        recordings = arguments.files[1:] if machine_path is not None else arguments.files
-        if by_bearing(arguments):
-            return self._bearings(recordings, arguments, bearing_misuse(arguments, machine_path, recordings))
-        if wrong := misuse(arguments, machine_path, recordings):
+        path, recordings = split_files(arguments)
+        if wrong := calibrate_misuse(arguments, path, recordings):
             self._parser.error(wrong)
-        self._need_directory(arguments)
+        if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
+            self._parser.error(f"--out {arguments.out}: there is no such directory; make it first")
         machine = None
-        if machine_path is not None:
-            machine = self._load(Path(machine_path))
+        if path is not None:
+            machine = self._load(path)
             if machine is None:
                 return EXIT_USAGE
-            if machine.pipeline.table(RotorSynchronous) is None:
-                return self._without_rotor(recordings, arguments, machine)
-        from daqsvc.analysis.setup import RefusedError  # noqa: PLC0415
-        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
+        from daqsvc.bearing.identify import NotIdentifiableError  # noqa: PLC0415
+        from daqsvc.recording.errors import RecordingError, RefusedError  # noqa: PLC0415
         from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415
 
         try:
-            if machine is None:
-                record = self._from_options(recordings, arguments)
-            elif arguments.live:
-                record = _live(machine, arguments)
-            else:
-                record = self._from_machine(machine, recordings, arguments)
-        except (RefusedError, RecordingError, NotCalibratableError) as error:
+            if self._of_bearings(machine, recordings, arguments):
+                return _keep_bearings(self._calibrated_bearings(machine, recordings[0], arguments), arguments)
+            if machine is not None and arguments.live:
+                return _keep(_live(machine, arguments), arguments)
+            return _keep(self._calibrated_rotor(machine, recordings, arguments), arguments)
+        except (RefusedError, RecordingError, NotCalibratableError, NotIdentifiableError) as error:
             return _refuse(str(error), as_json=arguments.json)
+        except ValueError as error:
+            self._parser.error(str(error))
         except _FailedError as error:
             return _fail(str(error))
-        return _keep(record, arguments)
 
-    def _need_directory(self, arguments: argparse.Namespace) -> None:
-        if arguments.out is not None and not arguments.out.absolute().parent.is_dir():
-            self._parser.error(f"--out {arguments.out}: there is no such directory; make it first")
-
-    def _without_rotor(
-        self, recordings: Sequence[str], arguments: argparse.Namespace, machine: MachineFile
-    ) -> int:
+    def _of_bearings(
+        self, machine: MachineFile | None, recordings: Sequence[str], arguments: argparse.Namespace
+    ) -> bool:
+        """Whether the bearings are calibrated; a rotor comes first."""
+        if machine is None:
+            return calibrates_bearing(arguments)
         from daqsvc.detectors.bearing.settings import Bearing  # noqa: PLC0415 - brings pydantic
+        from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - likewise
 
+        if machine.pipeline.table(RotorSynchronous) is not None:
+            return False
         if machine.pipeline.table(Bearing) is None:
+            from daqsvc.offline.runner import calibrated_tables  # noqa: PLC0415
+
             self._parser.error(
-                f"{machine.path} has neither [pipeline.rotor_synchronous] nor [pipeline.bearing] to be "
-                "calibrated; add one"
+                f"{machine.path} has neither {' nor '.join(calibrated_tables())} to be calibrated; add one"
             )
-        return self._bearings(recordings, arguments, shared_misuse(arguments, recordings), machine)
-
-    def _bearings(
-        self,
-        recordings: Sequence[str],
-        arguments: argparse.Namespace,
-        wrong: str,
-        machine: MachineFile | None = None,
-    ) -> int:
-        if wrong:
+        if wrong := bearing_recording_misuse(arguments, recordings):
             self._parser.error(wrong)
-        self._need_directory(arguments)
+        return True
+
+    def _runner(
+        self, make: Callable[[argparse.Namespace], MachineFile], machine: MachineFile | None, arguments: Any
+    ) -> Runner:
+        """What reads the recordings of the machine file, or of one that the options make.
+
+        Args:
+            make: makes it of the options.
+            machine: the machine file on disk, if there is one.
+            arguments: the options.
+        """
+        from daqsvc.offline.machine_options import recording_options  # noqa: PLC0415
+        from daqsvc.offline.runner import Runner  # noqa: PLC0415
+
+        patterns = calibrates_bearing(arguments)
+        given = recording_options(arguments, in_memory=machine is None, patterns=patterns)
         try:
-            return calibrate_bearings(recordings[0], arguments, machine)
+            runner = Runner(lambda: make(arguments), given, machine=machine and _uncalibrated(machine))
+            runner.prepare()
         except ValueError as error:
             self._parser.error(str(error))
+        return runner
 
-    def _from_options(self, recordings: Sequence[str], arguments: argparse.Namespace) -> CalibrationRecord:
-        from daqsvc.analysis.calibrating import calibrate_recordings  # noqa: PLC0415
-        from daqsvc.recording.recording import load_recording  # noqa: PLC0415
-
-        try:
-            setup = _setup(arguments)
-        except ValueError as error:
-            self._parser.error(str(error))
-        loaded = [load_recording(path, setup.taken.columns, arguments.fs) for path in recordings]
-        return calibrate_recordings(_with_notes_said(loaded), setup)
-
-    def _from_machine(
-        self, machine: MachineFile, recordings: Sequence[str], arguments: argparse.Namespace
+    def _calibrated_rotor(
+        self, machine: MachineFile | None, recordings: Sequence[str], arguments: argparse.Namespace
     ) -> CalibrationRecord:
-        from daqsvc.analysis.calibrating import calibrate_recordings  # noqa: PLC0415
-        from daqsvc.analysis.calibrating_machine import MachineRecordings  # noqa: PLC0415
+        from daqsvc.detectors.rotor_synchronous.calibrating import calibrate_recordings  # noqa: PLC0415
+        from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor  # noqa: PLC0415
+        from daqsvc.offline.machine_options import rotor_machine  # noqa: PLC0415
 
-        of_machine = MachineRecordings(machine, arguments.map, arguments.fs, arguments.unit)
-        try:
-            setup = of_machine.setup(arguments.sweep_rpm)
-        except ValueError as error:
-            self._parser.error(str(error))
-        loaded = [of_machine.load(path) for path in recordings]
-        return calibrate_recordings(_with_notes_said(loaded), setup)
+        runner = self._runner(rotor_machine, machine, arguments)
+        rotor = next(one for one in runner.detectors.values() if isinstance(one, RecordedRotor))
+        loaded = [runner.load(path, only=rotor.sensors) for path in recordings]
+        return calibrate_recordings(
+            _with_notes_said(loaded),
+            rotor.setup,
+            rotor_given=machine is not None or arguments.natural_frequency_hz is not None,
+            sweep_rpm=arguments.sweep_rpm,
+        )
+
+    def _calibrated_bearings(
+        self, machine: MachineFile | None, recording: str, arguments: argparse.Namespace
+    ) -> BearingBaseline:
+        from daqsvc.detectors.bearing.calibrating import calibrate_bearings  # noqa: PLC0415
+        from daqsvc.detectors.bearing.recorded import RecordedBearings  # noqa: PLC0415
+        from daqsvc.offline.machine_options import bearing_machine  # noqa: PLC0415
+
+        runner = self._runner(bearing_machine, machine, arguments)
+        (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
+        loaded = runner.load(recording, only=bearings.sensors)
+        return calibrate_bearings(runner.machine, bearings.given, loaded, together=machine is None)
+
+
+def _uncalibrated(machine: MachineFile) -> MachineFile:
+    """The machine without the calibrations that its tables name: they are about to be made."""
+    from daqsvc.settings.plugins import configured  # noqa: PLC0415
+
+    update = {
+        key: given.model_copy(update={"calibration": None})
+        for key, _, given in configured(machine.pipeline)
+        if "calibration" in type(given).model_fields
+    }
+    return machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=update)})
 
 
 def _with_notes_said(loaded: Sequence[Recording]) -> Sequence[Recording]:
@@ -172,48 +189,11 @@ def _with_notes_said(loaded: Sequence[Recording]) -> Sequence[Recording]:
     return loaded
 
 
-def _setup(arguments: argparse.Namespace) -> CalibrationSetup:
-    """What the options say.
-
-    Raises:
-        ValueError: they contradict each other.
-    """
-    from daqsvc.analysis.calibrating import CalibrationSetup  # noqa: PLC0415
-    from daqsvc.analysis.setup import Keyphasor, RotorSetup  # noqa: PLC0415
-    from daqsvc.rotor.laval import LavalRotor  # noqa: PLC0415
-
-    speed, sweep_rpm = arguments.speed_rpm or SpeedOption(None), arguments.sweep_rpm
-    given = arguments.natural_frequency_hz is not None
-    rotor = LavalRotor(
-        natural_frequency_hz=arguments.natural_frequency_hz if given else 1.0,
-        damping_ratio=arguments.damping_ratio if given else 0.1,
-        natural_frequency_tolerance=arguments.natural_frequency_tolerance / 100.0,
-        damping_tolerance=arguments.damping_tolerance / 100.0,
-        clearance_um=arguments.clearance_um,
-        static_sag_um=arguments.static_sag_um,
-    )
-    keyphasor = None
-    if arguments.keyphasor is not None:
-        keyphasor = Keyphasor(arguments.keyphasor, arguments.keyphasor_threshold)
-    taken = RotorSetup(
-        probes=arguments.probes,
-        rotor=rotor,
-        speed_rpm=sweep_rpm[1] if speed.rpm is None and sweep_rpm is not None else speed.rpm,
-        unit=arguments.unit or "um",
-        keyphasor=keyphasor,
-        follow_orbit=speed.orbit,
-        ac_coupled=arguments.ac_coupled,
-        channels=arguments.map,
-        rate_hz=arguments.fs,
-    )
-    return CalibrationSetup(taken=taken, rotor_given=given, sweep_rpm=sweep_rpm)
-
-
 def _live(machine: MachineFile, arguments: argparse.Namespace) -> CalibrationRecord:
     """Listen to the machine; the terminal sees the revolutions go by."""
     from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
-    from daqsvc.analysis.progress import progress_bar  # noqa: PLC0415
-    from daqsvc.commands.calibrate_live import calibrate_live, default_timeout_s  # noqa: PLC0415
+    from daqsvc.offline.calibrate_live import calibrate_live, default_timeout_s  # noqa: PLC0415
+    from daqsvc.offline.progress import progress_bar  # noqa: PLC0415
     from daqsvc.rotor.calibration.file import CalibrationRecord  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
@@ -271,6 +251,27 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
             return _fail(str(error))
         if not arguments.json:
             said += f"\nwritten to {arguments.out}"
+    print(said, flush=True)  # noqa: T201 - this is what the verb is for
+    return EXIT_OK
+
+
+def _keep_bearings(found: BearingBaseline, arguments: argparse.Namespace) -> int:
+    """Write the file first, then say what was found."""
+    from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
+    from daqsvc.bearing.identify_file import BaselineFileError, save_bearing_baseline  # noqa: PLC0415
+    from daqsvc.commands.calibrate_report import bearings_as_json, bearings_as_text  # noqa: PLC0415
+
+    found = replace(found, written=iso_utc(SystemClock().wall_ns()))
+    if arguments.out is not None:
+        try:
+            save_bearing_baseline(found, arguments.out)
+        except BaselineFileError as error:
+            return _fail(str(error))
+    said = (
+        json.dumps(bearings_as_json(found, arguments.out))
+        if arguments.json
+        else bearings_as_text(found, arguments.out)
+    )
     print(said, flush=True)  # noqa: T201 - this is what the verb is for
     return EXIT_OK
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.analysis.result import calibration_json, finite
+from daqsvc.detectors.shaft.verdict import calibration_json
+from daqsvc.diagnosis.recorded import finite
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from daqsvc.bearing.identify_baseline import BearingBaseline
     from daqsvc.rotor.calibration.file import CalibrationRecord
     from daqsvc.rotor.calibration.run_up_fit import RunUpFit
     from daqsvc.rotor.synchronous.baseline import Calibration
@@ -56,6 +58,50 @@ def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path 
         }
     )
     return found
+
+
+def bearings_as_json(found: BearingBaseline, out: object) -> dict[str, Any]:
+    """The healthy state of bearings, and where it was written to."""
+    return {
+        "refused": None,
+        "source": found.source,
+        "written_to": None if out is None else str(out),
+        "rate_hz": found.rate_hz,
+        "speed_rpm": found.speed_rpm,
+        "models": [
+            {
+                "channels": list(channels),
+                "order": residual.model.order,
+                "spectral_radius": residual.model.spectral_radius,
+                "whiteness_p": residual.model.whiteness.p_value,
+                "predictable": residual.model.whiteness.predictable,
+                "windows": residual.windows,
+                "window_s": residual.window_samples / found.rate_hz,
+                "spread_db": float(residual.spread_db[0]),
+            }
+            for channels, residual in found.residuals.items()
+        ],
+        "lines": {
+            channel: {part: {"z": e.z, "size": e.depth} for part, e in race.evidence.items()}
+            for channel, race in found.races.items()
+        },
+    }
+
+
+def bearings_as_text(found: BearingBaseline, out: object) -> str:
+    """The same in lines for a person."""
+    lines = [f"{found.source}: {found.rate_hz:g} Hz, {found.speed_rpm:g} rpm"]
+    for channels, residual in found.residuals.items():
+        model = residual.model
+        lines.append(
+            f"{' and '.join(channels)}: autoregressive of order {model.order}, stable (largest pole "
+            f"{model.spectral_radius:.4f}); {100.0 * model.whiteness.predictable:.2g} % of the innovations "
+            f"can still be predicted; {residual.windows} windows of "
+            f"{residual.window_samples / found.rate_hz:.3g} s differ by {residual.spread_db[0]:.2f} dB"
+        )
+    if out is not None:
+        lines.append(f"written to {out}")
+    return "\n  ".join(lines)
 
 
 def _run_up_json(fit: RunUpFit, asked: Sequence[float] | None) -> dict[str, Any]:

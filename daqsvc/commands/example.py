@@ -7,13 +7,12 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
+
 if TYPE_CHECKING:
     import argparse
     from importlib.resources.abc import Traversable
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_BAD_NAME = 2
 
 _FOLDERS = {"machines": "machine files", "scenarios": "scenarios for daqsvc sim"}
 _DEVICES = "../devices/"
@@ -93,7 +92,7 @@ class ExampleCommand:
             from daqsvc.settings.problems import choice  # noqa: PLC0415
 
             print(f"daqsvc example: there is no {name!r}; {choice(name, known)}", file=sys.stderr)  # noqa: T201
-            return EXIT_BAD_NAME
+            return EXIT_USAGE
         if arguments.out is None:
             sys.stdout.write(known[name].text)
             return EXIT_OK

@@ -18,17 +18,14 @@ import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from daqsvc.commands.arguments import EXIT_HUNG, EXIT_STUCK
+
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
 log = logging.getLogger(__name__)
 
-EXIT_HUNG = 4
-"""Something hung while the service stopped."""
-
-EXIT_STUCK = 5
-"""The event loop stood still."""
 
 USER_SIGNALS = (signal.SIGUSR1, signal.SIGUSR2)
 """They would end the process, and mean nothing to it."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc import kernel_cache
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
 from daqsvc.commands.option_types import positive
 from daqsvc.commands.signals import signals_to_end
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
     from drivers.base import Driver
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_MISUSED = 2
 
 ENDINGS = (".blf", ".asc", ".log")
 
@@ -71,12 +69,12 @@ class RecordCommand:
         kernel_cache.prepare()
         machine = self._load(arguments.file)
         if machine is None:
-            return EXIT_MISUSED
+            return EXIT_USAGE
         try:
             bus = _bus(machine, arguments.bus)
             _check_new(arguments.out)
         except _MisuseError as error:
-            return _say(error, EXIT_MISUSED)
+            return _say(error, EXIT_USAGE)
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.base import DeviceAbsentError  # noqa: PLC0415

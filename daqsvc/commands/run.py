@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc import kernel_cache
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_HUNG, EXIT_LOST, EXIT_OK, EXIT_STUCK, EXIT_USAGE
 from daqsvc.commands.log_thread import LogThread
-from daqsvc.commands.process_guard import EXIT_HUNG, EXIT_STUCK, ProcessGuard
+from daqsvc.commands.process_guard import ProcessGuard
 from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
 
 if TYPE_CHECKING:
@@ -22,11 +23,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EXIT_OK = 0
-EXIT_FAILED = 1
-EXIT_BAD_FILE = 2
-EXIT_LOST = 3
-"""Something without which the service is useless was lost while it ran."""
 
 LOG_S = 0.3
 """What the last lines of the log may take to be written."""
@@ -77,7 +73,7 @@ class RunCommand:
         try:
             machine = self._load(arguments.file)
             if machine is None:
-                return EXIT_BAD_FILE
+                return EXIT_USAGE
             kernel_cache.prepare()
             with ProcessGuard(handler.flush_within) as guard:
                 # Under systemd its journal reads the log, whose restart is no reason to stop.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from daqsvc.settings.plugins import PipelineTable
 from daqsvc.settings.section import Section
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.reading import Reading
+    from daqsvc.diagnosis.recorded import RecordedDetector, RecordingOptions
     from daqsvc.settings.models import MachineFile
 
 SettingsT = TypeVar("SettingsT", bound=Section)
@@ -22,7 +23,12 @@ class DetectorPlugin(PipelineTable[SettingsT]):
     """A kind of detector: its table in ``[pipeline]``, and what makes the detectors of it.
 
     Importing one must be cheap: what brings kernels is imported when a detector is made.
+
+    Attributes:
+        calibrated: whether ``daqsvc calibrate`` makes a file that ``calibration`` of its table can name.
     """
+
+    calibrated: ClassVar[bool] = False
 
     def build(self, machine: MachineFile, given: SettingsT, store: Path | None) -> Iterable[Detector]:
         """The detectors that the table asks for.
@@ -43,6 +49,26 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         Raises:
             AssemblyError: it cannot; the message names file, key, value and remedy.
         """
+
+    def recorded(
+        self, machine: MachineFile, given: SettingsT, options: RecordingOptions
+    ) -> RecordedDetector[Any]:
+        """The detector for recordings: what ``daqsvc analyze`` shows of it.
+
+        Args:
+            machine: the machine file.
+            given: the table.
+            options: what is said of the recordings.
+
+        Returns:
+            Unless overridden, one that condenses what the detectors of `build` say.
+
+        Raises:
+            ValueError: what the table or the options name cannot be used; the message says what to do.
+        """
+        from daqsvc.diagnosis.recorded import RecordedLive  # noqa: PLC0415 - NumPy, which `check` need not
+
+        return RecordedLive(machine, given, options, self.build)
 
     def readings(self, machine: MachineFile, given: SettingsT) -> Iterable[Reading]:
         """The figures that are shown by themselves."""

@@ -1,4 +1,4 @@
-"""Which variable of a recording is which channel, at what rate and in what unit of length."""
+"""Which variable of a recording is which channel, at what rate and in what unit."""
 
 from __future__ import annotations
 
@@ -22,6 +22,13 @@ LengthUnit = Literal["m", "mm", "um", "mil"]
 LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
 
 UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
+
+AccelerationUnit = Literal["g", "m/s2", "V"]
+
+ACCELERATION_UNITS: tuple[AccelerationUnit, ...] = get_args(AccelerationUnit)
+
+M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0}
+"""Volts are missing: what they mean only the sensor's sensitivity tells."""
 
 LEAST_MEMORY_GB = 0.05
 MOST_MEMORY_GB = 1000.0

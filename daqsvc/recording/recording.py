@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -12,7 +13,7 @@ from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import find
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     import numpy as np
     from numpy.typing import NDArray
@@ -124,6 +125,49 @@ def list_channels(path: Path | str) -> dict[str, int]:
     """
     found: dict[str, int] = _there("channels_of", Path(path), {}).found
     return found
+
+
+def load_matching(path: Path | str, channels: Mapping[str, str], rate_hz: float | None = None) -> Recording:
+    """The same; a channel that the file does not have may be a pattern, or what one of its names ends with.
+
+    Raises:
+        RecordingError: see `load_recording` and `matching`.
+    """
+    try:
+        return load_recording(path, channels, rate_hz)
+    except RecordingError:
+        there = list_channels(path)
+        found = {name: matching(path, variable, there) for name, variable in channels.items()}
+        if found == channels:
+            raise
+    return load_recording(path, found, rate_hz)
+
+
+def matching(path: Path | str, variable: str, there: Iterable[str]) -> str:
+    """The channel of a file that a name means, or a pattern, or what only one of the names there ends with.
+
+    Sets of recordings often number their variables: ``DE_time`` is ``X105_DE_time`` in one file and
+    ``X106_DE_time`` in the next.
+
+    Args:
+        path: the file.
+        variable: what is meant.
+        there: the channels of the file.
+
+    Returns:
+        The channel; ``variable`` itself if there is none.
+
+    Raises:
+        RecordingError: several may be meant.
+    """
+    matches = [one for one in there if one.endswith(variable) or fnmatch.fnmatchcase(one, variable)]
+    if not matches or variable in matches:
+        return variable
+    if len(matches) > 1:
+        raise RecordingError(
+            f"{path} has several channels that may be {variable!r}: {', '.join(matches)}; name one of them"
+        )
+    return matches[0]
 
 
 def stop_reading() -> None:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.commands.arguments import EXIT_FAILED
 from daqsvc.recording.channels import channel_map, sampling_rate_hz
 from sim_hw.arguments import add_random, add_recording, add_speed, positive
 from sim_hw.demo.arguments import broker_url, misuse
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from sim_hw.demo.session import DemoOutcome, Script
     from sim_hw.scenario_bearing import BearingScenario
 
-EXIT_FAILED = 1
 SCENARIO = "paper"
 UNIT = "g"
 BEARING_RATE_HZ = 12_000.0

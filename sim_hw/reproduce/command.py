@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.arguments import EXIT_FAILED
 from sim_hw import arguments as arguments_of
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
     from sim_hw.reproduce.results import Findings, ResultRow
 
-EXIT_FAILED = 1
 SEED = 1
 SNR_DB = 0.0
 MOST_DB = 40.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from support.example_packages import DETECTOR, DOCS, installed
 from support.machine_files import MOTOR, problems_of
 
 from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.cli import main
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.settings import describe, parse_machine_file
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 TABLE = '[pipeline.crest]\nsensor = "accel-de"\nalert = 5.0\n'
+RATE_HZ = 10_000
 ALARM = '[[alarms]]\nname = "knocks"\ndetector = "crest"\n'
 
 
@@ -84,6 +87,28 @@ def test_missing_samples_and_silence_hold_the_decision() -> None:
     assert (silent.decision, silent.quality, silent.t_ns) == ("alert", "missing", 5 * 10**9)
     [dead] = made.process(window(made, np.zeros(made.block)))
     assert (dead.decision, dead.statistics["crest_factor"]) == ("normal", 0.0)
+
+
+def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`analyze` knows no detector: what it shows of one comes with the plugin."""
+    file = tmp_path / "machine.toml"
+    sensor = MOTOR.read_text().partition("[[sensors]]")[2].partition("[pipeline]")[0]
+    other = "[[sensors]]" + sensor.replace('"accel-de"', '"accel-nde"').replace('"de"', '"nde"')
+    text = MOTOR.read_text().replace("samples_per_frame = 30", "samples_per_frame = 15")
+    text = text.replace("channels = [", 'channels = [\n  { name = "nde", type = "int16", scale = 0.0005 },')
+    file.write_text(f"{text}\n{other}\n{TABLE}\n{ALARM}")
+    knocking = np.sin(np.arange(3 * RATE_HZ) / 9.0)
+    knocking[RATE_HZ + 7] = 40.0
+    for name in ("accel-de", "accel-nde"):
+        np.savez(tmp_path / f"{name}.npz", **{name: knocking}, fs=RATE_HZ)
+    assert main(["analyze", str(file), str(tmp_path / "accel-de.npz"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["detectors"]["crest"]
+    assert [step["decision"] for step in found["history"]] == ["normal", "alert", "normal"]
+    assert (found["decision"], found["worst"]["onset_sample"]) == ("normal", RATE_HZ)
+    assert found["statistics"]["crest_factor"] == pytest.approx(np.sqrt(2), rel=1e-2)
+    # The other bearing alone has nothing for it.
+    assert main(["analyze", str(file), str(tmp_path / "accel-nde.npz"), "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["detectors"]) == {"levels/accel-nde"}
 
 
 def test_what_is_wrong_in_its_table_is_said() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.orbit_files import AMPLITUDE_UM, ONSET, RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, Orbit
 
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import RotorSetup
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 

@@ -11,17 +11,18 @@ import pytest
 from scipy.signal import butter, lfilter
 from support.orbit_files import RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, Orbit
 
-from daqsvc.analysis.calibrating import CalibrationSetup, calibrate_recordings
 from daqsvc.analysis.quality import Complaint
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import Keyphasor, RefusedError, RotorSetup
+from daqsvc.detectors.rotor_synchronous.calibrating import calibrate_recordings
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
+from daqsvc.recording.errors import RefusedError
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.calibration.file import CalibrationFileError, load_healthy, save_record
 from daqsvc.rotor.laval import LavalRotor
 
 ROTOR = LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1, clearance_um=200.0)
 SETUP = RotorSetup(probes=("x", "y"), rotor=ROTOR, speed_rpm=SPEED_RPM)
-WITH_KEYPHASOR = replace(SETUP, keyphasor=Keyphasor("k"))
+WITH_KEYPHASOR = replace(SETUP, keyphasor=KeyphasorChannel("k"))
 
 
 class MarkedOrbit(Orbit):
@@ -92,11 +93,10 @@ def test_missing_pulses_leave_a_calibration_what_revolutions_there_are():
     orbit = MarkedOrbit(120)
     for revolution in (20, 41, 60, 61, 90):
         orbit.pulses[(revolution - 1) * SAMPLES_PER_REV : revolution * SAMPLES_PER_REV] = -10.0
-    setup = CalibrationSetup(taken=WITH_KEYPHASOR)
-    made = calibrate_recordings([recording(orbit, keyphasor=True)], setup)
+    made = calibrate_recordings([recording(orbit, keyphasor=True)], WITH_KEYPHASOR)
     assert made.steady[0].revolutions >= 110
     with pytest.raises(RefusedError) as refused:
-        calibrate_recordings([recording(MarkedOrbit(15), keyphasor=True)], setup)
+        calibrate_recordings([recording(MarkedOrbit(15), keyphasor=True)], WITH_KEYPHASOR)
     assert "a baseline needs 23" in str(refused.value)
     assert "--" not in str(refused.value)
     assert "fewer" not in str(refused.value)
@@ -113,7 +113,7 @@ def with_run_up(path):
     run_up = Recording(("x", "y", "k"), samples, RUN_UP_RATE_HZ, Path("run-up"), nan_count=0)
     setup = replace(WITH_KEYPHASOR, speed_rpm=None)
     steady = recording(MarkedOrbit(120), keyphasor=True)
-    made = calibrate_recordings([run_up, steady], CalibrationSetup(taken=setup, rotor_given=False))
+    made = calibrate_recordings([run_up, steady], setup, rotor_given=False)
     save_record(made, path)
     save_record(
         replace(made, run_up=None, steady=(replace(made.steady[0], fit_error=None),)), path.with_suffix(".st")

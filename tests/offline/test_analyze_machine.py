@@ -10,9 +10,9 @@ import pytest
 from support.orbit_files import RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, UNBALANCE, VERDICTS, Orbit
 from support.paths import ROOT
 
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import Keyphasor, RotorSetup
 from daqsvc.cli import main
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
@@ -38,7 +38,7 @@ def calibration(tmp_path: Path) -> Path:
         0,
     )
     rotor = LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1)
-    setup = RotorSetup(probes=("x", "y"), rotor=rotor, speed_rpm=SPEED_RPM, keyphasor=Keyphasor("k"))
+    setup = RotorSetup(probes=("x", "y"), rotor=rotor, speed_rpm=SPEED_RPM, keyphasor=KeyphasorChannel("k"))
     healthy = analyse(recording, setup).calibration
     assert healthy is not None
     save_calibration(healthy, tmp_path / "healthy.toml")

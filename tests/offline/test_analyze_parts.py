@@ -16,15 +16,16 @@ import numpy as np
 import pytest
 from support.orbit_files import AMPLITUDE_UM, RATE_HZ, SPEED_RPM, Orbit
 
-from daqsvc.analysis import progress, quality
-from daqsvc.analysis.many import Outcome, WorkerLostError, judge_all
-from daqsvc.analysis.progress import ProgressInterval
-from daqsvc.analysis.result import finite
-from daqsvc.analysis.rotor import analyse, posterior
-from daqsvc.analysis.setup import RefusedError, RotorSetup
-from daqsvc.analysis.statements import by_name, worst
+from daqsvc.analysis import quality
 from daqsvc.commands.option_types import SpeedOption, speed
+from daqsvc.detectors.rotor_synchronous.recorded import analyse, posterior
+from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.diagnosis.recorded import by_name, finite, worst
+from daqsvc.offline import progress
+from daqsvc.offline.progress import ProgressInterval
+from daqsvc.offline.runner import Outcome, WorkerLostError, judge_all
+from daqsvc.recording.errors import RefusedError
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 
@@ -64,8 +65,6 @@ def test_the_progress_of_a_long_recording_is_told() -> None:
 def test_a_setup_needs_a_speed_from_somewhere() -> None:
     with pytest.raises(ValueError, match="--speed-rpm, or name a keyphasor"):
         RotorSetup(probes=("x", "y"), rotor=ROTOR, speed_rpm=None)
-    with pytest.raises(ValueError, match="different channels"):
-        RotorSetup(probes=("x", "y"), rotor=ROTOR, speed_rpm=1.0, channels={"x": "a", "y": "a"})
 
 
 def test_probabilities_are_those_of_the_evidence() -> None:
@@ -171,7 +170,7 @@ def test_the_bar_of_rich_is_taken_where_there_is_one() -> None:
 
 @dataclass(frozen=True)
 class Sleepless:
-    """An analyst that dies of one recording."""
+    """Judges nothing, and dies of one recording."""
 
     deadly: str
 
@@ -218,15 +217,15 @@ def test_each_sensor_of_a_level_detector_has_a_statement_of_its_own_and_the_wors
         *(said("probe-x", 100, "danger"), said("probe-y", 100, "normal")),
         *(said("probe-x", 200, "alert"), said("probe-y", 200, "alert")),
     ]
-    found = by_name("levels/shaft", diagnoses, 100.0, {})
+    found = by_name("levels/shaft", diagnoses, 100.0)
     assert [one.detector for one in found] == ["levels/probe-x", "levels/probe-y"]
     assert [one.as_json()["severity"] for one in found] == ["alert", "alert"]
     assert found[0].as_json()["worst"]["severity"] == "danger"
     assert found[0].as_json()["worst"]["onset_sample"] == 100
     assert found[0].describe().startswith("levels/probe-x: alert (alert, danger at 1.000 s); rms 1")
     assert worst(found) == "levels/probe-x, danger from 1.000 s on"
-    assert worst(by_name("levels/shaft", diagnoses[:2], 100.0, {})) == ""
-    (silent,) = by_name("levels/shaft", [], 100.0, {})
+    assert worst(by_name("levels/shaft", diagnoses[:2], 100.0)) == ""
+    (silent,) = by_name("levels/shaft", [], 100.0)
     assert silent.as_json()["worst"] is None
 
 
@@ -240,7 +239,7 @@ def test_complaints_that_differ_in_figures_only_are_one_with_a_count() -> None:
 
 
 def test_the_figure_shows_where_the_test_holds_a_changed_machine_against_itself() -> None:
-    from daqsvc.analysis.plots import _innovations, _new_references, _Subject
+    from daqsvc.detectors.rotor_synchronous.plots import _innovations, _new_references, _Subject
 
     orbit = Orbit(300, change=0.8)
     analysis = analyse(recorded(orbit), SETUP)

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import RotorSetup
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 

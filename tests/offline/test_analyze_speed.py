@@ -13,15 +13,15 @@ from support.orbit_files import RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, Orbit
 from support.run_ups import RATE_HZ as RUN_UP_RATE_HZ
 from support.run_ups import record
 
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import Keyphasor, RotorSetup
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
 from daqsvc.dsp.speed.steadiness import trend_of_orbit, trend_of_pulses
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 
 ROTOR = LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1, clearance_um=200.0)
 SETUP = RotorSetup(probes=("x", "y"), rotor=ROTOR, speed_rpm=SPEED_RPM)
-WITH_KEYPHASOR = replace(SETUP, keyphasor=Keyphasor("k"), speed_rpm=None)
+WITH_KEYPHASOR = replace(SETUP, keyphasor=KeyphasorChannel("k"), speed_rpm=None)
 
 
 def pulses(angle_rad):

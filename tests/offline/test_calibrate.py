@@ -16,15 +16,18 @@ import can
 import numpy as np
 import pytest
 from support.machine_files import MACHINES
+from support.paths import ROOT
 from support.run_ups import ECCENTRICITY, OMEGA, RATE_HZ, record
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
-from daqsvc.commands.calibrate_live import calibrate_live
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.offline.calibrate_live import _only_rotor, calibrate_live
 from daqsvc.rotor.calibration.file import load_calibration, load_record
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.settings import parse_machine_file
+from daqsvc.settings.plugins import configured
 from drivers.can.plugin import frame_layout
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import RealTimePacer
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 MACHINE = MACHINES / "rotor-synchronous.toml"
+SPECIMENS = ROOT / "tests" / "guard" / "specimens"
 
 
 @cache
@@ -343,6 +347,14 @@ async def test_the_live_bus_gives_the_same_machine() -> None:
     assert made.speed_rpm == pytest.approx(1500.0, rel=1e-3)
     assert made.laval
     assert told[-1][1] == 40
+
+
+def test_whatever_else_watches_the_machine_is_left_out_while_it_is_calibrated() -> None:
+    file = SPECIMENS / "specimen-calibrated.toml"
+    machine = parse_machine_file(file.read_text(encoding="utf-8"), file)
+    assert machine.pipeline.table(Bearing) is not None
+    alone = _only_rotor(machine, 40)
+    assert [key for key, _, _ in configured(alone.pipeline)] == ["rotor_synchronous"]
 
 
 async def test_a_silent_bus_is_not_waited_for_for_ever() -> None:

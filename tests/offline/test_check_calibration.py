@@ -8,9 +8,9 @@ import pytest
 from support.orbit_files import RATE_HZ, SPEED_RPM, Orbit
 from support.paths import ROOT
 
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import RotorSetup
 from daqsvc.cli import main
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.recording.recording import load_recording
 from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
@@ -42,7 +42,9 @@ def calibration(tmp_path):
     setup = RotorSetup(
         probes=("x", "y"), rotor=LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1), speed_rpm=SPEED_RPM
     )
-    healthy = analyse(load_recording(Orbit().save(tmp_path / "h.npz"), setup.columns), setup).calibration
+    healthy = analyse(
+        load_recording(Orbit().save(tmp_path / "h.npz"), {"x": "x", "y": "y"}), setup
+    ).calibration
     save_calibration(healthy, tmp_path / "healthy.toml")
     return "healthy.toml"
 

@@ -13,8 +13,8 @@ from support.fuzz_bytes import mutated
 from support.orbit_files import OPTIONS, Orbit
 from support.paths import ROOT
 
-from daqsvc.analysis.can_logs import load_can_log
 from daqsvc.cli import main
+from daqsvc.offline.can_logs import load_can_log
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording, shared, stop_reading
 from daqsvc.settings import load_machine_file

@@ -14,10 +14,11 @@ from support.orbit_files import RATE_HZ, SPEED_RPM, Orbit
 from support.race_signals import BEARING, strikes
 
 import sim_hw.scenario
-from daqsvc.analysis.bearing_setup import BearingSetup
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import Keyphasor, RotorSetup
 from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.detectors.bearing.calibrating import HealthyRun
+from daqsvc.detectors.bearing.verdict import BearingSetup
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.calibration.file import load_record, save_calibration
 from daqsvc.rotor.calibration.reading import CalibrationFileError
@@ -37,11 +38,11 @@ def sound(tmp_path_factory):
         ("x", "y", "k"), np.column_stack([orbit.x, orbit.y, orbit.keyphasor]), RATE_HZ, folder, 0
     )
     rotor = LavalRotor(natural_frequency_hz=60.0, damping_ratio=0.1)
-    setup = RotorSetup(probes=("x", "y"), rotor=rotor, speed_rpm=SPEED_RPM, keyphasor=Keyphasor("k"))
+    setup = RotorSetup(probes=("x", "y"), rotor=rotor, speed_rpm=SPEED_RPM, keyphasor=KeyphasorChannel("k"))
     save_calibration(analyse(recording, setup).calibration, folder / "rotor.toml")
     bearing = BearingSetup(channels=("de",), speed_rpm=1797.0, bearings={"de": BEARING})
     healthy = Recording(("de",), strikes(None, 12.0)[:, None], 12_000.0, folder, 0)
-    save_bearing_baseline(bearing.learn(healthy), folder / "bearing.toml")
+    save_bearing_baseline(HealthyRun(bearing, healthy).at(healthy.rate_hz), folder / "bearing.toml")
     return {
         "rotor": ((folder / "rotor.toml").read_bytes(), load_record, CalibrationFileError),
         "bearing": ((folder / "bearing.toml").read_bytes(), load_bearing_baseline, BaselineFileError),

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from daqsvc.detectors.bearing.recorded import RecordedBearings
     from daqsvc.detectors.bearing.settings import WatchedBearing
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import Finding
 
@@ -26,6 +28,7 @@ class BearingPlugin(DetectorPlugin[Bearing]):
     settings = Bearing
     about = "the rolling bearings"
     detector = BEARING
+    calibrated = True
     place = 3
 
     def checks(self, draft: MachineFile, given: Bearing) -> Iterator[Iterator[Finding]]:
@@ -49,6 +52,12 @@ class BearingPlugin(DetectorPlugin[Bearing]):
     def check_files(self, machine: MachineFile, given: Bearing) -> None:
         """See `DetectorPlugin.check_files`: its calibration, and that its bearings are known."""
         self.build(machine, given, None)
+
+    def recorded(self, machine: MachineFile, given: Bearing, options: RecordingOptions) -> RecordedBearings:
+        """See `DetectorPlugin.recorded`."""
+        from daqsvc.detectors.bearing.recorded import RecordedBearings  # noqa: PLC0415 - brings SciPy
+
+        return RecordedBearings(machine, given, options)
 
     def readings(self, machine: MachineFile, given: Bearing) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

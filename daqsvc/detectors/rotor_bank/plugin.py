@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
+    from daqsvc.detectors.rotor_bank.recorded import RecordedBank
     from daqsvc.detectors.rotor_bank.settings import Mode
+    from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import Finding, KeyPath
 
@@ -76,6 +78,12 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
     def check_files(self, machine: MachineFile, given: RotorBank) -> None:
         """See `DetectorPlugin.check_files`: whether observers can be made of the figures."""
         self.build(machine, given, None)
+
+    def recorded(self, machine: MachineFile, given: RotorBank, options: RecordingOptions) -> RecordedBank:
+        """See `DetectorPlugin.recorded`."""
+        from daqsvc.detectors.rotor_bank.recorded import RecordedBank  # noqa: PLC0415 - brings SciPy
+
+        return RecordedBank(machine, given, options)
 
     def readings(self, machine: MachineFile, given: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

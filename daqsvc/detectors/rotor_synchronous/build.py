@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS
 from daqsvc.detectors.shaft.build import keyphasor, probes
+from daqsvc.diagnosis.recorded import known
 from daqsvc.rotor.calibration.file import (
     CalibrationFileError,
     load_calibration,
@@ -42,7 +43,7 @@ def healthy_rotor(
         calibration: file to take in place of the one that the machine file names.
 
     Returns:
-        See `load_healthy`: at most one baseline, that of the machine's speed.
+        See `load_healthy`: at most one baseline, that of the machine's speed if it is known.
 
     Raises:
         CalibrationFileError: the calibration cannot be used at the machine's speed.
@@ -52,7 +53,7 @@ def healthy_rotor(
     if calibration is None and given.calibration is not None:
         calibration = machine.resolve(given.calibration)
     if calibration is not None:
-        return load_healthy(calibration, machine.machine.speed_rpm, rotor.clearance_um)
+        return load_healthy(calibration, known(machine.machine.speed_rpm), rotor.clearance_um)
     stated = LavalRotor(
         natural_frequency_hz=rotor.natural_frequency_hz,
         damping_ratio=rotor.damping_ratio,

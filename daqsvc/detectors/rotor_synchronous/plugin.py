@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+    from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings.models import MachineFile
@@ -28,6 +30,7 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
     about = "the rotor against its own healthy state"
     detector = ROTOR_SYNCHRONOUS
     states_speed = True
+    calibrated = True
     place = 2
 
     def sampled_together(self, given: RotorSynchronous) -> tuple[str, ...]:
@@ -58,6 +61,14 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
     def check_files(self, machine: MachineFile, given: RotorSynchronous) -> None:
         """See `DetectorPlugin.check_files`: whether its calibration can be used."""
         _healthy_rotor(machine, given)
+
+    def recorded(
+        self, machine: MachineFile, given: RotorSynchronous, options: RecordingOptions
+    ) -> RecordedRotor:
+        """See `DetectorPlugin.recorded`."""
+        from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor  # noqa: PLC0415 - brings SciPy
+
+        return RecordedRotor(machine, given, options)
 
     def readings(self, machine: MachineFile, given: RotorSynchronous) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

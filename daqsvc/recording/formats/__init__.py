@@ -36,6 +36,11 @@ CAN_LOGS = (".blf", ".asc", ".log", ".trc")
 _LONGEST_REASON = 300
 
 
+def named_as_can_log(path: Path) -> bool:
+    """Whether a file is a CAN log by its name."""
+    return path.name.lower().removesuffix(".gz").endswith(CAN_LOGS)
+
+
 def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
     """The reader of a file, and its size in bytes.
 
@@ -51,7 +56,7 @@ def find(path: Path) -> tuple[Callable[[Path, Budget], Contents], int]:
         raise RecordingError(f"{path!s:.200} cannot be read: {_one_line(error)}; correct the path") from None
     name = path.name.lower()
     reader = next((reader for suffix, reader in READERS.items() if name.endswith(suffix)), None)
-    if reader is None and name.removesuffix(".gz").endswith(CAN_LOGS):
+    if reader is None and named_as_can_log(path):
         raise RecordingError(
             f"{path} is a CAN log, which only the layouts of a machine file make sense of: name that first"
         )

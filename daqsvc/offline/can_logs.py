@@ -12,11 +12,8 @@ import numpy as np
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.assembly_alignment import alignment
-from daqsvc.detectors.bearing.settings import Bearing
-from daqsvc.detectors.rotor_bank.settings import RotorBank
-from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.recording.errors import RecordingError
-from daqsvc.recording.formats import CAN_LOGS
+from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE
 from daqsvc.recording.recording import Recording
 from drivers.base import StreamSpec
@@ -35,7 +32,6 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings import MachineFile
-    from daqsvc.settings.models import Sensor
     from drivers.frames import FrameLayout
 
     Floats: TypeAlias = NDArray[np.float64]
@@ -49,16 +45,9 @@ _NAMED_IDS = 8
 _LAYOUTS = "ids and lengths of its layouts"
 
 
-def is_can_log(path: str) -> bool:
-    """Whether a recording is a CAN log by its ending, or a folder of such."""
-    return Path(path).is_dir() or _is_log(Path(path))
-
-
-def _is_log(path: Path) -> bool:
-    return path.name.lower().removesuffix(".gz").endswith(CAN_LOGS)
-
-
-def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) -> Recording:
+def load_can_log(
+    machine: MachineFile, path: str, rate_hz: float | None = None, watched: Sequence[str] = ()
+) -> Recording:
     """The sensors of a machine in a CAN log, or in all logs of a folder: its buses, and the parts of each.
 
     The frames go through the decoders and assemblers of the live service, and streams that the detectors take
@@ -69,6 +58,7 @@ def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) 
         machine: the machine file.
         path: the log or folder.
         rate_hz: what the user says of the rate.
+        watched: sensors whose verdict needs all samples at one rate; unless there are any, all sensors.
 
     Raises:
         RecordingError: it cannot be read, holds no samples of the machine, or not at the rates that the
@@ -86,7 +76,7 @@ def load_can_log(machine: MachineFile, path: str, rate_hz: float | None = None) 
             f"{path} has no frame of a stream of {machine.path}{playing.seen_instead()}; {why}"
         )
     playing.check_rates()
-    return _recording(machine, path, playing, rate_hz)
+    return _recording(machine, path, playing, rate_hz, watched)
 
 
 @dataclass(slots=True)
@@ -131,7 +121,7 @@ class _Playing:
         """Play them."""
         files = [Path(self._path)]
         if files[0].is_dir():
-            files = sorted(file for file in files[0].iterdir() if _is_log(file) and file.is_file())
+            files = sorted(file for file in files[0].iterdir() if named_as_can_log(file) and file.is_file())
             if not files:
                 raise RecordingError(
                     f"{self._path} is a folder without a CAN log ({', '.join(CAN_LOGS)}); give that of "
@@ -327,9 +317,11 @@ def _rows(path: str, name: str, blocks: Sequence[SampleBlock]) -> _Rows:
     return _Rows(samples, last.t_first_ns - (last.first_index - first) * last.period_ns)
 
 
-def _recording(machine: MachineFile, path: str, playing: _Playing, given_hz: float | None) -> Recording:
+def _recording(
+    machine: MachineFile, path: str, playing: _Playing, given_hz: float | None, watched: Sequence[str]
+) -> Recording:
     notes = list(playing.notes)
-    group, rate_hz = _group(machine, playing)
+    group, rate_hz = _group(machine, playing, watched)
     if given_hz is not None and abs(given_hz / rate_hz - 1.0) > SAME_RATE:
         raise RecordingError(
             f"the sampling rate of {path} is {rate_hz:g} Hz by {machine.path} and {given_hz:g} Hz as given: "
@@ -367,7 +359,9 @@ def _recording(machine: MachineFile, path: str, playing: _Playing, given_hz: flo
     )
 
 
-def _group(machine: MachineFile, playing: _Playing) -> tuple[dict[str, list[tuple[str, str]]], float]:
+def _group(
+    machine: MachineFile, playing: _Playing, watched: Sequence[str]
+) -> tuple[dict[str, list[tuple[str, str]]], float]:
     """What makes the recording: a grid, or streams of one rate; with the stream and channel of each column.
 
     Raises:
@@ -383,7 +377,8 @@ def _group(machine: MachineFile, playing: _Playing) -> tuple[dict[str, list[tupl
                 "of different times; give logs of some 10 s and more, of the same time"
             )
     present = [name for name in machine.streams if name in playing.blocks]
-    wanted = [sensor.stream for sensor in _watched(machine) if sensor.stream in present] or present
+    streams = [machine.sensor(name).stream for name in watched]
+    wanted = [stream for stream in streams if stream in present] or present
     rates = [machine.streams[name].rate_hz for name in wanted]
     rate_hz = max(dict.fromkeys(rates), key=rates.count)
     group = {
@@ -392,16 +387,3 @@ def _group(machine: MachineFile, playing: _Playing) -> tuple[dict[str, list[tupl
         if machine.streams[name].rate_hz == rate_hz
     }
     return group, rate_hz
-
-
-def _watched(machine: MachineFile) -> list[Sensor]:
-    """The sensors of the detectors that need their samples at one rate."""
-    pipeline = machine.pipeline
-    rotors = [
-        one.sensors
-        for one in (pipeline.table(RotorSynchronous), pipeline.table(RotorBank))
-        if one is not None
-    ]
-    given = pipeline.table(Bearing)
-    bearings = [] if given is None else [given.sensors]
-    return [machine.sensor(name) for names in (*rotors, *bearings) for name in names]

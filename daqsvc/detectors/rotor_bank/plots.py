@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from daqsvc.analysis.plots import shortened
+from daqsvc.diagnosis.recorded import shortened
 
 if TYPE_CHECKING:
-    from daqsvc.analysis.statements import Statements
+    from collections.abc import Iterable
+
+    from daqsvc.diagnosis.recorded import Statements
     from daqsvc.recording.recording import Recording
 
 _DPI = 110
@@ -18,12 +20,13 @@ _LEAD = "lead."
 _MOST_NATS = 200.0
 
 
-def draw_bank(recording: Recording, said: Statements, prefix: str) -> list[str]:
+def draw_bank(recording: Recording, said: Statements, modes: Iterable[str], prefix: str) -> list[str]:
     """Write probabilities and evidence of the modes over the revolutions, as a PNG file.
 
     Args:
         recording: the recording.
         said: all that the bank said.
+        modes: names of its modes.
         prefix: what the file's name begins with, directory included.
 
     Returns:
@@ -36,7 +39,7 @@ def draw_bank(recording: Recording, said: Statements, prefix: str) -> list[str]:
     figure.suptitle(f"Rotor bank: {shortened(recording.source.name)}\n{good[-1].decision}", fontsize=11)
     upper, lower = figure.subplots(2, 1, sharex=True)
     turns = np.array([one.revolutions for one in good], dtype=np.float64)
-    for mode in said.faults:
+    for mode in modes:
         probability = [one.probabilities.get(mode, np.nan) for one in good]
         (line,) = upper.step(turns, probability, where="post", linewidth=1.8, label=mode)
         lead = [one.evidence.get(_LEAD + mode, np.nan) for one in good]

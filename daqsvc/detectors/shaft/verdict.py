@@ -1,14 +1,13 @@
-"""The verdict about a recording, as data, as a JSON object and in words."""
+"""The verdict about the rotor of a recording, as data, as a JSON object and in words."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, get_args
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
 from daqsvc.analysis.quality import DataQuality
+from daqsvc.diagnosis.recorded import Verdict, finite
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
@@ -130,13 +129,10 @@ class Trace:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RotorAnalysis:
-    """What a recording says about a rotor.
+class RotorVerdict(Verdict):
+    """What a recording says about a rotor; see `Verdict`.
 
     Attributes:
-        recording: name of the recording.
-        quality: what is known against its samples.
-        refused: why it cannot be judged; None if it can.
         verdict: the fault, the most likely one of ``group``; None if refused.
         group: all that the evidence cannot tell apart, the most likely first.
         named: whether two looks in a row agreed, or the machine is normal.
@@ -160,9 +156,8 @@ class RotorAnalysis:
         trace: what it was made of; None if refused before.
     """
 
-    recording: str
-    quality: DataQuality
-    refused: str | None = None
+    part: ClassVar[str] = "rotor"
+
     verdict: RotorFault | None = None
     group: tuple[RotorFault, ...] = ()
     named: bool = False
@@ -185,7 +180,7 @@ class RotorAnalysis:
     trace: Trace | None = None
 
     @classmethod
-    def not_judged(cls, recording: str, why: str, quality: DataQuality | None = None) -> RotorAnalysis:
+    def not_judged(cls, recording: str, why: str, quality: DataQuality | None = None) -> RotorVerdict:
         """The verdict about a recording that cannot be judged."""
         return cls(recording=recording, quality=quality or DataQuality(0), refused=why)
 
@@ -327,19 +322,6 @@ def calibration_json(calibration: Calibration, reference_revolutions: int | None
 
 def _grown(calibration: Calibration, revolutions: int | None) -> Calibration:
     return calibration if revolutions is None else replace(calibration, revolutions=revolutions)
-
-
-def finite(value: Any) -> Any:
-    """The same with every NaN and infinity as None, and NumPy's numbers as Python's."""
-    if isinstance(value, dict):
-        return {key: finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(part) for part in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def _json_of(instant: Instant | None) -> dict[str, Any] | None:

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from daqsvc.analysis.plots import shortened
 from daqsvc.bearing.race.verdict import PARTS
+from daqsvc.diagnosis.recorded import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from matplotlib.axes import Axes
 
-    from daqsvc.analysis.bearing_result import BearingAnalysis
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import Part, RaceVerdict
+    from daqsvc.detectors.bearing.verdict import BearingVerdict
 
 _COLOURS: Mapping[Part, str] = {"inner": "#d55e00", "outer": "#0072b2", "ball": "#009e73"}
 _MARKS: Mapping[Part, str] = {"inner": "v", "outer": "s", "ball": "o"}
@@ -31,7 +31,7 @@ _HARMONICS = 4
 _DPI = 110
 
 
-def draw_envelopes(analysis: BearingAnalysis, prefix: str) -> list[str]:
+def draw_envelopes(analysis: BearingVerdict, prefix: str) -> list[str]:
     """Write the envelope spectrum of each channel that could be judged as a PNG file.
 
     Args:
@@ -48,7 +48,7 @@ def draw_envelopes(analysis: BearingAnalysis, prefix: str) -> list[str]:
     return files
 
 
-def _envelope(analysis: BearingAnalysis, name: str, race: RaceVerdict) -> Figure:
+def _envelope(analysis: BearingVerdict, name: str, race: RaceVerdict) -> Figure:
     """One channel: the spectrum over orders, its noise floor, and where each part's lines would be."""
     spectrum = race.spectrum
     assert spectrum is not None  # noqa: S101 - the race test of a recording keeps it

@@ -7,18 +7,18 @@ that speed, by the detector that watches the machine live (`analyse`), over all 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from daqsvc.analysis import quality as checks
-from daqsvc.analysis.rotor import analyse
-from daqsvc.analysis.setup import RefusedError
-from daqsvc.analysis.speed import LEAST_JUDGED, speed_of
+from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded_speed import LEAST_JUDGED, speed_of
 from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
 from daqsvc.dsp.speed.revolutions import KeyphasorCutter
 from daqsvc.recording.channels import to_um
+from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.calibration.file import CalibrationRecord
 from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.setup import RotorSetup
+    from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.run_up_fit import RunUpFit
 
@@ -40,23 +40,6 @@ _SAME_SPEED = 0.01
 """Baselines at speeds that differ by less than this part are of one speed."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrationSetup:
-    """What `calibrate_recordings` needs to know.
-
-    Attributes:
-        taken: how the recordings were taken.
-        rotor_given: whether natural frequency and damping in ``taken`` are known; if not, a run-up has to
-            tell them.
-        sweep_rpm: speed at the first and the last sample of the first recording, which is then a run-up
-            without a keyphasor, even in time; positive.
-    """
-
-    taken: RotorSetup
-    rotor_given: bool = True
-    sweep_rpm: tuple[float, float] | None = None
-
-
 class _Sweep(NamedTuple):
     """A stretch in which the shaft angle is known: orbit in um, rotation from x to y, and unwrapped angle."""
 
@@ -64,12 +47,22 @@ class _Sweep(NamedTuple):
     angle_rad: Floats
 
 
-def calibrate_recordings(recordings: Sequence[Recording], setup: CalibrationSetup) -> CalibrationRecord:
+def calibrate_recordings(
+    recordings: Sequence[Recording],
+    taken: RotorSetup,
+    *,
+    rotor_given: bool = True,
+    sweep_rpm: tuple[float, float] | None = None,
+) -> CalibrationRecord:
     """Calibrate on recordings of a healthy machine.
 
     Args:
-        recordings: with the channels of ``setup.taken.columns``, by their names there; at most one run-up.
-        setup: what is known.
+        recordings: with the channels of ``taken``, by their names there; at most one run-up.
+        taken: how the recordings were taken.
+        rotor_given: whether natural frequency and damping in ``taken`` are known; if not, a run-up has to
+            tell them.
+        sweep_rpm: speed at the first and the last sample of the first recording, which is then a run-up
+            without a keyphasor, even in time; positive.
 
     Returns:
         The record, without a date.
@@ -80,9 +73,8 @@ def calibrate_recordings(recordings: Sequence[Recording], setup: CalibrationSetu
     run_ups: list[tuple[Recording, RunUpFit]] = []
     steady: list[Recording] = []
     for number, recording in enumerate(recordings):
-        sweep_rpm = setup.sweep_rpm if number == 0 else None
         try:
-            sweep = _sweep(recording, setup.taken, sweep_rpm)
+            sweep = _sweep(recording, taken, sweep_rpm if number == 0 else None)
             if sweep is None:
                 steady.append(recording)
             else:
@@ -94,12 +86,11 @@ def calibrate_recordings(recordings: Sequence[Recording], setup: CalibrationSetu
             f"{' and '.join(str(recording.source) for recording, _ in run_ups)} are run-ups; give one of them"
         )
     run_up_recording, run_up = run_ups[0] if run_ups else (None, None)
-    taken = setup.taken
-    if run_up is not None and (run_up.laval or not setup.rotor_given):
+    if run_up is not None and (run_up.laval or not rotor_given):
         known = taken.rotor
         rotor = run_up.rotor(clearance_um=known.clearance_um, static_sag_um=known.static_sag_um)
         taken = replace(taken, rotor=rotor)
-    elif not setup.rotor_given:
+    elif not rotor_given:
         raise RefusedError(
             "natural frequency and damping ratio are not known: add a run-up, or give "
             "--natural-frequency-hz and --damping-ratio"
@@ -179,9 +170,9 @@ def _sweep(recording: Recording, taken: RotorSetup, sweep_rpm: tuple[float, floa
     if taken.keyphasor is None and sweep_rpm is None:
         return None
     samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    samples = samples[:, [recording.names.index(name) for name in taken.columns]]
+    samples = samples[:, [recording.names.index(name) for name in taken.names]]
     samples[:, :2] = to_um(samples[:, :2], taken.unit)
-    checks.refuse_unreadable(tuple(taken.columns), samples)
+    checks.refuse_unreadable(tuple(taken.names), samples)
     if sweep_rpm is not None:
         sweep = _even_sweep(recording, taken, samples, sweep_rpm)
         period = 120.0 * recording.rate_hz / sum(sweep_rpm)
@@ -208,7 +199,7 @@ def _even_sweep(
 def _keyphasor_sweep(recording: Recording, taken: RotorSetup, samples: Floats) -> tuple[_Sweep, float] | None:
     """The longest stretch with a known angle, and samples in its median revolution; None if it is steady."""
     short = _with_revolutions(taken, 0)
-    speed, _ = speed_of(recording, short, samples, checks.count_bad(tuple(taken.columns), samples))
+    speed, _ = speed_of(recording, short, samples, checks.count_bad(tuple(taken.names), samples))
     marks = speed.keyphasor
     assert marks is not None  # noqa: S101 - taken.keyphasor
     cutter = KeyphasorCutter(

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.projections.polar import PolarAxes
 
-from daqsvc.analysis.result import VERDICTS
+from daqsvc.detectors.shaft.verdict import VERDICTS
+from daqsvc.diagnosis.recorded import shortened
 from daqsvc.recording.channels import to_um
 from daqsvc.rotor.synchronous.baseline import compensated
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.result import RotorAnalysis, Trace
-    from daqsvc.analysis.setup import RotorSetup
+    from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
+    from daqsvc.detectors.shaft.verdict import RotorVerdict, Trace
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.synchronous.baseline import Calibration
 
@@ -50,7 +51,6 @@ _POINTS = 128
 _HARMONICS = 8
 """Harmonics of a mean revolution that are drawn."""
 _DPI = 110
-_LONGEST_NAME = 40
 _COMPONENTS = ("mean", "1X", "-1X", "2X", "-2X")
 
 
@@ -71,7 +71,7 @@ class _Subject:
 
     name: str
     probes: tuple[str, str]
-    analysis: RotorAnalysis
+    analysis: RotorVerdict
     trace: Trace
     calibration: Calibration
     xy: Floats
@@ -105,7 +105,7 @@ class _Subject:
         return np.stack([np.interp(at, samples, self.xy[:, k]) for k in (0, 1)], axis=-1)
 
 
-def draw(recording: Recording, setup: RotorSetup, analysis: RotorAnalysis, prefix: str) -> list[str]:
+def draw(recording: Recording, setup: RotorSetup, analysis: RotorVerdict, prefix: str) -> list[str]:
     """Write the figures of a verdict as PNG files.
 
     Args:
@@ -143,15 +143,6 @@ def draw(recording: Recording, setup: RotorSetup, analysis: RotorAnalysis, prefi
         files.append(f"{prefix}-{name}.png")
         make(subject).savefig(files[-1], dpi=_DPI)
     return files
-
-
-def shortened(name: str) -> str:
-    """A file's name as a title has room for it."""
-    return (
-        name
-        if len(name) <= _LONGEST_NAME
-        else f"{name[: _LONGEST_NAME // 2]}...{name[-_LONGEST_NAME // 2 :]}"
-    )
 
 
 def _figure(subject: _Subject, title: str, size: tuple[float, float]) -> Figure:

@@ -3,34 +3,56 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from daqsvc.analysis.result import finite
+from daqsvc.bearing.identify_change import ChangeRules
+from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import PARTS
 from daqsvc.detectors.bearing.finding import WORDS, severity_of
+from daqsvc.diagnosis.recorded import Verdict, finite
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.analysis.bearing_setup import BearingSetup
-    from daqsvc.analysis.quality import DataQuality
+    from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
     from daqsvc.detectors.bearing.finding import BearingFinding
+    from daqsvc.recording.channels import AccelerationUnit
 
 _TOLD_LINES = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BearingAnalysis:
-    """What a recording says about a machine's bearings.
+class BearingSetup:
+    """What a recording of bearings is judged by.
 
     Attributes:
-        recording: name of the recording.
+        channels: accelerometers on the bearings' housings, or the bearings where these have names.
+        speed_rpm: shaft speed, right to about 1 %.
+        bearings: fault orders of the bearing at each channel.
+        designations: of the bearings; those that were given by their orders have none.
+        unit: of the samples; ``"V"`` if the sensors' sensitivity is not known.
+        change: what counts as a change of the healthy machine.
+        race: settings of the race test.
+    """
+
+    channels: tuple[str, ...]
+    speed_rpm: float
+    bearings: Mapping[str, BearingOrders]
+    designations: Mapping[str, str] = field(default_factory=dict)
+    unit: AccelerationUnit = "g"
+    change: ChangeRules = field(default_factory=ChangeRules)
+    race: RaceRules = field(default_factory=RaceRules)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BearingVerdict(Verdict):
+    """What a recording says about a machine's bearings; see `Verdict`.
+
+    Attributes:
         baseline: name of the healthy run; None without one.
         setup: what it was judged by.
-        quality: what is known against its samples.
-        refused: why it cannot be judged; None if it can.
         finding: the verdict; None if refused.
         races: what each channel shows, of those that could be judged.
         unfit: why the others could not.
@@ -38,18 +60,17 @@ class BearingAnalysis:
         change: how they differ; None if they were not compared.
     """
 
-    recording: str
+    part: ClassVar[str] = "bearing"
+
     baseline: str | None
     setup: BearingSetup
-    quality: DataQuality
-    refused: str | None = None
     finding: BearingFinding | None = None
     races: Mapping[str, RaceVerdict] = field(default_factory=dict)
     unfit: Mapping[str, str] = field(default_factory=dict)
     healthy: HealthyResidual | None = None
     change: ResidualChange | None = None
 
-    def with_problem(self, problem: str) -> BearingAnalysis:
+    def with_problem(self, problem: str) -> BearingVerdict:
         """The same with one more problem of data quality."""
         return replace(self, quality=self.quality.with_problem(problem))
 

@@ -13,6 +13,7 @@ from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
+from daqsvc.settings.plugins import configured
 from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.settings import MachineFile
+    from daqsvc.settings.section import Section
 
 _LOOK_NS = NS_PER_S // 10
 _PATIENCE = 3.0
@@ -137,6 +139,8 @@ def _only_rotor(machine: MachineFile, revolutions: int) -> MachineFile:
     """The machine with the calibrated rotor as its only detector, not calibrated yet."""
     given = machine.pipeline.table(RotorSynchronous)
     assert given is not None  # noqa: S101 - the command has asked for it
-    given = given.model_copy(update={"calibration": None, "calibrate_revolutions": revolutions})
-    update = {"levels": None, "rotor_bank": None, "rotor_synchronous": given}
+    update: dict[str, Section | None] = {key: None for key, _, _ in configured(machine.pipeline)}
+    update["rotor_synchronous"] = given.model_copy(
+        update={"calibration": None, "calibrate_revolutions": revolutions}
+    )
     return machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=update)})

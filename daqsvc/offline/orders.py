@@ -1,32 +1,108 @@
-"""From recordings of accelerometers without a keyphasor to a verdict: is 1X still that of the healthy run?"""
+"""From recordings of accelerometers without a keyphasor to a verdict: is 1X still that of the healthy run?
+
+It needs a healthy run to compare with, and so there is no detector of the service like it.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
 
 import numpy as np
 
-from daqsvc.analysis.acceleration import M_S2_PER_UNIT
-from daqsvc.analysis.many import Outcome
 from daqsvc.analysis.quality import DataQuality, known_against
-from daqsvc.analysis.result import VERDICTS, finite
+from daqsvc.detectors.shaft.verdict import VERDICTS
+from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
 from daqsvc.dsp.speed.lines import ORDERS
+from daqsvc.recording.channels import M_S2_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
 from daqsvc.rotor.orders.change import OrderChange, OrderRules, compare_orders
+from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Container
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.acceleration import AccelerationUnit
+    from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
+    from daqsvc.recording.channels import AccelerationUnit
     from daqsvc.recording.recording import Recording
+    from daqsvc.settings.models import MachineFile
 
     Floats: TypeAlias = NDArray[np.float64]
+
+
+class Orders(Section):
+    """What counts as a change of the orders; in no machine file, but made of options."""
+
+    false_alarm_probability: float
+
+
+class RecordedOrders(RecordedDetector[Orders]):
+    """The orders of all accelerometers of a machine against those of a healthy run.
+
+    Raises:
+        ValueError: the healthy run cannot be read or measured.
+    """
+
+    part = "rotor"
+
+    def __init__(self, machine: MachineFile, given: Orders, options: RecordingOptions) -> None:
+        super().__init__(machine, given, options)
+        self._setup = OrderSetup(
+            channels=tuple(sensor.name for sensor in machine.sensors),
+            speed_rpm=machine.machine.speed_rpm,
+            unit=cast("AccelerationUnit", machine.sensors[0].unit),
+            rules=OrderRules(false_alarm_probability=given.false_alarm_probability),
+        )
+        self._name = cast("str", options.healthy)
+        wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
+        try:
+            healthy = load_recording(self._name, wanted, options.rate_hz)
+            self._baseline = self._setup.orders_of(healthy)
+        except (RecordingError, ValueError) as error:
+            raise ValueError(f"healthy run {self._name}: {error}") from error
+
+    def as_recorded(self, sensors: Container[str]) -> Orders:
+        """See `RecordedDetector.as_recorded`: all accelerometers are there, or nothing is read."""
+        del sensors
+        return self.given
+
+    def not_judged(self, recording: str, why: str) -> OrderVerdict:
+        """See `RecordedDetector.not_judged`."""
+        return OrderVerdict(
+            recording=recording,
+            baseline=self._name,
+            setup=self._setup,
+            quality=DataQuality(0),
+            refused=why,
+        )
+
+    def evaluate(self, recorded: Recorded, given: Orders, progress: Progress | None) -> Evaluated:
+        """See `RecordedDetector.evaluate`."""
+        del given, progress  # a recording takes a tenth of a second
+        verdict = analyse_orders(recorded.recording, self._setup, self._baseline, self._name)
+        return Evaluated(verdict=verdict)
+
+
+def order_detectors(
+    false_alarm_probability: float, machine: MachineFile, options: RecordingOptions
+) -> dict[str, RecordedDetector[Any]]:
+    """The comparison as the only detector of a machine, as `daqsvc.offline.runner.Runner` wants it.
+
+    Args:
+        false_alarm_probability: of a recording of the unchanged machine, at most.
+        machine: the machine, see `daqsvc.offline.machine_options.accelerometer_machine`.
+        options: what is said of the recordings; among that the healthy run.
+
+    Raises:
+        ValueError: the healthy run cannot be used.
+    """
+    given = Orders.model_construct(false_alarm_probability=false_alarm_probability)
+    return {"orders": RecordedOrders(machine, given, options)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,25 +113,13 @@ class OrderSetup:
         channels: names of the channels, of one unit.
         speed_rpm: nominal shaft speed.
         unit: of the samples; ``"V"`` if the sensors' sensitivity is not known.
-        map: what a channel is called in the file, where that is not its name here.
-        rate_hz: samples per second; None: what the file says.
         rules: what counts as a change.
     """
 
     channels: tuple[str, ...]
     speed_rpm: float
     unit: AccelerationUnit = "g"
-    map: Mapping[str, str] = field(default_factory=dict)
-    rate_hz: float | None = None
     rules: OrderRules = field(default_factory=OrderRules)
-
-    def load(self, path: str) -> Recording:
-        """Read the channels of a recording.
-
-        Raises:
-            RecordingError: it cannot be read.
-        """
-        return load_recording(path, {name: self.map.get(name, name) for name in self.channels}, self.rate_hz)
 
     def orders_of(self, recording: Recording) -> OrderVectors:
         """Measure a recording.
@@ -67,24 +131,20 @@ class OrderSetup:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OrderAnalysis:
-    """What a recording says about a machine whose healthy run is known.
+class OrderVerdict(Verdict):
+    """What a recording says about a machine whose healthy run is known; see `Verdict`.
 
     Attributes:
-        recording: name of the recording.
         baseline: name of the healthy one.
         setup: what it was judged by.
-        quality: what is known against its samples.
-        refused: why it cannot be judged; None if it can.
         orders: what was measured; None if refused before.
         change: the verdict and what it was made of; None if refused.
     """
 
-    recording: str
+    part: ClassVar[str] = "rotor"
+
     baseline: str
     setup: OrderSetup
-    quality: DataQuality
-    refused: str | None = None
     orders: OrderVectors | None = None
     change: OrderChange | None = None
 
@@ -185,7 +245,7 @@ class OrderAnalysis:
 
 def analyse_orders(
     recording: Recording, setup: OrderSetup, baseline: OrderVectors, baseline_name: str
-) -> OrderAnalysis:
+) -> OrderVerdict:
     """Compare a recording with the orders of a healthy run.
 
     Args:
@@ -201,7 +261,7 @@ def analyse_orders(
         orders = setup.orders_of(recording)
         change = compare_orders(baseline, orders, setup.rules)
     except ValueError as error:
-        return OrderAnalysis(
+        return OrderVerdict(
             recording=name,
             baseline=baseline_name,
             setup=setup,
@@ -214,52 +274,6 @@ def analyse_orders(
             f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "
             "turned at another speed, this comparison says nothing; check its speed"
         )
-    return OrderAnalysis(
+    return OrderVerdict(
         recording=name, baseline=baseline_name, setup=setup, quality=quality, orders=orders, change=change
     )
-
-
-@dataclass(frozen=True, slots=True)
-class OrderAnalyst:
-    """Judges recordings of one machine against its healthy run.
-
-    Attributes:
-        setup: what is known.
-        baseline: orders of the healthy run.
-        baseline_name: its file.
-    """
-
-    setup: OrderSetup
-    baseline: OrderVectors
-    baseline_name: str
-
-    @classmethod
-    def of(cls, setup: OrderSetup, baseline: str) -> OrderAnalyst:
-        """With the healthy run at a path.
-
-        Raises:
-            ValueError: it cannot be read or measured.
-        """
-        try:
-            return cls(setup, setup.orders_of(setup.load(baseline)), baseline)
-        except (RecordingError, ValueError) as error:
-            raise ValueError(f"healthy run {baseline}: {error}") from error
-
-    def judge(
-        self, recording: str, figures: str | None, progress: Callable[[int, int], None] | None = None
-    ) -> Outcome:
-        """See `daqsvc.analysis.many.Analyst.judge`."""
-        del figures, progress  # none are drawn; a recording takes a tenth of a second
-        try:
-            loaded = self.setup.load(recording)
-        except RecordingError as error:
-            analysis = OrderAnalysis(
-                recording=recording,
-                baseline=self.baseline_name,
-                setup=self.setup,
-                quality=DataQuality(0),
-                refused=str(error),
-            )
-        else:
-            analysis = analyse_orders(loaded, self.setup, self.baseline, self.baseline_name)
-        return Outcome(analysis.as_json(), analysis.describe(), analysis.refused is not None)

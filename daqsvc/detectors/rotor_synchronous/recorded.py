@@ -6,40 +6,54 @@ the one that watches the machine live.
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.analysis import quality as checks
-from daqsvc.analysis.alarms import Places, declared_at, rotor_alarms
 from daqsvc.analysis.quality import ClippedError, Complaint, DataQuality
-from daqsvc.analysis.result import RotorAnalysis, Step, Trace
-from daqsvc.analysis.setup import RefusedError
-from daqsvc.analysis.speed import LEAST_JUDGED, refuse_coarse, speed_of, too_short
+from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
+from daqsvc.detectors.rotor_synchronous.recorded_speed import (
+    LEAST_JUDGED,
+    KeyphasorChannel,
+    RotorSetup,
+    refuse_coarse,
+    speed_of,
+    too_short,
+)
+from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
+from daqsvc.detectors.shaft.verdict import Instant, RotorAlarm, RotorVerdict, Step, Trace
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, known
 from daqsvc.dsp.probes import Probe
 from daqsvc.recording.channels import to_um
+from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.calibration.record import baseline_at
 from daqsvc.rotor.synchronous.baseline import Calibration, compensated
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.severity import levels
 from daqsvc.rotor.synchronous.signatures import likelihoods
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
+from daqsvc.rotor.synchronous.watch import WatchRules
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.setup import RotorSetup
+    from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
+    from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.signatures import RotorFault
     from daqsvc.rotor.synchronous.watch import WatchReport
+    from daqsvc.settings.models import Keyphasor, MachineFile, ProximityProbe
 
     Floats = NDArray[np.float64]
 
@@ -55,6 +69,91 @@ _SEEN = 128
 """Revolutions that say what a healthy machine looks like at the end."""
 
 
+class RecordedRotor(RecordedDetector[RotorSynchronous]):
+    """The calibrated rotor in recordings; see `RecordedDetector`.
+
+    Attributes:
+        setup: what is known of it.
+
+    Raises:
+        ValueError: its figures contradict each other, or its calibration cannot be used.
+    """
+
+    part = "rotor"
+
+    def __init__(self, machine: MachineFile, given: RotorSynchronous, options: RecordingOptions) -> None:
+        super().__init__(machine, given, options)
+        self.setup = _setup(machine, given, options)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """See `RecordedDetector.sensors`."""
+        return self.given.sensors
+
+    def as_recorded(self, sensors: Container[str]) -> RotorSynchronous:
+        """See `RecordedDetector.as_recorded`: without one of its sensors a recording is refused."""
+        del sensors
+        return self.given
+
+    def not_judged(self, recording: str, why: str) -> RotorVerdict:
+        """See `RecordedDetector.not_judged`."""
+        rate = self.setup.rules.false_alarms_per_1000_rev
+        verdict = RotorVerdict.not_judged(recording, why)
+        if not self.options.in_memory:
+            return verdict
+        return replace(verdict, false_alarms_per_1000_rev=rate, threshold_nats=threshold_for(rate))
+
+    def evaluate(self, recorded: Recorded, given: RotorSynchronous, progress: Progress | None) -> Evaluated:
+        """See `RecordedDetector.evaluate`."""
+        del given
+        setup = replace(self.setup, ac_coupled=recorded.machine.ac_coupled)
+        verdict = analyse(recorded.recording, setup, progress)
+        draw = None if verdict.trace is None else partial(_draw, recorded.recording, setup, verdict)
+        return Evaluated(verdict=verdict, draw=draw)
+
+
+def _draw(recording: Recording, setup: RotorSetup, verdict: RotorVerdict, prefix: str) -> None:
+    from daqsvc.detectors.rotor_synchronous.plots import draw  # noqa: PLC0415 - brings matplotlib
+
+    draw(recording, setup, verdict, prefix)
+
+
+def _setup(machine: MachineFile, given: RotorSynchronous, options: RecordingOptions) -> RotorSetup:
+    """The calibrated rotor of a machine file, as `analyse` wants it.
+
+    Raises:
+        ValueError: its figures contradict each other, or its calibration cannot be used.
+    """
+    x, y = (cast("ProximityProbe", machine.sensor(name)) for name in given.probes)
+    keyphasor = None
+    if given.reference == "keyphasor" and given.keyphasor is not None:
+        sensor = cast("Keyphasor", machine.sensor(given.keyphasor))
+        keyphasor = KeyphasorChannel(
+            sensor.name, known(sensor.threshold_v), sensor.edge, known(sensor.hysteresis_v)
+        )
+    rules = WatchRules(
+        calibrate_revolutions=given.calibrate_revolutions,
+        false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
+        probe_drift_um=given.probe_drift_um,
+        retry=False,
+    )
+    threshold_for(rules.false_alarms_per_1000_rev)
+    rotor, calibrations = healthy_rotor(machine, given, options.calibration)
+    return RotorSetup(
+        probes=(x.name, y.name),
+        probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),
+        rotor=rotor,
+        speed_rpm=known(machine.machine.speed_rpm),
+        speed_step_rpm=options.speed_step_rpm,
+        unit=cast("LengthUnit", options.unit or x.unit),
+        keyphasor=keyphasor,
+        follow_orbit=given.reference == "orbit",
+        rules=rules,
+        calibrations=calibrations,
+        ac_coupled=machine.ac_coupled,
+    )
+
+
 @dataclass(slots=True)
 class _Watched:
     """What the detector says of every revolution that it could fit."""
@@ -68,15 +167,13 @@ class _Watched:
         self.vectors.append(vectors)
 
 
-def analyse(
-    recording: Recording, setup: RotorSetup, progress: Callable[[int, int], None] | None = None
-) -> RotorAnalysis:
+def analyse(recording: Recording, setup: RotorSetup, progress: Progress | None = None) -> RotorVerdict:
     """Judge a recording.
 
     The first revolutions are the healthy machine, unless ``setup`` has a calibration.
 
     Args:
-        recording: with the channels of ``setup.columns``, by their names there.
+        recording: with the channels of ``setup.names``, by their names there.
         setup: what is known.
         progress: told the samples done and to do, now and then.
 
@@ -90,7 +187,7 @@ def analyse(
     except RefusedError as error:
         if isinstance(error, ClippedError):
             quality = error.quality
-        return RotorAnalysis(
+        return RotorVerdict(
             recording=str(recording.source),
             quality=quality,
             refused=str(error),
@@ -101,28 +198,17 @@ def analyse(
         )
 
 
-def refused(source: str, setup: RotorSetup, why: str) -> RotorAnalysis:
-    """The verdict about a recording that cannot even be read."""
-    return RotorAnalysis(
-        recording=source,
-        quality=DataQuality(0),
-        refused=why,
-        false_alarms_per_1000_rev=setup.rules.false_alarms_per_1000_rev,
-        threshold_nats=threshold_for(setup.rules.false_alarms_per_1000_rev),
-    )
-
-
 def _judge(
     recording: Recording,
     setup: RotorSetup,
     quality: DataQuality,
     watched: _Watched,
-    progress: Callable[[int, int], None] | None,
-) -> RotorAnalysis:
+    progress: Progress | None,
+) -> RotorVerdict:
     samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    samples = samples[:, [recording.names.index(name) for name in setup.columns]]
+    samples = samples[:, [recording.names.index(name) for name in setup.names]]
     samples[:, :2] = to_um(samples[:, :2], setup.unit)
-    checks.refuse_unreadable(tuple(setup.columns), samples)
+    checks.refuse_unreadable(tuple(setup.names), samples)
     checks.refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
     speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
@@ -185,7 +271,7 @@ def _feed(
     samples: Floats,
     rate_hz: float,
     period_samples: float,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
 ) -> tuple[Complaint, ...]:
     """Hand the recording to the detector in windows; what it complains of, each kind once."""
     reasons: list[str] = []
@@ -214,7 +300,7 @@ class _Reading:
     vectors: SynchronousVectors
     complaints: tuple[Complaint, ...]
 
-    def verdict(self, quality: DataQuality) -> RotorAnalysis:
+    def verdict(self, quality: DataQuality) -> RotorVerdict:
         watch = self.detector.watch
         unusable = watch.revolutions - len(self.vectors)
         quality = replace(
@@ -233,7 +319,7 @@ class _Reading:
         departed = self._departed()
         places = Places(self.reports, self.vectors.period_samples, self.recording.rate_hz)
         threshold = threshold_for(self.setup.rules.false_alarms_per_1000_rev)
-        analysis = RotorAnalysis(
+        analysis = RotorVerdict(
             recording=str(self.recording.source),
             quality=quality,
             verdict="normal",
@@ -350,3 +436,106 @@ def posterior(evidence: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
     top = max(evidence.values(), default=0.0)
     weights = {name: math.exp(nats - top) for name, nats in evidence.items()}
     return {name: weight / math.fsum(weights.values()) for name, weight in weights.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where the revolutions of a recording lie.
+
+    Attributes:
+        reports: one for each revolution that could be fitted.
+        period_samples: float64, samples in each of them.
+        rate_hz: sampling rate.
+    """
+
+    reports: Sequence[WatchReport]
+    period_samples: NDArray[np.float64]
+    rate_hz: float
+
+    def onset(self, departed: WatchReport) -> Instant:
+        """Where the revolution begins that the change is estimated to begin with."""
+        first = departed.onset_revolution or departed.revolution
+        place = bisect.bisect_left(self.reports, first, key=lambda report: report.revolution)
+        place = min(place, len(self.reports) - 1)
+        begin = self.reports[place].end_index - round(float(self.period_samples[place]))
+        return self._instant(max(0, begin), first - 1)
+
+    def end_of(self, report: WatchReport) -> Instant:
+        """Where a revolution ends."""
+        return self._instant(report.end_index, report.revolution)
+
+    def _instant(self, sample: int, revolution: int) -> Instant:
+        return Instant(sample, sample / self.rate_hz, revolution)
+
+
+def rotor_alarms(places: Places, last: Identification | None) -> tuple[RotorAlarm, ...]:
+    """Every alarm of a recording, in order.
+
+    The departure that takes a machine back to its healthy state is no alarm, but the end of the one before.
+
+    Args:
+        places: the recording.
+        last: the look at its end; None if the machine is healthy then.
+    """
+    alarms: list[RotorAlarm] = []
+    segment: list[WatchReport] = []
+    up = 0  # alarms before those that are up
+
+    def clear(at: WatchReport) -> None:
+        nonlocal up
+        closing = _alarm(places, segment)
+        # The way back to health is a change, too: the end of the alarm before and not one of its own.
+        if len(alarms) == up or set(closing.group) not in ({*alarms[-1].group}, set()):
+            alarms.append(closing)
+        alarms[up:] = [replace(alarm, returned=places.end_of(at)) for alarm in alarms[up:]]
+        up = len(alarms)
+        segment.clear()
+
+    for report in places.reports:
+        if report.departed:
+            if segment:
+                alarms.append(_alarm(places, segment))
+            segment = [report]
+        elif segment and report.state == "watching":
+            clear(report)
+        elif segment:
+            segment.append(report)
+    if segment and last is not None and last.verdict == "normal":
+        clear(segment[-1])
+    elif segment:
+        alarms.append(_alarm(places, segment, last))
+    return tuple(alarms)
+
+
+def declared_at(
+    places: Places, reports: Sequence[WatchReport], last: Identification | None
+) -> Instant | None:
+    """Where a group was first named.
+
+    Args:
+        places: the recording.
+        reports: among which to look, in order.
+        last: the look that names it; None if none does.
+    """
+    if last is None or not last.named:
+        return None
+    for report in reports:
+        said = report.identification
+        if report.looked and said is not None and said.named and set(said.group) == set(last.group):
+            return places.end_of(report)
+    return places.end_of(places.reports[-1])
+
+
+def _alarm(places: Places, segment: Sequence[WatchReport], last: Identification | None = None) -> RotorAlarm:
+    looks = [report.identification for report in segment if report.looked and report.identification]
+    # A name is kept through one look that sees a healthy machine: such a look says nothing of the fault.
+    faulty = [look for look in looks if look.verdict != "normal" and "normal" not in look.candidates]
+    seen = last or (faulty[-1] if faulty else None)
+    return RotorAlarm(
+        onset=places.onset(segment[0]),
+        departure=places.end_of(segment[0]),
+        declaration=declared_at(places, segment, seen),
+        verdict=None if seen is None else seen.verdict,
+        group=() if seen is None else seen.group,
+        returned=None,
+    )

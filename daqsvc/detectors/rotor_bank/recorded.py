@@ -1,19 +1,23 @@
-"""The verdict of a rotor bank over a recording, in the words of `RotorAnalysis`."""
+"""The rotor's model bank over a recording: its verdict, in the words of `RotorVerdict`."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
+from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from daqsvc.analysis.quality import complaints, known_against
-from daqsvc.analysis.result import Instant, RotorAnalysis, Step
+from daqsvc.detectors.rotor_bank.build import bank_detector
+from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.detectors.shaft.verdict import Instant, RotorVerdict, Step
+from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, statements_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Container, Mapping, Sequence
 
-    from daqsvc.analysis.statements import Statements
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.diagnosis.recorded import Progress, Recorded, Statements
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.synchronous.signatures import RotorFault
 
@@ -24,14 +28,51 @@ _CLOSED_LIST = (
 )
 
 
-def bank_analysis(recording: Recording, said: Statements) -> RotorAnalysis:
+class RecordedBank(RecordedDetector[RotorBank]):
+    """The model bank in recordings; see `RecordedDetector`."""
+
+    part = "rotor"
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """See `RecordedDetector.sensors`."""
+        return self.given.sensors
+
+    def as_recorded(self, sensors: Container[str]) -> RotorBank | None:
+        """See `RecordedDetector.as_recorded`."""
+        return self.given if all(name in sensors for name in self.given.sensors) else None
+
+    def not_judged(self, recording: str, why: str) -> RotorVerdict:
+        """See `RecordedDetector.not_judged`."""
+        return RotorVerdict.not_judged(recording, why)
+
+    def evaluate(self, recorded: Recorded, given: RotorBank, progress: Progress | None) -> Evaluated:
+        """See `RecordedDetector.evaluate`."""
+        del progress
+        detector = bank_detector(recorded.machine, given)
+        (statements,) = statements_of(detector, recorded)
+        return Evaluated(
+            (statements,),
+            bank_verdict(recorded.recording, statements, detector.faults),
+            partial(_draw, recorded.recording, statements, tuple(detector.faults)),
+        )
+
+
+def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], prefix: str) -> None:
+    from daqsvc.detectors.rotor_bank.plots import draw_bank  # noqa: PLC0415 - brings matplotlib
+
+    draw_bank(recording, statements, modes, f"{prefix}-bank")
+
+
+def bank_verdict(recording: Recording, said: Statements, faults: Mapping[str, str]) -> RotorVerdict:
     """What a recording says about a rotor by its bank alone.
 
     Modes become the faults that they stand for; levels of one fault are one verdict.
 
     Args:
         recording: the recording.
-        said: all that the bank said, with the fault of each mode.
+        said: all that the bank said.
+        faults: the fault that each mode stands for.
     """
     quality = known_against(recording)
     source = str(recording.source)
@@ -40,32 +81,32 @@ def bank_analysis(recording: Recording, said: Statements) -> RotorAnalysis:
     for complaint in complaints(one.reason for one in poor):
         quality = quality.with_problem(complaint.describe())
     if not said.diagnoses:
-        return RotorAnalysis.not_judged(
+        return RotorVerdict.not_judged(
             source, "the recording is too short for the rotor bank: not one revolution", quality
         )
     if len(poor) > len(judged):
-        return RotorAnalysis.not_judged(source, poor[-1].reason, quality)
+        return RotorVerdict.not_judged(source, poor[-1].reason, quality)
     last = judged[-1]
-    group = _faults(last, said)
+    group = _faults(last, faults)
     if not group:
-        return RotorAnalysis.not_judged(
+        return RotorVerdict.not_judged(
             source,
             f"the bank has not decided in {last.revolutions or 0.0:.0f} revolutions; give a longer recording",
             quality,
         )
-    steps, departed, onset, named = _history(judged, said)
+    steps, departed, onset, named = _history(judged, faults)
     chances: dict[RotorFault, float] = defaultdict(float)
     for mode, probability in last.probabilities.items():
-        chances[cast("RotorFault", said.faults.get(mode, mode))] += probability
+        chances[cast("RotorFault", faults.get(mode, mode))] += probability
     changed = group[0] != "normal" and departed is not None
     if changed:
         quality = quality.with_problem(_CLOSED_LIST)
-    return RotorAnalysis(
+    return RotorVerdict(
         recording=source,
         quality=quality,
         verdict=group[0],
         group=group,
-        named=last.decision in said.faults,
+        named=last.decision in faults,
         probabilities=chances,
         evidence=cast("dict[RotorFault, float]", dict(last.evidence)),
         onset=_instant(onset, recording.rate_hz, last) if changed and onset is not None else None,
@@ -78,29 +119,29 @@ def bank_analysis(recording: Recording, said: Statements) -> RotorAnalysis:
     )
 
 
-def _faults(said: Diagnosis, bank: Statements) -> tuple[RotorFault, ...]:
+def _faults(said: Diagnosis, faults: Mapping[str, str]) -> tuple[RotorFault, ...]:
     """The faults that a statement leaves, the decision first."""
-    modes = [mode for mode in (said.decision, *said.group) if mode in bank.faults]
-    return tuple(dict.fromkeys(cast("RotorFault", bank.faults[mode]) for mode in modes))
+    modes = [mode for mode in (said.decision, *said.group) if mode in faults]
+    return tuple(dict.fromkeys(cast("RotorFault", faults[mode]) for mode in modes))
 
 
 def _history(
-    judged: Sequence[Diagnosis], bank: Statements
+    judged: Sequence[Diagnosis], faults: Mapping[str, str]
 ) -> tuple[tuple[Step, ...], Diagnosis | None, int | None, Diagnosis | None]:
     """Changes of the verdict; the statements that raised the alarm and gave the last name, and the onset."""
     steps: list[Step] = []
     departed = named = None
     onset: int | None = None
     for said in judged:
-        group = _faults(said, bank)
+        group = _faults(said, faults)
         if not group:
             continue
-        settled = said.decision in bank.faults
+        settled = said.decision in faults
         if group == ("normal",):
             departed = named = onset = None
         elif departed is None:
             departed, onset = said, said.first_index
-        if settled and group != ("normal",) and (named is None or set(_faults(named, bank)) != set(group)):
+        if settled and group != ("normal",) and (named is None or set(_faults(named, faults)) != set(group)):
             named = said
         step = Step(math.floor(said.revolutions or 0.0), group[0], group, settled)
         if not steps or (steps[-1].group, steps[-1].named) != (step.group, step.named):

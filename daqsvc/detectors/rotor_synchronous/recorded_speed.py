@@ -1,25 +1,32 @@
-"""The speed that a recording is cut into revolutions by, and whether the recording agrees with it."""
+"""What has to be known of a rotor before a recording of it can be judged, and above all its speed.
+
+That is what a recording is cut into revolutions by; the recording must agree with it.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.analysis.setup import RefusedError
 from daqsvc.dsp.speed.keyphasor import EdgeFinder, KeyphasorProbe
 from daqsvc.dsp.speed.orbit import estimate_speed
 from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
+from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
+from daqsvc.rotor.synchronous.watch import WatchRules
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.analysis.quality import DataQuality
-    from daqsvc.analysis.setup import Keyphasor, RotorSetup
+    from daqsvc.dsp.speed.keyphasor import Edge
+    from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
+    from daqsvc.rotor.laval import LavalRotor
+    from daqsvc.rotor.synchronous.baseline import Calibration
 
     Floats = NDArray[np.float64]
 
@@ -46,6 +53,71 @@ _ROUNDING = 0.5
 """Part of a revolution that the interpolation of the first and the last pulse may cost."""
 _STRONGER = 4.0
 """So many times the 1X amplitude another line may have and still be a whirl or a harmonic."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyphasorChannel:
+    """The keyphasor of a recording.
+
+    Attributes:
+        name: its channel.
+        threshold: level that marks the edge, in the unit of the channel; None: half way between the lowest
+            and the highest value.
+        edge: the edge that marks angle zero.
+        hysteresis: how far the signal must return before there can be another edge; None: a fifth of its
+            range.
+    """
+
+    name: str
+    threshold: float | None = None
+    edge: Edge = "rising"
+    hysteresis: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotorSetup:
+    """What `daqsvc.detectors.rotor_synchronous.recorded.analyse` needs to know.
+
+    Attributes:
+        probes: names of the two channels.
+        rotor: what is known about the rotor.
+        probe_angles_deg: where they point, from +x against the clock.
+        speed_rpm: shaft speed, negative if the shaft turns clockwise; may be None with a keyphasor.
+        speed_step_rpm: step of the stated speed's last digit, which it is rounded to; 0: it is exact.
+        unit: unit of the probes' samples.
+        keyphasor: the keyphasor, if there is one.
+        follow_orbit: take speed and angle from the orbit's own 1X, about ``speed_rpm``.
+        rules: of calibration, departure and naming.
+        calibrations: healthy states of an earlier time, each at another speed, of which the measured speed
+            chooses; without any the first revolutions are the healthy state.
+        ac_coupled: whether the probes lack their mean position.
+
+    Raises:
+        ValueError: the speed comes from nowhere.
+    """
+
+    probes: tuple[str, str]
+    rotor: LavalRotor
+    speed_rpm: float | None
+    probe_angles_deg: tuple[float, float] = (0.0, 90.0)
+    speed_step_rpm: float = 0.0
+    unit: LengthUnit = "um"
+    keyphasor: KeyphasorChannel | None = None
+    follow_orbit: bool = False
+    rules: WatchRules = field(default_factory=lambda: WatchRules(retry=False))
+    calibrations: tuple[Calibration, ...] = ()
+    ac_coupled: bool = False
+
+    def __post_init__(self) -> None:
+        if self.speed_rpm is None and self.keyphasor is None:
+            raise ValueError(
+                "the speed is not known: give it with --speed-rpm, or name a keyphasor with --keyphasor"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels, in the order of their columns."""
+        return self.probes if self.keyphasor is None else (*self.probes, self.keyphasor.name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +306,7 @@ def _line_um(orbit: Floats, rate_hz: float, rpm: float) -> float:
 
 
 def _keyphasor_speed(
-    recording: Recording, setup: RotorSetup, keyphasor: Keyphasor, marker: Floats, quality: DataQuality
+    recording: Recording, setup: RotorSetup, keyphasor: KeyphasorChannel, marker: Floats, quality: DataQuality
 ) -> tuple[Speed, DataQuality]:
     low, high = (float(value) for value in np.nanpercentile(marker, [0.1, 99.9]))
     threshold = (low + high) / 2.0 if keyphasor.threshold is None else keyphasor.threshold

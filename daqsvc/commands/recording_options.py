@@ -1,0 +1,623 @@
+"""The options of `analyze` and `calibrate`, and what is wrong with them together.
+
+They go by what is measured: probes on a rotor, accelerometers against a healthy run (orders), accelerometers
+on bearings. One of these stands in place of a machine file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daqsvc.commands.option_types import (
+    calibration_length,
+    count,
+    not_negative,
+    number,
+    percent,
+    positive,
+    probe_pair,
+    speed,
+)
+from daqsvc.recording.channels import (
+    ACCELERATION_UNITS,
+    LENGTH_UNITS,
+    add_max_memory,
+    channel_map,
+    sampling_rate_hz,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+MOST_CHANNELS = 2
+"""Accelerometers that a bearing is judged by."""
+CALIBRATE_REVOLUTIONS = 50
+FALSE_ALARMS_PER_1000_REV = 0.1
+FALSE_ALARM_PROBABILITY = 1e-3
+LIVE_REVOLUTIONS = 200
+TOLERANCE_PERCENT = 20.0
+
+_SHARED = ("--speed-rpm",)
+"""Of the options of a rotor, those that accelerometers have too."""
+_ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
+_ROTOR_ONLY = ("probes", "keyphasor", "natural_frequency_hz", "damping_ratio", "clearance_um", "sweep_rpm")
+
+
+def add_analyze_options(parser: argparse.ArgumentParser) -> None:
+    """All of ``daqsvc analyze``."""
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
+    )
+    _add_rotor_of_analyze(parser)
+    _add_orders(parser)
+    _add_bearings(parser)
+    _add_about_recordings(parser)
+    _add_output(parser)
+
+
+def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
+    """All of ``daqsvc calibrate``."""
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where the calibration is written (.toml)")
+    parser.add_argument("--json", action="store_true", help="say what was found as one JSON object")
+    parser.add_argument(
+        "--predict-rpm",
+        type=_speeds,
+        metavar="N,N,...",
+        help="speeds at which to predict 1X from a run-up (default: 0.5, 0.7, 0.95 and 1 of the critical)",
+    )
+    live = parser.add_argument_group("from the live bus")
+    live.add_argument("--live", action="store_true", help="listen to the machine instead of recordings")
+    live.add_argument(
+        "--revolutions",
+        type=calibration_length,
+        default=LIVE_REVOLUTIONS,
+        metavar="N",
+        help=f"usable revolutions to wait for (default: {LIVE_REVOLUTIONS})",
+    )
+    live.add_argument(
+        "--timeout-s",
+        type=positive,
+        metavar="S",
+        help="how long to wait for them (default: three times what they take, and 10 s)",
+    )
+    _add_about_healthy_recordings(parser)
+    _add_rotor(
+        parser.add_argument_group("without a machine file").add_argument,
+        speed_help="speed of the steady recordings, negative if clockwise; exact if there is no keyphasor",
+        told="; a run-up tells it",
+    )
+    _add_bearing_of_calibrate(parser)
+
+
+def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[str]]:
+    """The machine file, if the first file is one, and the recordings."""
+    first, *others = arguments.files
+    return (Path(first), others) if first.lower().endswith(".toml") else (None, arguments.files)
+
+
+def by_bearing(arguments: argparse.Namespace) -> bool:
+    """Whether the options are those of bearings."""
+    return arguments.bearing is not None or arguments.orders is not None
+
+
+def by_orders(arguments: argparse.Namespace) -> bool:
+    """Whether the options are those of accelerometers."""
+    return arguments.channels is not None or arguments.baseline is not None
+
+
+def analyze_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
+    """What is wrong with options of `analyze` that are sound one by one; empty if nothing is."""
+    if by_bearing(arguments):
+        return next(_bearing_misuse(arguments, machine), "")
+    if by_orders(arguments):
+        return _order_misuse(arguments, machine)
+    return _probe_misuse(arguments, machine, recordings)
+
+
+def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
+    if not recordings:
+        return (
+            f"{arguments.files[0]} is a machine file, and there is no recording after it; name at least one"
+        )
+    if machines := [name for name in recordings if name.lower().endswith(".toml")]:
+        return f"{machines[0]} is not a recording; a machine file comes first, and there is only one"
+    if arguments.unit in ACCELERATION_UNITS:
+        return f"--unit {arguments.unit}: proximity probes measure in {', '.join(LENGTH_UNITS)}"
+    given = _rotor_options(arguments)
+    if machine is not None:
+        extra = [name for name, is_there in given.items() if is_there]
+        return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
+    known = [
+        name
+        for name in ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um")
+        if given[name] and arguments.calibration is not None
+    ]
+    if known:
+        return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
+    return _lacking(arguments, given) or _unknown_channels(arguments)
+
+
+def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
+    """What is wrong with options of `calibrate` that are sound one by one; empty if nothing is."""
+    if calibrates_bearing(arguments):
+        return _healthy_bearing_misuse(arguments, machine, recordings)
+    if arguments.out is None and not arguments.json:
+        return "nothing would be kept: give --out FILE, --json or both"
+    if machine is not None and (given := _rotor_given(arguments)):
+        return f"{', '.join(given)}: the machine file says this; leave it out"
+    if arguments.live:
+        return _live_misuse(arguments, machine, recordings)
+    if not recordings:
+        return "no recording is given; name one after the machine file, or listen to the machine with --live"
+    return "" if machine is not None else _lacking_to_calibrate(arguments, len(recordings))
+
+
+def calibrates_bearing(arguments: argparse.Namespace) -> bool:
+    """Whether the options are those of bearings."""
+    return any(getattr(arguments, name) is not None for name in ("channels", "bearing", "orders"))
+
+
+def bearing_recording_misuse(arguments: argparse.Namespace, recordings: Sequence[str]) -> str:
+    """What is wrong with what calibrates bearings, by options or by a machine file; empty if nothing is."""
+    if arguments.live:
+        return "--live is for rotors; the service learns the healthy state of bearings by itself"
+    if len(recordings) != 1:
+        return f"{len(recordings)} recordings are given; the healthy state of bearings is learnt from one"
+    if arguments.out is None and not arguments.json:
+        return "nothing would be kept: give --out FILE, --json or both"
+    return ""
+
+
+def channel_names(text: str) -> tuple[str, ...]:
+    """``NAME,...``: one or more channels.
+
+    Raises:
+        argparse.ArgumentTypeError: one is empty or named twice.
+    """
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"{text!r} does not name channels; write NAME,NAME, each once")
+    return names
+
+
+def probability(text: str) -> float:
+    """A false-alarm probability.
+
+    Raises:
+        argparse.ArgumentTypeError: it is not from 1e-9 to 0.5.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 1e-9 <= value <= 0.5:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a probability from 1e-9 to 0.5")
+    return value
+
+
+def fault_orders(text: str) -> dict[str, float]:
+    """``BPFI=F,BPFO=F,BSF=F,FTF=F``, in any order: positive numbers per revolution of the shaft.
+
+    Raises:
+        argparse.ArgumentTypeError: one is missing, unknown, given twice or no positive number.
+    """
+    form = ",".join(f"{key}=.." for key in _ORDER_KEYS)
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        key, _, value = (piece.strip() for piece in part.partition("="))
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if (
+            key.upper() not in _ORDER_KEYS
+            or key.upper() in found
+            or not (math.isfinite(number) and number > 0.0)
+        ):
+            raise argparse.ArgumentTypeError(f"{part!r} is no fault order; write {form}, each once")
+        found[key.upper()] = number
+    if missing := [key for key in _ORDER_KEYS if key not in found]:
+        raise argparse.ArgumentTypeError(f"{', '.join(missing)} missing in {text!r}; write {form}")
+    return found
+
+
+def _add_rotor_of_analyze(parser: argparse.ArgumentParser) -> None:
+    """Options that stand in for a machine file."""
+    rotor = parser.add_argument_group("without a machine file")
+    _add_rotor(
+        rotor.add_argument,
+        speed_help="shaft speed, negative if clockwise: nominal with a keyphasor, else exact to half of its "
+        "last digit",
+    )
+    rotor.add_argument("--follow-orbit", action="store_true", help="the same as --speed-rpm orbit:N")
+    rotor.add_argument(
+        "--calibrate-revs",
+        type=calibration_length,
+        default=CALIBRATE_REVOLUTIONS,
+        metavar="N",
+        help=f"revolutions of the healthy machine at the start (default: {CALIBRATE_REVOLUTIONS})",
+    )
+    rotor.add_argument(
+        "--false-alarms-per-1000-rev",
+        type=positive,
+        default=FALSE_ALARMS_PER_1000_REV,
+        metavar="R",
+        help=f"rate of false alarms to accept (default: {FALSE_ALARMS_PER_1000_REV:g})",
+    )
+
+
+def _add_orders(parser: argparse.ArgumentParser) -> None:
+    """Options of accelerometers, in place of those of probes."""
+    orders = parser.add_argument_group("accelerometers, in place of probes")
+    orders.add_argument(
+        "--channels", type=channel_names, metavar="NAME,...", help="channels of one unit, e.g. the three axes"
+    )
+    orders.add_argument(
+        "--baseline", metavar="HEALTHY_REC", help="a recording of the healthy machine at the same speed"
+    )
+    orders.add_argument(
+        "--false-alarm-probability",
+        type=probability,
+        default=FALSE_ALARM_PROBABILITY,
+        metavar="P",
+        help=f"of a recording of the unchanged machine, at most (default: {FALSE_ALARM_PROBABILITY:g})",
+    )
+
+
+def _add_bearings(parser: argparse.ArgumentParser) -> None:
+    """Options of bearings, beside those of accelerometers."""
+    bearings = parser.add_argument_group("bearings, with --channels and --speed-rpm")
+    bearings.add_argument("--bearing", metavar="NAME", help="designation in the catalogue, e.g. 6205-2RS")
+    bearings.add_argument(
+        "--orders",
+        type=fault_orders,
+        metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
+        help="fault orders per revolution of the shaft, in place of --bearing",
+    )
+    bearings.add_argument(
+        "--baseline-map",
+        type=channel_map,
+        default={},
+        metavar="NAME=VARIABLE,...",
+        help="which variable of the healthy run is which channel, where that is not as in the recordings",
+    )
+    bearings.add_argument(
+        "--baseline-fs", type=sampling_rate_hz, metavar="HZ", help="its sampling rate (default: --fs)"
+    )
+
+
+def _add_about_recordings(parser: argparse.ArgumentParser) -> None:
+    """Options that both forms know."""
+    both = parser.add_argument_group("about the recordings")
+    _add_channel_map(both.add_argument)
+    both.add_argument(
+        "--unit",
+        choices=(*LENGTH_UNITS, *ACCELERATION_UNITS),
+        help="unit of the samples (default: um, or the machine file's; of accelerometers: g)",
+    )
+    both.add_argument(
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="the healthy machine as daqsvc calibrate wrote it, in place of the first revolutions",
+    )
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    """What comes out, and how."""
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "--json", action="store_true", help="one JSON object a line for each recording, in the order given"
+    )
+    output.add_argument(
+        "--plot",
+        type=Path,
+        metavar="DIR",
+        help="write figures there: orbit, Poincare map, phase plane, probabilities, innovations, polar plot",
+    )
+    output.add_argument(
+        "--jobs",
+        type=count,
+        metavar="N",
+        help="processes at a time (default: as many as there are cores, fewer for a few recordings)",
+    )
+
+
+def _add_about_healthy_recordings(parser: argparse.ArgumentParser) -> None:
+    about = parser.add_argument_group("about the recordings")
+    _add_channel_map(about.add_argument)
+    about.add_argument("--unit", choices=LENGTH_UNITS, help="unit of the probes' samples (default: um)")
+    about.add_argument(
+        "--sweep-rpm",
+        type=_sweep,
+        metavar="FROM,TO",
+        help="the first recording is a run-up without a keyphasor: the speed goes evenly from FROM at its "
+        "first sample to TO at its last, angle zero at the first",
+    )
+
+
+def _add_bearing_of_calibrate(parser: argparse.ArgumentParser) -> None:
+    """Options of bearings, in place of those of the rotor."""
+    bearings = parser.add_argument_group("bearings, with --speed-rpm, in place of the rotor")
+    bearings.add_argument(
+        "--channels",
+        type=channel_names,
+        metavar="NAME[,NAME]",
+        help="accelerometers on the housings; name them as the sensors of the machine file are",
+    )
+    bearings.add_argument("--bearing", metavar="NAME", help="designation in the catalogue, e.g. 6205-2RS")
+    bearings.add_argument(
+        "--orders",
+        type=fault_orders,
+        metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
+        help="fault orders per revolution of the shaft, in place of --bearing",
+    )
+
+
+class _MergedMap(argparse.Action):
+    """``--map A=1,B=2 --map C=3``: all of them, none twice."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        assert isinstance(values, dict)  # noqa: S101 - made by channel_map
+        merged = dict(getattr(namespace, self.dest))
+        for name, variable in values.items():
+            if name in merged:
+                parser.error(f"{option_string} names {name!r} twice; give each channel one variable")
+            merged[name] = variable
+        setattr(namespace, self.dest, merged)
+
+
+def _add_channel_map(add: Callable[..., argparse.Action]) -> None:
+    """What the recordings call their channels, and how fast they were sampled.
+
+    Args:
+        add: ``add_argument`` of the group that takes the options.
+    """
+    add(
+        "--map",
+        type=channel_map,
+        action=_MergedMap,
+        default={},
+        metavar="NAME=VARIABLE,...",
+        help="which variable of the recordings is which channel or sensor (default: the one of its name)",
+    )
+    add("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it")
+    add_max_memory(add)
+
+
+def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: str = "") -> None:
+    """Probes, speed and rotor, which a machine file says otherwise.
+
+    Args:
+        add: ``add_argument`` of the group that takes the options.
+        speed_help: what the speed is.
+        told: what is said beside the rotor's figures, where something else can tell them.
+    """
+    add("--probes", type=probe_pair, metavar="X,Y", help="channels of the two probes, y 90 degrees after x")
+    add(
+        "--speed-rpm",
+        type=speed,
+        metavar="N",
+        help=f"{speed_help}; orbit:N follows the orbit's own 1X about N",
+    )
+    add("--keyphasor", metavar="CH", help="channel of the keyphasor, one pulse a revolution")
+    add(
+        "--keyphasor-threshold",
+        type=number,
+        metavar="V",
+        help="level that marks its edge, in the channel's unit (default: half way from low to high)",
+    )
+    for name, unit, metavar, about in (
+        ("natural-frequency", "hz", "F", "natural frequency of the healthy shaft"),
+        ("damping", "ratio", "Z", "its damping ratio"),
+    ):
+        add(f"--{name}-{unit}", type=positive, metavar=metavar, help=f"{about}{told}")
+        add(
+            f"--{name}-tolerance",
+            type=percent,
+            default=TOLERANCE_PERCENT,
+            metavar="PERCENT",
+            help=f"how far that may be off (default: {TOLERANCE_PERCENT:g})",
+        )
+    add("--clearance-um", type=positive, metavar="C", help="radial clearance to the stator")
+    add(
+        "--static-sag-um",
+        type=not_negative,
+        metavar="S",
+        help="sag of the shaft under its weight (default: g / omega^2; 0 if it stands upright)",
+    )
+    add("--ac-coupled", action="store_true", help="the probes have no mean position: do not look at it")
+
+
+def _rotor_options(arguments: argparse.Namespace) -> dict[str, bool]:
+    """Which of the options of `_add_rotor_of_analyze` are given."""
+    return {
+        "--probes": arguments.probes is not None,
+        "--speed-rpm": arguments.speed_rpm is not None,
+        "--follow-orbit": arguments.follow_orbit,
+        "--keyphasor": arguments.keyphasor is not None,
+        "--keyphasor-threshold": arguments.keyphasor_threshold is not None,
+        "--natural-frequency-hz": arguments.natural_frequency_hz is not None,
+        "--damping-ratio": arguments.damping_ratio is not None,
+        "--clearance-um": arguments.clearance_um is not None,
+        "--static-sag-um": arguments.static_sag_um is not None,
+        "--calibrate-revs": arguments.calibrate_revs != CALIBRATE_REVOLUTIONS,
+        "--false-alarms-per-1000-rev": arguments.false_alarms_per_1000_rev != FALSE_ALARMS_PER_1000_REV,
+        "--ac-coupled": arguments.ac_coupled,
+        "--natural-frequency-tolerance": arguments.natural_frequency_tolerance != TOLERANCE_PERCENT,
+        "--damping-tolerance": arguments.damping_tolerance != TOLERANCE_PERCENT,
+    }
+
+
+def _lacking(arguments: argparse.Namespace, given: dict[str, bool]) -> str:
+    needed = ["--probes"]
+    if arguments.calibration is None:
+        needed += ["--natural-frequency-hz", "--damping-ratio"]
+    if arguments.keyphasor is None:
+        needed.append("--speed-rpm")
+        if arguments.keyphasor_threshold is not None:
+            return "--keyphasor-threshold without --keyphasor: name the channel of the keyphasor"
+    missing = [name for name in needed if not given[name]]
+    if not missing:
+        return ""
+    instead = ", or --keyphasor in place of --speed-rpm" if "--speed-rpm" in missing else ""
+    return f"without a machine file, {', '.join(missing)} must be given{instead}"
+
+
+def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
+    """What is wrong with the options of accelerometers together; empty if nothing is."""
+    if machine is not None:
+        return "--channels, --baseline: the machine file says what is measured; leave them out"
+    given = {
+        **_rotor_options(arguments),
+        "--calibration": arguments.calibration is not None,
+        "--plot": arguments.plot is not None,
+    }
+    if extra := [name for name, is_there in given.items() if is_there and name not in _SHARED]:
+        return f"{', '.join(extra)}: not with --channels and --baseline; leave it out"
+    missing = [
+        name
+        for name, value in (
+            ("--channels", arguments.channels),
+            ("--baseline", arguments.baseline),
+            ("--speed-rpm", arguments.speed_rpm),
+        )
+        if value is None
+    ]
+    if missing:
+        bearing = "to judge a bearing, --bearing or --orders; " if arguments.baseline is None else ""
+        told = ", ".join(missing)
+        return f"{bearing}to compare accelerometers with a healthy run, {told} must be given too"
+    if arguments.speed_rpm.orbit:
+        return "--speed-rpm orbit:N needs two probes; with --channels give the nominal speed alone"
+    if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
+        return f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
+    return ""
+
+
+def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iterator[str]:
+    """What is wrong with the options of bearings together."""
+    if machine is not None:
+        yield "--bearing, --orders: the machine file says which bearings there are; leave them out"
+    if arguments.bearing is not None and arguments.orders is not None:
+        yield "--bearing and --orders both say what the bearing is; leave out one of them"
+    if arguments.calibration is not None:
+        yield (
+            "--calibration: goes with a machine file, whose bearings it was learnt for; with --bearing or "
+            "--orders give the healthy recording itself, --baseline FILE"
+        )
+    given = _rotor_options(arguments)
+    if extra := [name for name, is_there in given.items() if is_there and name not in _SHARED]:
+        yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
+    missing = [
+        name
+        for name, value in (("--channels", arguments.channels), ("--speed-rpm", arguments.speed_rpm))
+        if value is None
+    ]
+    if missing:
+        yield f"to judge a bearing, {', '.join(missing)} must be given too"
+    elif len(arguments.channels) > MOST_CHANNELS:
+        yield f"--channels names {len(arguments.channels)} accelerometers; a bearing is judged by one or two"
+    elif arguments.speed_rpm.orbit:
+        yield "--speed-rpm orbit:N needs two probes; with --bearing give the speed alone"
+    if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
+        yield f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
+    if arguments.baseline is None and (arguments.baseline_map or arguments.baseline_fs is not None):
+        yield "--baseline-map, --baseline-fs: there is no --baseline that they could be about"
+
+
+def _healthy_bearing_misuse(
+    arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]
+) -> str:
+    """What is wrong with the options of bearings together; empty if nothing is."""
+    if machine is not None:
+        return "--channels, --bearing, --orders: the machine file says this; leave them out"
+    if extra := [name for name in _ROTOR_ONLY if getattr(arguments, name) is not None]:
+        return f"--{extra[0].replace('_', '-')}: not with --channels; a bearing is calibrated by itself"
+    needed = {"--channels": arguments.channels, "--speed-rpm": arguments.speed_rpm}
+    missing = [name for name, value in needed.items() if value is None]
+    if arguments.bearing is None and arguments.orders is None:
+        missing.append("--bearing or --orders")
+    if missing:
+        return f"to calibrate a bearing, {', '.join(missing)} must be given too"
+    if arguments.bearing is not None and arguments.orders is not None:
+        return "--bearing and --orders both say what the bearing is; leave out one of them"
+    if len(arguments.channels) > MOST_CHANNELS:
+        return f"--channels names {len(arguments.channels)} accelerometers; give one or two"
+    return bearing_recording_misuse(arguments, recordings)
+
+
+def _rotor_given(arguments: argparse.Namespace) -> list[str]:
+    options = {
+        "--probes": arguments.probes,
+        "--speed-rpm": arguments.speed_rpm,
+        "--keyphasor": arguments.keyphasor,
+        "--keyphasor-threshold": arguments.keyphasor_threshold,
+        "--natural-frequency-hz": arguments.natural_frequency_hz,
+        "--damping-ratio": arguments.damping_ratio,
+        "--clearance-um": arguments.clearance_um,
+        "--static-sag-um": arguments.static_sag_um,
+        "--ac-coupled": arguments.ac_coupled or None,
+    }
+    return [option for option, value in options.items() if value is not None]
+
+
+def _live_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
+    if machine is None:
+        return "--live needs a machine file, which says how to reach the machine"
+    if recordings or arguments.sweep_rpm:
+        return "--live listens to the machine; leave out recordings and --sweep-rpm, or leave out --live"
+    return ""
+
+
+def _lacking_to_calibrate(arguments: argparse.Namespace, recordings: int) -> str:
+    if arguments.probes is None:
+        return "without a machine file, --probes must be given"
+    if arguments.keyphasor is None and arguments.keyphasor_threshold is not None:
+        return "--keyphasor-threshold without --keyphasor: name the channel of the keyphasor"
+    if arguments.keyphasor is not None and arguments.sweep_rpm is not None:
+        return "--keyphasor and --sweep-rpm both say the speed; leave out one of them"
+    steady = recordings - (arguments.sweep_rpm is not None)
+    if arguments.keyphasor is None and arguments.speed_rpm is None and steady:
+        return (
+            "the speed is not known: give --speed-rpm for a steady recording, --sweep-rpm for a run-up, or "
+            "--keyphasor"
+        )
+    if (arguments.natural_frequency_hz is None) != (arguments.damping_ratio is None):
+        return "--natural-frequency-hz and --damping-ratio go together; give both, or a run-up instead"
+    return _unknown_channels(arguments)
+
+
+def _unknown_channels(arguments: argparse.Namespace) -> str:
+    """What is wrong with ``--map`` without a machine file; empty if nothing is."""
+    known = [*arguments.probes, *([arguments.keyphasor] if arguments.keyphasor is not None else [])]
+    unknown = [name for name in arguments.map if name not in known]
+    if not unknown:
+        return ""
+    return (
+        f"--map names {unknown[0]!r}, which --probes and --keyphasor do not; they name {', '.join(known)}: "
+        "write --map CHANNEL=VARIABLE for one of these"
+    )
+
+
+def _speeds(text: str) -> tuple[float, ...]:
+    return tuple(positive(one) for one in text.split(","))
+
+
+def _sweep(text: str) -> tuple[float, float]:
+    ends = [positive(one) for one in text.split(",")]
+    if len(ends) != 2 or ends[0] == ends[1]:
+        raise argparse.ArgumentTypeError(f"{text!r} is no sweep; write FROM,TO in revolutions per minute")
+    return ends[0], ends[1]

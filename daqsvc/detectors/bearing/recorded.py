@@ -1,0 +1,388 @@
+"""From a recording of accelerometers to a verdict about the bearings of a machine.
+
+With a machine file the live detector watches the recording from its first sample to its last. What options
+tell of is judged at one go (`analyse_bearings`), by the tests inside the detector.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.analysis.quality import DataQuality
+from daqsvc.bearing.identify import NotIdentifiableError
+from daqsvc.bearing.identify_change import ChangeRules, compare_residual
+from daqsvc.bearing.identify_file import load_bearing_baseline
+from daqsvc.bearing.race.judge import race_test
+from daqsvc.detectors.bearing.build import bearing_detector, orders_of
+from daqsvc.detectors.bearing.calibrating import HealthyRun
+from daqsvc.detectors.bearing.finding import BearingFinding, find
+from daqsvc.detectors.bearing.persistence import UNDETERMINED
+from daqsvc.detectors.bearing.recorded_checks import (
+    accelerometer_quality,
+    ball_order_problem,
+    meant_in_hz,
+    refuse_no_machine,
+    stated_speed_problem,
+    unit_problems,
+    with_offsets,
+    with_repairs,
+)
+from daqsvc.detectors.bearing.settings import Bearing
+from daqsvc.detectors.bearing.verdict import BearingSetup, BearingVerdict
+from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Statements
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import load_matching
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
+    from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
+    from daqsvc.detectors.bearing.detector import BearingDetector
+    from daqsvc.detectors.bearing.evaluation import Evaluation
+    from daqsvc.detectors.bearing.persistence import ConfirmedState
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
+    from daqsvc.recording.channels import AccelerationUnit
+    from daqsvc.recording.recording import Recording
+    from daqsvc.settings.models import MachineFile
+
+    Floats = NDArray[np.float64]
+
+
+class RecordedBearings(RecordedDetector[Bearing]):
+    """The bearings of a machine in recordings; see `RecordedDetector`.
+
+    Raises:
+        ValueError: a bearing is not known, or what they are compared with cannot be used.
+    """
+
+    part = "bearing"
+    takes_fewer = True
+
+    def __init__(self, machine: MachineFile, given: Bearing, options: RecordingOptions) -> None:
+        super().__init__(machine, given, options)
+        self._setup = setup_of(machine, given)
+        calibration = options.calibration
+        if calibration is None and given.calibration is not None:
+            calibration = machine.resolve(given.calibration)
+        if calibration is not None:
+            load_bearing_baseline(calibration)
+        self._healthy = None if options.healthy is None else self._load_healthy(options.healthy)
+
+    def _load_healthy(self, path: str) -> HealthyRun:
+        options = self.options
+        names = {**options.channels, **options.healthy_channels}
+        rate_hz = options.rate_hz if options.healthy_rate_hz is None else options.healthy_rate_hz
+        try:
+            wanted = {name: names.get(name, name) for name in self._setup.channels}
+            healthy = HealthyRun(self._setup, load_matching(path, wanted, rate_hz))
+            healthy.at(healthy.recording.rate_hz)
+        except (RecordingError, NotIdentifiableError) as error:
+            raise ValueError(f"healthy run {path}: {error}") from error
+        return healthy
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """See `RecordedDetector.sensors`."""
+        return self.given.sensors
+
+    def as_recorded(self, sensors: Container[str]) -> Bearing | None:
+        """The bearings whose accelerometers a recording has; None if there is none."""
+        given = self.given
+        bearings = tuple(
+            bearing
+            if bearing.rotor_sensor is None or bearing.rotor_sensor in sensors
+            else bearing.model_copy(update={"rotor_sensor": None, "model": None})
+            for bearing in given.bearings
+            if bearing.sensor in sensors
+        )
+        keyphasor = given.keyphasor if given.keyphasor in sensors else None
+        return given.model_copy(update={"bearings": bearings, "keyphasor": keyphasor}) if bearings else None
+
+    def not_judged(self, recording: str, why: str) -> BearingVerdict:
+        """See `RecordedDetector.not_judged`."""
+        return BearingVerdict(
+            recording=recording,
+            baseline=None if self._healthy is None else str(self._healthy.recording.source),
+            setup=self._setup,
+            quality=DataQuality(0),
+            refused=why,
+        )
+
+    def evaluate(self, recorded: Recorded, given: Bearing, progress: Progress | None) -> Evaluated:
+        """See `RecordedDetector.evaluate`."""
+        del progress  # a recording takes a tenth of a second
+        statements: tuple[Statements, ...] = ()
+        setup = setup_of(recorded.machine, given)
+        if self.options.in_memory:
+            verdict = _against(recorded.recording, setup, self._healthy)
+        else:
+            detector = bearing_detector(recorded.machine, given, None, self.options.calibration)
+            diagnoses, looks = _watched(detector, recorded)
+            statements = (Statements(detector.name, tuple(diagnoses), recorded.recording.rate_hz),)
+            verdict = _concluded(setup, recorded.recording, detector, diagnoses, looks)
+        draw = partial(_draw, verdict) if verdict.races else None
+        return Evaluated(statements=statements, verdict=verdict, draw=draw, shown=False)
+
+
+def setup_of(machine: MachineFile, given: Bearing) -> BearingSetup:
+    """What the bearings of a machine are judged by, in the words of an analysis.
+
+    Raises:
+        ValueError: a bearing is not known.
+    """
+    unit = machine.sensor(given.bearings[0].sensor).unit
+    return BearingSetup(
+        channels=tuple(bearing.name for bearing in given.bearings),
+        speed_rpm=abs(machine.machine.speed_rpm),
+        bearings={bearing.name: orders_of(bearing, i) for i, bearing in enumerate(given.bearings)},
+        designations={bearing.name: bearing.type for bearing in given.bearings if bearing.type is not None},
+        unit=cast("AccelerationUnit", unit),
+        change=ChangeRules(
+            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+        ),
+    )
+
+
+def _draw(verdict: BearingVerdict, prefix: str) -> None:
+    from daqsvc.detectors.bearing.plots import draw_envelopes  # noqa: PLC0415 - brings matplotlib
+
+    draw_envelopes(verdict, prefix)
+
+
+def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], list[Evaluation]]:
+    """Have the detector see a recording block by block, so that no look is missed: statements and looks."""
+    said: list[Diagnosis] = []
+    looks: list[Evaluation] = []
+    for statements in _watch(detector, recorded.samples_of(detector.stream), recorded.recording.rate_hz):
+        said += statements
+        if detector.seen is not None and (not looks or detector.seen is not looks[-1]):
+            looks.append(detector.seen)
+    return said, looks
+
+
+def _watch(detector: BearingDetector, samples: Floats, rate_hz: float) -> Iterator[Sequence[Diagnosis]]:
+    period_ns = NS_PER_S / rate_hz
+    whole = len(samples) // detector.block * detector.block
+    for begin in range(0, whole, detector.block):
+        end = begin + detector.block
+        yield detector.process(
+            Window(begin, samples[begin:end].astype(np.float32), round((end - 1) * period_ns), period_ns)
+        )
+    last = detector.finish(samples[whole:].astype(np.float32), round((len(samples) - 1) * period_ns))
+    if last is not None:
+        yield [last]
+
+
+def _concluded(
+    setup: BearingSetup,
+    recording: Recording,
+    detector: BearingDetector,
+    said: list[Diagnosis],
+    looks: list[Evaluation],
+) -> BearingVerdict:
+    """What the detector stands by at the end, with the figures of the look that shows it most."""
+    columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
+    quality = accelerometer_quality(setup.channels, recording.samples[:, columns], setup.unit)
+    good = [one for one in said if one.quality == "good"]
+    poor = [one for one in said if one.quality != "good"]
+    for reason in dict.fromkeys(one.reason for one in poor):
+        quality = quality.with_problem(reason)
+    analysis = BearingVerdict(
+        recording=str(recording.source),
+        baseline=None if detector.baseline is None else detector.baseline.source or None,
+        setup=setup,
+        quality=quality,
+    )
+    standing = detector.standing
+    look = _decisive(looks, standing)
+    if len(poor) > len(good):
+        return replace(analysis, refused=poor[-1].reason)
+    if look is None or look.finding is None or standing.decision == UNDETERMINED:
+        return replace(
+            analysis,
+            refused=f"the recording is too short: {len(recording.samples) / recording.rate_hz:.3g} s are not "
+            "enough for two looks that agree; give 10 s or more",
+        )
+    where = standing.where if standing.where in look.races else look.finding.where
+    finding = look.finding
+    if standing.decision != finding.verdict:
+        word = cast("RaceWord", standing.decision)
+        finding = replace(finding, verdict=word, group=standing.group or (word,), where=where)
+    change_at = max(look.changes, key=lambda name: look.changes[name].departure, default=None)
+    healthy = None
+    if detector.baseline is not None and change_at is not None:
+        sensors = next(bearing.sensors for bearing in detector.bearings if bearing.name == change_at)
+        healthy = detector.baseline.residuals[sensors]
+    return replace(
+        analysis,
+        finding=BearingFinding(
+            verdict=finding.verdict,
+            group=finding.group,
+            where=where,
+            probabilities=finding.probabilities,
+            severity=finding.severity,
+        ),
+        quality=with_offsets(quality, look.races),
+        races=look.races,
+        healthy=healthy,
+        change=look.change,
+    )
+
+
+def _decisive(looks: list[Evaluation], standing: ConfirmedState) -> Evaluation | None:
+    """The look that a standing verdict rests on: the strongest that found the same, or else the last."""
+    same = [
+        look
+        for look in looks
+        if look.finding is not None
+        and (look.finding.verdict, look.finding.where) == (standing.decision, standing.where)
+    ]
+    if not same:
+        return looks[-1] if looks else None
+    if standing.decision == "changed":
+        return max(same, key=lambda look: 0.0 if look.change is None else look.change.departure)
+    return max(same, key=lambda look: 0.0 if look.finding is None else look.finding.severity)
+
+
+def _against(recording: Recording, setup: BearingSetup, healthy: HealthyRun | None) -> BearingVerdict:
+    """Judge against the healthy run, unless that is none: it must not hide anything."""
+    if healthy is None:
+        return analyse_bearings(recording, setup)
+    source = healthy.recording.source
+    damage, doubt = healthy.against
+    if damage:
+        return analyse_bearings(recording, setup).with_problem(
+            f"the healthy run {source} is not used: {damage}; give one of the machine in good order"
+        )
+    try:
+        baseline = healthy.at(recording.rate_hz)
+    except NotIdentifiableError as error:
+        alone = analyse_bearings(recording, setup)
+        return alone.with_problem(f"the healthy run {source} is not used: {error}")
+    analysis = analyse_bearings(recording, setup, baseline)
+    if not doubt:
+        return analysis
+    if analysis.leading is not None and analysis.leading.speed_seen:
+        return analyse_bearings(recording, setup).with_problem(
+            f"the healthy run {source} is not used: {doubt}, as those of the recording do; correct "
+            "--baseline-fs, or give one at this speed"
+        )
+    return analysis.with_problem(
+        f"the healthy run {source}: {doubt}; see whether its rate and speed are right"
+    )
+
+
+def analyse_bearings(
+    recording: Recording, setup: BearingSetup, baseline: BearingBaseline | None = None
+) -> BearingVerdict:
+    """Say which bearing of a machine is damaged, and where.
+
+    Args:
+        recording: to be judged.
+        setup: what is known.
+        baseline: the healthy machine at the recording's rate, learnt by the same setup.
+    """
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    quality = _quality(recording, setup)
+    source = None if baseline is None else baseline.source
+    races: dict[str, RaceVerdict] = {}
+    unfit: dict[str, str] = {}
+    for name, column in zip(recording.names, samples.T, strict=True):
+        before = None if baseline is None else baseline.races[name]
+        try:
+            refuse_clipped(column)
+            race = race_test(
+                column, recording.rate_hz, setup.speed_rpm, setup.bearings[name], setup.race, before
+            )
+            refuse_no_machine(column, setup.unit, race)
+        except ClippedError as error:
+            unfit[name] = str(error)
+            quality = replace(quality, clipped={**quality.clipped, name: error.samples})
+        except UnfitError as error:
+            unfit[name] = str(error)
+        else:
+            races[name] = race
+
+    def refuse(why: str) -> BearingVerdict:
+        return BearingVerdict(
+            recording=str(recording.source),
+            baseline=source,
+            setup=setup,
+            quality=quality,
+            refused=why,
+            unfit=unfit,
+        )
+
+    if not any(race.speed_seen for race in races.values()) and (wrong := meant_in_hz(recording, setup)):
+        return refuse(wrong)
+    if not races:
+        return refuse("; ".join(f"{name}: {why}" for name, why in unfit.items()))
+    healthy = None if baseline is None else baseline.residuals[tuple(races)]
+    change: ResidualChange | None = None
+    if healthy is not None:
+        try:
+            change = _change(healthy, samples, recording, setup, tuple(races))
+        except ValueError as error:
+            return refuse(str(error))
+    return BearingVerdict(
+        recording=str(recording.source),
+        baseline=source,
+        setup=setup,
+        quality=with_repairs(quality, races),
+        finding=find(races, change, setup.change.false_alarm_probability),
+        races=races,
+        unfit=unfit,
+        healthy=healthy,
+        change=change,
+    )
+
+
+def _quality(recording: Recording, setup: BearingSetup) -> DataQuality:
+    """What is known against a recording before it is judged."""
+    quality = accelerometer_quality(recording.names, recording.samples, setup.unit)
+    quality = replace(quality, problems=(*recording.notes, *quality.problems))
+    orders = dict.fromkeys(ball_order_problem(setup.bearings[name]) for name in recording.names)
+    speed = stated_speed_problem(recording, setup.speed_rpm)
+    for problem in (speed, *unit_problems(recording, setup.unit), *orders):
+        quality = quality.with_problem(problem) if problem else quality
+    return quality
+
+
+def _change(
+    healthy: HealthyResidual,
+    samples: Floats,
+    recording: Recording,
+    setup: BearingSetup,
+    names: tuple[str, ...],
+) -> ResidualChange:
+    """How the innovations of the channels differ from the healthy machine's.
+
+    Raises:
+        ValueError: they cannot be compared, or what differs is no matter of the machine.
+    """
+    columns = samples[:, [recording.names.index(name) for name in names]]
+    change = compare_residual(healthy, healthy.levels_db(columns), setup.change)
+    if change.quiet:
+        raise ValueError(
+            f"{', '.join(names)}: {-change.rise_db[0]:.1f} dB quieter than in the healthy run: the machine "
+            "stands still, a sensor is loose, or the unit is another; give recordings at one speed and unit"
+        )
+    if change.gain:
+        raise ValueError(
+            f"{', '.join(names)}: {change.rise_db[0]:.1f} dB louder than in the healthy run in all bands "
+            f"alike (a factor of {change.ratio:.3g}): gain or unit is another; give both in one unit"
+        )
+    return change

@@ -1,0 +1,1 @@
+"""Recordings: the detectors of the service over files, from a machine file or options to a verdict."""

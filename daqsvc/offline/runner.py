@@ -1,0 +1,424 @@
+"""One runner over recordings: it reads them, has every detector of a machine file judge them, and joins that.
+
+The machine file is one on disk, or one that options make in memory (`daqsvc.offline.machine_options`).
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
+
+import numpy as np
+
+from daqsvc import kernel_cache
+from daqsvc.analysis.quality import known_against
+from daqsvc.detectors.shaft.verdict import RotorVerdict
+from daqsvc.diagnosis.recorded import Recorded, worst
+from daqsvc.recording.errors import RecordingError, RefusedError
+from daqsvc.recording.formats import named_as_can_log
+from daqsvc.recording.recording import (
+    get_limits,
+    list_channels,
+    load_matching,
+    load_recording,
+    matching,
+    set_limits,
+)
+from daqsvc.settings.plugins import configured, detector_tables
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+
+    from daqsvc.confined.limits import ResourceLimits
+    from daqsvc.diagnosis.plugin import DetectorPlugin
+    from daqsvc.diagnosis.recorded import (
+        Evaluated,
+        Progress,
+        RecordedDetector,
+        RecordingOptions,
+        Statements,
+        Verdict,
+    )
+    from daqsvc.recording.recording import Recording
+    from daqsvc.settings import MachineFile
+
+_BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+Detectors: TypeAlias = "dict[str, RecordedDetector[Any]]"
+"""By the key of their table, in the order of their places."""
+
+
+class WorkerLostError(Exception):
+    """A process died that was working on a recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What is printed about a recording.
+
+    Attributes:
+        json: the JSON object.
+        text: the same in words.
+        refused: whether the recording could not be judged.
+    """
+
+    json: dict[str, Any]
+    text: str
+    refused: bool
+
+
+class Runner:
+    """Judges recordings of one machine. In another process it is made there, machine file and all.
+
+    A sensor's samples are the variable that ``options.channels`` says, else the one with the sensor's name,
+    else the one with its channel's name. Detectors whose sensors the recording lacks are left out. The
+    recording's sampling rate replaces that of the streams.
+
+    Args:
+        make: makes the machine file, once a process.
+        options: what is said of the recordings.
+        detectors: makes the detectors; unless given, those of the machine file's tables.
+        machine: the machine file, where it has been made in this process.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], MachineFile],
+        options: RecordingOptions,
+        detectors: Callable[[MachineFile, RecordingOptions], Detectors] | None = None,
+        machine: MachineFile | None = None,
+    ) -> None:
+        self._make = make
+        if machine is not None:
+            self.machine = machine
+        self._make_detectors = detectors
+        self.options = options
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """What makes it, for the models of the machine's tables are made where it is read."""
+        return type(self), (self._make, self.options, self._make_detectors)
+
+    @cached_property
+    def machine(self) -> MachineFile:
+        """The machine file.
+
+        Raises:
+            MachineFileError: it cannot be used.
+        """
+        return self._make()
+
+    @cached_property
+    def detectors(self) -> Detectors:
+        """Its detectors.
+
+        Raises:
+            ValueError: what they or the options name does not fit the machine, or cannot be used.
+        """
+        if self._make_detectors is not None:
+            return self._make_detectors(self.machine, self.options)
+        return detectors_of(self.machine, self.options)
+
+    def prepare(self) -> None:
+        """See whether the options fit the machine, and make its detectors.
+
+        Raises:
+            ValueError: they do not, or what they name cannot be used.
+            MachineFileError: the machine file cannot be used.
+        """
+        machine = self.machine
+        names = {name for sensor in machine.sensors for name in (sensor.name, sensor.channel)}
+        if not self.options.in_memory and (odd := [n for n in self.options.channels if n not in names]):
+            raise ValueError(
+                f"--map names {odd[0]!r}, which is no sensor of {machine.path}; there are "
+                f"{', '.join(sensor.name for sensor in machine.sensors)}"
+            )
+        _ = self.detectors
+
+    def judge(self, recording: str, figures: str | None, progress: Progress | None = None) -> Outcome:
+        """Judge the recording at a path.
+
+        Args:
+            recording: the file, a CAN log, or a folder of CAN logs.
+            figures: what the names of its figures begin with; None: no figures.
+            progress: told the samples done and to do.
+        """
+        try:
+            loaded = self.load(recording)
+        except (RecordingError, RefusedError) as error:
+            return self._outcome(_not_judged(self.detectors, recording, str(error)), {})
+        present, machine = self._as_recorded(loaded)
+        found: dict[str, Evaluated] = {}
+        wrong = ""
+        for key, given in present.items():
+            detector = self.detectors[key]
+            try:
+                found[key] = detector.evaluate(Recorded(machine, loaded, detector.options), given, progress)
+            except (ValueError, AssemblyError) as error:
+                wrong = str(error)
+                continue
+            draw = found[key].draw
+            if figures is not None and draw is not None:
+                draw(figures)
+        if wrong:
+            first = _not_judged({key: self.detectors[key] for key in present}, recording, wrong)
+            return self._outcome(first, found, loaded.notes)
+        heads = _heads({key: self.detectors[key] for key in present})
+        verdicts = [verdict for key in heads.values() if (verdict := found[key].verdict) is not None]
+        if not verdicts:
+            verdicts = [RotorVerdict(recording=recording, quality=known_against(loaded))]
+        return self._outcome(verdicts[0], found, loaded.notes, verdicts[1:])
+
+    def _outcome(
+        self,
+        first: Verdict,
+        found: Mapping[str, Evaluated],
+        notes: Iterable[str] = (),
+        others: Sequence[Verdict] = (),
+    ) -> Outcome:
+        """The verdict about the first part of the machine, the others below it, then all statements."""
+        json = first.as_json()
+        if self.options.in_memory:
+            return Outcome(json, first.describe(), first.refused is not None)
+        quality = json["data_quality"]
+        quality["problems"] = list(dict.fromkeys([*notes, *quality["problems"]]))
+        texts = [first.describe()]
+        texts += [said.describe() for one in found.values() if one.shown for said in one.statements]
+        for verdict in others:
+            json[verdict.part] = verdict.as_json()
+            texts.append(f"{verdict.part}s of {verdict.describe()}")
+        statements: list[Statements] = [said for one in found.values() for said in one.statements]
+        json["detectors"] = {said.detector: said.as_json() for said in statements}
+        if alarmed := worst(statements):
+            texts.insert(1, f"worst of the other detectors: {alarmed}")
+        texts[1:1] = [note for note in notes if note not in texts[0]]
+        return Outcome(json, "\n  ".join(texts), first.refused is not None)
+
+    def _as_recorded(self, recording: Recording) -> tuple[dict[str, Any], MachineFile]:
+        """The tables that a recording suffices for, and the machine with these, its sensors and its rate."""
+        tables = {key: one.as_recorded(recording.names) for key, one in self.detectors.items()}
+        machine = self.machine
+        update = {
+            "sensors": tuple(sensor for sensor in machine.sensors if sensor.name in recording.names),
+            "streams": {
+                name: stream.model_copy(update={"rate_hz": recording.rate_hz})
+                for name, stream in machine.streams.items()
+            },
+            "pipeline": machine.pipeline.model_copy(update=tables),
+        }
+        given = {key: table for key, table in tables.items() if table is not None}
+        return given, machine.model_copy(update=update)
+
+    def load(self, recording: str, only: Sequence[str] | None = None) -> Recording:
+        """The sensors of the machine in a recording, by their names.
+
+        Args:
+            recording: path of the recording: a file, a CAN log, or a folder of CAN logs.
+            only: names of the sensors that are wanted; None: all that it has.
+
+        Raises:
+            RecordingError: it cannot be read.
+            RefusedError: it lacks a sensor that is wanted, or that the verdict needs, or has none at all.
+        """
+        machine, options = self.machine, self.options
+        if options.in_memory:
+            wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
+            return (load_matching if options.patterns else load_recording)(recording, wanted, options.rate_hz)
+        if not _is_can_log(recording):
+            columns = self._columns(recording)
+            self._refuse_lacking(recording, only or (), columns)
+            wanted = columns if only is None else {name: columns[name] for name in only}
+            return load_recording(recording, wanted, options.rate_hz)
+        if options.channels or options.unit is not None:
+            raise RefusedError(
+                f"{recording} is a CAN log, of which the machine file says channels and units: leave out "
+                f"{'--map' if options.channels else '--unit'}"
+            )
+        from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels
+
+        watched = [name for one in self.detectors.values() for name in one.sensors]
+        found = load_can_log(machine, recording, options.rate_hz, watched)
+        self._refuse_lacking(recording, only or _needs(self.detectors), found.names)
+        if only is None:
+            return found
+        samples = found.samples[:, [found.names.index(name) for name in only]]
+        return replace(
+            found,
+            names=tuple(only),
+            samples=samples,
+            nan_count=int(np.isnan(samples).sum()),
+            infinity_count=int(np.isinf(samples).sum()),
+        )
+
+    def _refuse_lacking(self, recording: str, wanted: Iterable[str], there: Container[str]) -> None:
+        """Refuse a recording without a sensor that is wanted.
+
+        Raises:
+            RefusedError: it lacks one.
+        """
+        lacking = [name for name in wanted if name not in there]
+        if lacking and _is_can_log(recording):
+            raise RefusedError(
+                f"{recording} holds no samples of {', '.join(lacking)} of {self.machine.path}; give the log "
+                "of its bus too, in one folder"
+            )
+        if lacking:
+            raise RefusedError(
+                f"{recording} has no channel for {', '.join(lacking)} of {self.machine.path}; name its "
+                f"variable, e.g. --map {lacking[0]}=VARIABLE"
+            )
+
+    def _columns(self, recording: str) -> dict[str, str]:
+        """The variable of each sensor that a recording has.
+
+        Raises:
+            RecordingError: it cannot be read.
+            RefusedError: it lacks a sensor that the verdict needs, or has none at all.
+        """
+        there = list_channels(recording)
+        channels, found = self.options.channels, {}
+        for sensor in self.machine.sensors:
+            mapped = channels.get(sensor.name, channels.get(sensor.channel))
+            if mapped is not None:
+                found[sensor.name] = matching(recording, mapped, there)
+            elif sensor.name in there:
+                found[sensor.name] = sensor.name
+            elif sensor.channel in there:
+                found[sensor.name] = sensor.channel
+        missing = [name for name in _needs(self.detectors) if name not in found]
+        if missing or not found:
+            missing = missing or [sensor.name for sensor in self.machine.sensors]
+            raise RefusedError(
+                f"{recording} has no channel for {', '.join(missing)} of {self.machine.path}; name its "
+                f"variable, e.g. --map {missing[0]}=VARIABLE. It holds {', '.join(there) or 'no channel'}"
+            )
+        return found
+
+
+def _is_can_log(path: str) -> bool:
+    """Whether a recording is a CAN log by its ending, or a folder of such."""
+    return Path(path).is_dir() or named_as_can_log(Path(path))
+
+
+def detectors_of(machine: MachineFile, options: RecordingOptions) -> Detectors:
+    """The detectors of a machine file, for recordings; a calibration is for the first that can have one.
+
+    Raises:
+        ValueError: what they or the options name cannot be used.
+    """
+    found: Detectors = {}
+    calibration = options.calibration
+    for key, table, given in configured(machine.pipeline):
+        plugin = cast("DetectorPlugin[Any]", table)
+        found[key] = plugin.recorded(
+            machine, given, replace(options, calibration=calibration if plugin.calibrated else None)
+        )
+        if plugin.calibrated:
+            calibration = None
+    if calibration is not None:
+        raise ValueError(
+            f"--calibration: {machine.path} has neither {' nor '.join(calibrated_tables())} that would use "
+            "it; add it"
+        )
+    return found
+
+
+def calibrated_tables() -> list[str]:
+    """The tables of a machine file whose detectors can be calibrated."""
+    return [
+        f"[pipeline.{key}]"
+        for key, table in detector_tables().items()
+        if cast("DetectorPlugin[Any]", table).calibrated
+    ]
+
+
+def _heads(detectors: Detectors) -> dict[str, str]:
+    """The detector that gives the verdict of each part of the machine, the first part first."""
+    return {one.part: key for key, one in detectors.items() if one.part}
+
+
+def _needs(detectors: Detectors) -> tuple[str, ...]:
+    """The sensors without which a recording is refused: those that the first verdict rests on."""
+    head = next((detectors[key] for key in _heads(detectors).values()), None)
+    return () if head is None or head.takes_fewer else head.sensors
+
+
+def _not_judged(detectors: Detectors, recording: str, why: str) -> Verdict:
+    """The verdict about a recording that cannot be judged, with the keys that one about it would have."""
+    for key in _heads(detectors).values():
+        verdict = detectors[key].not_judged(recording, why)
+        if verdict is not None:
+            return verdict
+    return RotorVerdict.not_judged(recording, why)
+
+
+class Judge(Protocol):
+    """Judges a recording; goes to another process by pickle. `Runner` is one."""
+
+    def judge(self, recording: str, figures: str | None, progress: Progress | None = None) -> Outcome:
+        """See `Runner.judge`."""
+        ...
+
+
+def judge_all(
+    judge: Judge, recordings: Sequence[str], figures: Sequence[str | None], processes: int
+) -> Iterator[Outcome]:
+    """Outcomes in the order of the recordings, each as soon as it and all before it are there.
+
+    Args:
+        judge: judges them.
+        recordings: the files.
+        figures: for each, what the names of its figures begin with.
+        processes: how many at a time; with one, this process does it.
+
+    Raises:
+        WorkerLostError: a process was killed.
+    """
+    if processes == 1:
+        for recording, prefix in zip(recordings, figures, strict=True):
+            yield judge.judge(recording, prefix)
+        return
+    # One process a core: threads of the linear algebra inside each would only get in each other's way.
+    for name in _BLAS_THREADS:
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(
+        processes,
+        multiprocessing.get_context("spawn"),
+        initializer=_prepare,
+        initargs=(judge, get_limits()),
+    )
+    try:
+        jobs = [pool.submit(_judge, *job) for job in zip(recordings, figures, strict=True)]
+        for recording, job in zip(recordings, jobs, strict=True):
+            try:
+                yield job.result()
+            except BrokenProcessPool:
+                raise WorkerLostError(
+                    f"a process was killed while {recording} was waited for (out of memory?); "
+                    "give fewer --jobs"
+                ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_judges: list[Judge] = []
+"""In a process of the pool: the one that judges there, so that what it has read is read once."""
+
+
+def _judge(recording: str, figures: str | None) -> Outcome:
+    return _judges[0].judge(recording, figures)
+
+
+def _prepare(judge: Judge, limits: ResourceLimits) -> None:
+    """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
+    _judges.append(judge)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    set_limits(limits)
+    kernel_cache.prepare(say=False)
