@@ -19,22 +19,22 @@ from typing import TYPE_CHECKING, Any
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
+from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.manager import AlarmManager
-from daqsvc.alarms.states import AlarmState, CommandNotAllowedError
+from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.audit import AuditError, AuditLog, Refusals
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.mqtt import MqttPublisher
+from daqsvc.publish.output import EarlierState, OutputPort, OutputSet, Watched, output_name
 from daqsvc.publish.payloads import alarm_json
 from daqsvc.publish.restore import restore_alarms
-from daqsvc.publish.session import EarlierState
-from daqsvc.publish.sparkplug.edge import SparkplugEdge
 from daqsvc.publish.topics import Topics
 from daqsvc.self_check import JOURNAL, SelfCheck, Vitals, conditions
+from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.acquisition.clock import Clock
@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.publish.mqtt import MqttSettings
-    from daqsvc.publish.sparkplug.settings import SparkplugSettings
+    from daqsvc.publish.output import Output
     from daqsvc.self_check import BusHealth
 
 logger = logging.getLogger(__name__)
@@ -60,7 +59,7 @@ COMMIT_S = 5.0
 MOST_COMMANDS = 64
 """Commands that may wait at a time; further ones are refused."""
 GRACE_S = 0.1
-"""What those who publish may take beyond their deadline before they are left behind."""
+"""What outputs may take beyond their deadline before they are left behind."""
 FORGOTTEN = "the journal was damaged and no longer knows how it stood; it begins anew"
 UNJOURNALLED = "the service ended while the journal could not be written; it begins anew"
 STOPPING = "the service is stopping; ask again when it runs"
@@ -86,7 +85,7 @@ class CommandCounters:
 class AlarmService:
     """Alarms of one machine, from diagnosis to broker.
 
-    Use: `open`, `resume`, then `take` and `execute` as diagnoses and commands come while `tellers` and
+    Use: `open`, `resume`, then `take` and `execute` as diagnoses and commands come while `outputs` and
     `keep_time` run; `settle`, `stop`, `close`.
 
     Args:
@@ -94,12 +93,12 @@ class AlarmService:
         rules: one per alarm.
         store: directory of the journal and the audit log.
         clock: the service's clock.
-        mqtt: how to reach the broker; None keeps everything in the journal.
+        outputs: who is told; None keeps everything in the journal.
         handling: what holds for all alarms.
         limits: how much the journal may keep.
-        sparkplug: what the box is to Sparkplug, beside its own topics; None for nothing.
         buses: by name, what can be watched of each bus.
         bus_health: says how the buses stand.
+        supervisor: counts what outputs do wrong.
     """
 
     def __init__(
@@ -108,13 +107,13 @@ class AlarmService:
         rules: Sequence[Rule],
         store: Path,
         clock: Clock,
-        mqtt: MqttSettings | None,
+        outputs: OutputSet | None,
         *,
         handling: AlarmHandling | None = None,
         limits: OutboxLimits | None = None,
-        sparkplug: SparkplugSettings | None = None,
         buses: Mapping[str, Collection[str]] | None = None,
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,
+        supervisor: Supervisor | None = None,
     ) -> None:
         limits = limits or OutboxLimits()
         self.identity = identity
@@ -123,33 +122,31 @@ class AlarmService:
         self.audit = AuditLog(store / "audit.jsonl", clock, limits.audit_max_bytes)
         self._refusals = Refusals(clock)
         self.commands = CommandCounters()
-        self.topics = Topics("daqsvc" if mqtt is None else mqtt.topic_root, identity.site, identity.box)
+        asked = outputs or OutputSet(watched=Watched(identity.machine))
+        self.topics = Topics(asked.topic_root, identity.site, identity.box)
         self._witness = self.topics.alarm(identity.machine, JOURNAL)
         """Every run that cannot write its disk tells the broker so, here."""
         self._witness_known: int | None = None
         """The last number on it that the journal knew at the start; None if it need not be compared."""
-        self.publisher = (
-            None
-            if mqtt is None
-            else MqttPublisher(
-                mqtt,
-                identity.site,
-                identity.box,
-                self.outbox,
-                clock,
+        self.outputs = asked.make(
+            OutputPort(
+                identity=identity,
+                watched=asked.watched,
+                store=store,
+                clock=clock,
+                outbox=self.outbox,
+                topics=self.topics,
                 commands=self.execute,
                 earlier=EarlierState(self._witness, self._take_witness),
             )
         )
-        self.sparkplug = (
-            None
-            if mqtt is None or sparkplug is None
-            else SparkplugEdge(sparkplug, mqtt, self.outbox, self.topics, clock, self.execute)
-        )
+        """Who is told, by the path of its table; each is to be run by itself, until `stop`."""
+        self._outdated = asked.outdated
         self._waiting_max = limits.alarms_waiting_max
         self._clock = clock
+        self._supervisor = supervisor or Supervisor()
         self._log = AlarmLog(clock)
-        self._conditions = conditions(mqtt, buses or {})
+        self._conditions = [*conditions(buses or {}), *asked.conditions]
         self._bus_health = bus_health
         self._self_check = SelfCheck(store, limits.reserve_bytes)
         self._free_bytes: int | None = None
@@ -319,12 +316,6 @@ class AlarmService:
         self._is_in_step, self._damage_seen = True, damage
         self._confirm(committed)
 
-    @property
-    def tellers(self) -> Mapping[str, MqttPublisher | SparkplugEdge]:
-        """What publishes, by name; each is to be run by itself, until `stop`."""
-        there = {"mqtt": self.publisher, "sparkplug": self.sparkplug}
-        return {name: teller for name, teller in there.items() if teller is not None}
-
     async def keep_time(self) -> None:
         """Have come to pass what time alone brings, and what the service says of itself; until cancelled."""
         was_backed = True
@@ -350,7 +341,7 @@ class AlarmService:
         self._log.sum_up()
         for event in self.manager.tick():
             self._post(event)
-        for condition in self._self_check.look(self._vitals()):
+        for condition in (*self._of_outputs(), *self._self_check.look(self._vitals())):
             for event in self.manager.condition(*condition):
                 self._post(event)
 
@@ -358,8 +349,6 @@ class AlarmService:
         """Take in a diagnosis; what follows from it is on its way to the disk when this returns."""
         for event in self.manager.take(diagnosis):
             self._post(event)
-        if self.sparkplug is not None:
-            self.sparkplug.observe(diagnosis)
 
     async def execute(self, command: AlarmCommand, source: str) -> CommandOutcome:
         """Carry out a person's command, one after the other: written down, obeyed, committed, answered.
@@ -406,9 +395,10 @@ class AlarmService:
         await asyncio.wait({telling, *self._under_way}, timeout=timeout_s)
 
     async def stop(self, deadline_s: float) -> None:
-        """Hand over to the broker what is left, and end `tellers`; see `MqttPublisher.stop`."""
+        """Hand over what is left, and end `outputs`; see `Output.stop`."""
         stopping = {
-            asyncio.create_task(t.stop(deadline_s), name=f"{name} stop") for name, t in self.tellers.items()
+            asyncio.create_task(_stop(output, deadline_s), name=f"{output_name(path)} stop")
+            for path, output in self.outputs.items()
         }
         if not stopping:
             return
@@ -477,15 +467,22 @@ class AlarmService:
         except AuditError as error:
             logger.error("refused commands that were counted are not in the log yet: %s", error)  # noqa: TRY400
 
+    def _of_outputs(self) -> Iterator[Condition]:
+        """How things stand with the outputs; what one that is no longer there has said stands no longer."""
+        told = self.manager.conditions
+        for path, output in self.outputs.items():
+            with self._supervisor.sparing_others(output_name(path), "it says nothing of itself meanwhile"):
+                yield from [*output.conditions(told)]
+        for prefix, sentence in self._outdated.items():
+            for name in sorted(told):
+                if name.startswith(prefix):
+                    yield Condition(name, Level.NORMAL, sentence)
+
     def _vitals(self) -> Vitals:
-        outbox, publisher = self.outbox.counters, self.publisher
+        outbox = self.outbox.counters
         return Vitals(
             now_ns=self._clock.monotonic_ns(),
-            wall_ns=self._clock.wall_ns(),
-            certificates_end_ns={} if publisher is None else publisher.certificate_expiry,
-            broker_has_expired=publisher is not None and publisher.broker_has_expired,
             conditions_told=self.manager.conditions,
-            connected=publisher is None or publisher.counters.connected,
             free_bytes=self._free_bytes,
             waiting=outbox.waiting,
             write_errors=outbox.write_errors,
@@ -499,8 +496,6 @@ class AlarmService:
             telemetry_dropped=outbox.telemetry.dropped,
             unwritten=self.commands.unwritten,
             buses=self._bus_health(),
-            refused=None if publisher is None else publisher.refused,
-            is_refused_known=publisher is not None and publisher.is_refused_known,
         )
 
     async def _look_at_disk(self) -> None:
@@ -549,6 +544,11 @@ class AlarmService:
     def _watch(self, work: asyncio.Future[Any]) -> None:
         self._under_way.add(work)
         work.add_done_callback(self._under_way.discard)
+
+
+async def _stop(output: Output, deadline_s: float) -> None:
+    """See `Output.stop`; whatever it raises is the task's."""
+    await output.stop(deadline_s)
 
 
 def _moment(event: AlarmEvent) -> tuple[object, ...]:

@@ -1,20 +1,26 @@
-"""What authors of drivers and detectors import; nothing else of daqsvc is public.
+"""What authors of drivers, detectors and outputs import; nothing else of daqsvc is public.
 
 A package registers a `DriverPlugin` in the group of entry points ``daqsvc.drivers`` under the name that
-``driver = "..."`` of a bus gives, or a `DetectorPlugin` in ``daqsvc.detectors`` under the key of its table in
-``[pipeline]``. ``docs/drivers.md`` and ``docs/detectors.md`` show one of each. Names leave this module only
-with a new major version.
+``driver = "..."`` of a bus gives, a `DetectorPlugin` in ``daqsvc.detectors`` under the key of its table in
+``[pipeline]``, or an `OutputPlugin` in ``daqsvc.outputs`` under the path of its table. ``docs/drivers.md``,
+``docs/detectors.md`` and ``docs/outputs.md`` show one of each. Names leave this module only with a new major
+version.
 """
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import Clock
 from daqsvc.acquisition.link import Link
 from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.alarms.conditions import Condition
+from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.detector import Detector, Window
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
+from daqsvc.outbox.messages import OutboxMessage
+from daqsvc.publish.output import Output, OutputPort, Watched
+from daqsvc.publish.plugin import OutputPlugin
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.models import MachineFile, Sensor, Stream
 from daqsvc.settings.packing import PackedLayout
@@ -35,6 +41,7 @@ __all__ = [
     "BusPort",
     "CannotOpenError",
     "Clock",
+    "Condition",
     "Detector",
     "DetectorPlugin",
     "Diagnosis",
@@ -45,9 +52,14 @@ __all__ = [
     "Judgement",
     "Layout",
     "LayoutError",
+    "Level",
     "Link",
     "MachineFile",
     "Name",
+    "OutboxMessage",
+    "Output",
+    "OutputPlugin",
+    "OutputPort",
     "PackedLayout",
     "Reading",
     "SampleBlock",
@@ -59,6 +71,7 @@ __all__ = [
     "StreamSpec",
     "StreamWords",
     "Text",
+    "Watched",
     "Window",
     "WindowDetector",
     "assembler_of",

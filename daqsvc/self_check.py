@@ -1,4 +1,4 @@
-"""What the service has to say about itself: certificates, a full disk, dropped telemetry, buses that fail it.
+"""What the service has to say about itself: a full disk, dropped telemetry, buses that fail it.
 
 Each is a condition of the alarm manager: active while it stands, returned when it is over, like any alarm.
 """
@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from daqsvc.acquisition.clock import NS_PER_S, iso_utc
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.states import Level
 from daqsvc.outbox.files import remedy
 
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
     from pathlib import Path
 
-    from daqsvc.publish.settings import MqttSettings
-
-NS_PER_DAY = 86_400 * NS_PER_S
 MIB = 1024 * 1024
 
 JOURNAL = "store/journal"
@@ -33,33 +31,8 @@ BUS_CONTROLLER = "bus-controller/"
 BUS_RECORDING = "bus-recording/"
 """How the names of the conditions of a bus begin."""
 
-REFUSED = "broker/refused"
-"""The condition of messages that the broker will not take."""
-
-REFUSED_NAMED = 3
-"""Topics that it names."""
-
-CERTIFICATE = "certificate/"
-BROKER = "broker"
-CERTIFICATE_DAYS = 14
-CERTIFICATE_DEADBAND_NS = NS_PER_DAY
-"""A clock that is set by an hour, and back, makes no alarm come and go."""
 QUIET_NS = 60 * NS_PER_S
 """What happens now and then stands until it has not happened for so long."""
-
-
-class Condition(NamedTuple):
-    """One thing about the service.
-
-    Attributes:
-        name: of the alarm, with a ``/`` in it.
-        level: how bad it is.
-        sentence: in words for a person.
-    """
-
-    name: str
-    level: Level
-    sentence: str
 
 
 class BusHealth(NamedTuple):
@@ -86,11 +59,7 @@ class Vitals:
 
     Attributes:
         now_ns: monotonic clock.
-        wall_ns: wall clock, ns since the Unix epoch.
-        certificates_end_ns: by certificate, when it ends, wall clock.
-        broker_has_expired: whether the broker is refused because its certificate has expired.
         conditions_told: conditions of the service that were ever told of, also before a restart.
-        connected: whether all certificates in use have been seen: there is a connection, or no broker.
         free_bytes: free space on the store's disk; None if nobody has looked.
         waiting: alarm events in memory that the disk has not taken.
         write_errors: failed writes of alarms so far.
@@ -99,19 +68,12 @@ class Vitals:
         telemetry_dropped: telemetry messages dropped so far.
         unwritten: commands so far that were refused because the audit log could not be written.
         buses: how each bus stands, by name.
-        refused: by topic, why the broker will not take messages; None without a broker.
-        is_refused_known: whether these are all there are: what an earlier run has left was read, and the
-            broker was asked.
         unbacked: whether the disk takes no alarm events, so that they go out from memory.
         set_aside: whether the damage has left files that are named ``*.corrupt-*``.
     """
 
     now_ns: int
-    wall_ns: int
-    certificates_end_ns: Mapping[str, int]
-    broker_has_expired: bool
     conditions_told: frozenset[str]
-    connected: bool
     free_bytes: int | None
     waiting: int
     write_errors: int
@@ -120,19 +82,14 @@ class Vitals:
     telemetry_dropped: int
     unwritten: int
     buses: Mapping[str, BusHealth] = field(default_factory=dict)
-    refused: Mapping[str, str] | None = None
-    is_refused_known: bool = False
     unbacked: bool = False
     set_aside: bool = False
 
 
-def conditions(
-    mqtt: MqttSettings | None, buses: Mapping[str, Collection[str]] = MappingProxyType({})
-) -> list[str]:
+def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> list[str]:
     """The names of all that can be said, so that people may act on it before it is.
 
     Args:
-        mqtt: how to reach the broker; None without one.
         buses: by name, what can be watched of each bus; see `BusTable.self_checks`.
     """
     found = list(STORE)
@@ -142,11 +99,6 @@ def conditions(
         (BUS_RECORDING, "recording"),
     ):
         found += [f"{kind}{bus}" for bus, watched in buses.items() if check in watched]
-    if mqtt is not None:
-        found.append(REFUSED)
-    if mqtt is not None and mqtt.tls:
-        files = {BROKER: True, "ca": mqtt.ca_file is not None, "client": mqtt.cert_file is not None}
-        found += [f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at]
     return found
 
 
@@ -165,7 +117,6 @@ class SelfCheck:
         self._store = store
         self._reserve_bytes = reserve_bytes
         self._remedy = "make room on the disk"
-        self._ending: set[str] = set()
         self._telemetry = _Happening()
         self._lost = _Happening()
         self._unwritten = _Happening()
@@ -191,31 +142,11 @@ class SelfCheck:
 
     def look(self, vitals: Vitals) -> Iterator[Condition]:
         """How everything stands, as far as it is known, whether that is new or not."""
-        yield from self._certificates(vitals)
         if vitals.free_bytes is not None:
             yield self._disk(vitals.free_bytes)
         for now_and_then in (self._journal, self._damage, self._dropped, self._audit):
             yield from self._once_known(now_and_then(vitals), vitals)
-        if vitals.refused is not None:
-            if vitals.refused or vitals.is_refused_known:
-                yield _refusals(vitals.refused)
-        elif REFUSED in vitals.conditions_told:
-            yield Condition(REFUSED, Level.NORMAL, "there is no broker any more")
         yield from self._buses(vitals)
-
-    def _certificates(self, vitals: Vitals) -> Iterator[Condition]:
-        for name, end_ns in sorted(vitals.certificates_end_ns.items()):
-            if not (name == BROKER and vitals.broker_has_expired):
-                yield self._certificate(name, end_ns - vitals.wall_ns, end_ns)
-        if vitals.broker_has_expired:
-            # What it showed when it was last verified says nothing of what it shows now.
-            sentence = "the broker is refused: its certificate, or one behind it, has expired; renew it there"
-            yield Condition(f"{CERTIFICATE}{BROKER}", Level.DANGER, sentence)
-        if vitals.connected:
-            seen = {f"{CERTIFICATE}{name}" for name in vitals.certificates_end_ns}
-            for name in sorted(vitals.conditions_told - seen):
-                if name.startswith(CERTIFICATE):
-                    yield Condition(name, Level.NORMAL, "it is no longer in use")
 
     def _buses(self, vitals: Vitals) -> Iterator[Condition]:
         for bus, health in vitals.buses.items():
@@ -245,24 +176,6 @@ class SelfCheck:
             if vitals.now_ns - begun_ns < QUIET_NS:
                 return
         yield condition
-
-    def _certificate(self, name: str, left_ns: int, end_ns: int) -> Condition:
-        condition = f"{CERTIFICATE}{name}"
-        border_ns = CERTIFICATE_DAYS * NS_PER_DAY
-        if left_ns < border_ns:
-            self._ending.add(name)
-        elif left_ns >= border_ns + CERTIFICATE_DEADBAND_NS:
-            self._ending.discard(name)
-        if name not in self._ending:
-            return Condition(condition, Level.NORMAL, f"certificate {name} lasts until {iso_utc(end_ns)}")
-        if left_ns <= 0:
-            sentence = f"certificate {name} ended at {iso_utc(end_ns)}: without a new one there is no broker"
-            return Condition(condition, Level.DANGER, sentence)
-        # No count of days: it would be another sentence every day.
-        sentence = (
-            f"certificate {name} ends at {iso_utc(end_ns)}, in less than {CERTIFICATE_DAYS} days: renew it"
-        )
-        return Condition(condition, Level.ALERT, sentence)
 
     def _disk(self, free_bytes: int) -> Condition:
         # No count of what is free: it stands for hours, and would be another sentence with every MiB.
@@ -347,19 +260,6 @@ class SelfCheck:
             "has room and is fast enough"
         )
         return Condition(name, Level.ALERT, sentence)
-
-
-def _refusals(refused: Mapping[str, str]) -> Condition:
-    if not refused:
-        return Condition(REFUSED, Level.NORMAL, "the broker takes all messages")
-    # No count: it would be another sentence each time.
-    named = "; ".join(f"{topic} ({reason})" for topic, reason in sorted(refused.items())[:REFUSED_NAMED])
-    others = ", and others" if len(refused) > REFUSED_NAMED else ""
-    sentence = (
-        f"the broker will not take messages on {named}{others}: they wait on disk and are tried again; allow "
-        "them there"
-    )
-    return Condition(REFUSED, Level.ALERT, sentence)
 
 
 class _Happening:

@@ -18,14 +18,15 @@ from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarm_service import AlarmService
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
 from daqsvc.assembly_alignment import alignment
-from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
 from daqsvc.assembly_store import outbox_limits
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.snapshots import at_once, patience
-from daqsvc.publish.payloads import diagnosis_payload, status_payload
-from daqsvc.self_check import BusHealth
+from daqsvc.publish.make import output_plugins, output_set
+from daqsvc.publish.output import output_name
+from daqsvc.publish.payloads import Figures
+from daqsvc.self_check import BusHealth, conditions
 from daqsvc.settings.streams import Grid
 from daqsvc.supervision import EssentialLostError, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.publish.mqtt import MqttPublisher
     from daqsvc.settings.models import MachineFile
     from drivers.base import Driver
 
@@ -154,12 +154,12 @@ class Service:
             alarm_rules(machine),
             store,
             self.clock,
-            mqtt_settings(machine),
+            output_set(machine, conditions(bus_self_checks(machine))),
             handling=alarm_handling(machine),
             limits=outbox_limits(machine),
-            sparkplug=sparkplug_settings(machine, store),
             buses=bus_self_checks(machine),
             bus_health=self._bus_health,
+            supervisor=self.supervisor,
         )
         self.control = ControlServer(
             store,
@@ -167,11 +167,6 @@ class Service:
             self.alarms.execute,
             lambda: self.alarms.outbox.counters.waiting,
         )
-
-    @property
-    def publisher(self) -> MqttPublisher | None:
-        """The way to the broker; None if the machine file has none."""
-        return self.alarms.publisher
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then hand over what is under way and end within two seconds.
@@ -230,7 +225,7 @@ class Service:
             keep("journal", self._watch_journal),
         ]
         controlling = keep("control socket", self.control.serve)
-        telling = [keep(name, teller.run) for name, teller in self.alarms.tellers.items()]
+        telling = [keep(output_name(path), output.run) for path, output in self.alarms.outputs.items()]
         pipeline = keep(
             "pipeline", self.pipeline.run, may_end=lambda: all(r.is_closed for r in self.rings.values())
         )
@@ -313,13 +308,10 @@ class Service:
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
         ):
             self.alarms.take(diagnosis)
-        if self.publisher is not None:
-            with self.supervisor.sparing_others(f"telemetry of {diagnosis.detector}", "one message is lost"):
-                payload = diagnosis_payload(self._identity, diagnosis, self.clock).to_json()
-                self.publisher.telemetry(
-                    f"{self.machine.machine.name}/diagnosis/{diagnosis.detector}", payload
-                )
-                self.publisher.report(diagnosis)
+        for path, output in self.alarms.outputs.items():
+            about = f"{output_name(path)} of {diagnosis.detector}"
+            with self.supervisor.sparing_others(about, "it is not told of one statement"):
+                output.report(diagnosis)
 
     def _bus_health(self) -> dict[str, BusHealth]:
         found: dict[str, BusHealth] = {}
@@ -340,11 +332,10 @@ class Service:
             self._publish_status()
 
     def _publish_status(self) -> None:
-        if self.alarms.sparkplug is not None:
-            self.alarms.sparkplug.reach(there=any(driver.link.state == "up" for driver in self.drivers))
-        if self.publisher is not None:
-            payload = status_payload(self.machine.site, self.machine.box, self.figures(), self.clock)
-            self.publisher.telemetry("status", payload.to_json())
+        figures = self.figures() if self.alarms.outputs else {}
+        for path, output in self.alarms.outputs.items():
+            with self.supervisor.sparing_others(output_name(path), "it is not told of one status"):
+                output.status(figures)
 
     def figures(self) -> dict[str, Any]:
         """The service's figures by what they belong to: streams, buses, detectors, alarms, outbox, MQTT."""
@@ -378,9 +369,20 @@ class Service:
             "commands": asdict(self.alarms.commands),
             "control": asdict(self.control.counters),
             "outbox": asdict(self.alarms.outbox.counters),
-            "mqtt": {} if self.publisher is None else self.publisher.figures(),
-            "sparkplug": {} if self.alarms.sparkplug is None else asdict(self.alarms.sparkplug.counters),
+            **self._figures_of_outputs(),
         }
+
+    def _figures_of_outputs(self) -> dict[str, Mapping[str, Any]]:
+        found: dict[str, Mapping[str, Any]] = {}
+        for path, plugin in output_plugins().items():
+            if plugin.status_key:
+                found[plugin.status_key] = {}
+                with self.supervisor.sparing_others(output_name(path), "its figures are missing"):
+                    if path in self.alarms.outputs:
+                        told = self.alarms.outputs[path].figures()
+                        Figures.model_validate(told)
+                        found[plugin.status_key] = told
+        return found
 
 
 def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:

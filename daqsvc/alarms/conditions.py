@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.rules import UNDETERMINED
 from daqsvc.alarms.states import Level
@@ -19,6 +19,20 @@ ALARM_FLOOD = "alarm-flood"
 TRIP_MULTIPLY = "trip-multiply"
 RESERVED = frozenset({ALARM_FLOOD, TRIP_MULTIPLY})
 """Names that no alarm of a machine file may have; other conditions have a ``/`` in theirs, which none may."""
+
+
+class Condition(NamedTuple):
+    """How one thing about the service stands.
+
+    Attributes:
+        name: of the alarm, with a ``/`` in it.
+        level: how bad it is.
+        sentence: in words for a person.
+    """
+
+    name: str
+    level: Level
+    sentence: str
 
 
 def statement(machine: str, condition: str, level: Level, at: ClockReading) -> Diagnosis:

@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
-from daqsvc.publish.home_assistant_readings import ReadingsPayload
+from daqsvc.publish.home_assistant.readings import ReadingsPayload
+from daqsvc.publish.home_assistant.summary import SummaryPayload
+from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
-from daqsvc.publish.summary import SummaryPayload
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -7,13 +7,20 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
-from daqsvc.settings.plugins import StreamWords, bus_tables, configured, driver_of_layout
+from daqsvc.settings.plugins import (
+    StreamWords,
+    bus_tables,
+    configured,
+    configured_outputs,
+    driver_of_layout,
+    output_tables,
+)
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from daqsvc.settings.models import MachineFile, Mqtt, Sensor, Stream
+    from daqsvc.settings.models import MachineFile, Sensor, Stream
 
 COLUMNS = 100
 _INDENT = "  "
@@ -174,41 +181,20 @@ def _limits(low: float | None, high: float | None, unit: str) -> str:
 
 
 def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
-    yield "MQTT", "no broker configured" if machine.mqtt is None else _broker(machine, machine.mqtt)
+    told = [(path, plugin.describe(machine, given)) for path, plugin, given in configured_outputs(machine)]
+    for path, plugin in output_tables().items():
+        below = [words for at, words in told if f"{at}.".startswith(f"{path}.") and words]
+        if "." not in path and (below or plugin.absent):
+            yield plugin.label or path, "; ".join(below) or plugin.absent
     yield (
         "Store",
         "no directory configured" if machine.store is None else str(machine.resolve(machine.store.directory)),
     )
 
 
-def _broker(machine: MachineFile, mqtt: Mqtt) -> str:
-    trust = f"certificates from {mqtt.ca_file}" if mqtt.ca_file is not None else "the system's certificates"
-    parts = [f"{mqtt.host} port {mqtt.port}, {f'TLS, {trust}' if mqtt.tls else 'without TLS'}"]
-    if mqtt.tls and mqtt.cert_file is not None:
-        parts.append(f"shows certificate {mqtt.cert_file}")
-    if mqtt.username is not None:
-        source = mqtt.password_file or (
-            f"credential {mqtt.password_credential}" if mqtt.password_credential else None
-        )
-        parts.append(f"user {mqtt.username}{f', password from {source}' if source else ''}")
-    parts.append(f"client {machine.mqtt_client_id}, keep-alive {mqtt.keepalive_s} s")
-    parts.append(f"topics {mqtt.topic_root}/{machine.site}/{machine.box}/...")
-    if mqtt.commands.enabled:
-        parts.append(f"takes commands: {', '.join(mqtt.commands.allow) or 'none'}")
-    if mqtt.home_assistant is not None and mqtt.home_assistant.enabled:
-        parts.append(f"tells Home Assistant below {mqtt.home_assistant.prefix}/")
-    if mqtt.sparkplug is not None:
-        group, node = mqtt.sparkplug.group or machine.site, mqtt.sparkplug.edge_node or machine.box
-        host = mqtt.sparkplug.primary_host
-        parts.append(
-            f"Sparkplug B edge node {group}/{node}{f', waits for host {host}' if host is not None else ''}"
-        )
-    return "; ".join(parts)
-
-
 def _facts(facts: Iterable[tuple[str, str]]) -> list[str]:
     """Labels in a column, their texts wrapped beside them."""
-    return [line for label, text in facts for line in _wrapped(f"{label:<9}", text)]
+    return [line for label, text in facts for line in _wrapped(f"{label:<8} ", text)]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -15,9 +15,9 @@ from daqsvc.settings.checks import check
 from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
 from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.locate import Spot
-from daqsvc.settings.models import MachineFile, Origin
+from daqsvc.settings.models import MachineFile, Origin, machine_file_model
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
-from daqsvc.settings.registry import broken_detectors, driver_of_layout
+from daqsvc.settings.registry import broken_detectors, broken_outputs, driver_of_layout
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
@@ -95,14 +95,16 @@ class _Reading:
         self.findings: list[Finding] = []
 
     def leave_out_broken(self) -> None:
-        """Take out the tables of detectors that are installed and cannot be loaded; each is a finding."""
-        pipeline = self._document.get("pipeline")
-        if not isinstance(pipeline, dict):
-            return
-        for key in broken_detectors().keys() & pipeline.keys():
-            del pipeline[key]
-            remedy = f"install the package that brings it again, or remove [pipeline.{key}]"
-            self.findings.append(Finding(("pipeline", key), broken_detectors()[key], remedy))
+        """Take out the tables of plugins that are installed and cannot be loaded; each is a finding."""
+        broken = {f"pipeline.{key}": why for key, why in broken_detectors().items()}
+        for name, why in (broken | dict(broken_outputs())).items():
+            path = tuple(name.split("."))
+            with suppress(LookupError):
+                table = value_at(self._document, path[:-1])
+                if isinstance(table, dict):
+                    del table[path[-1]]
+                    remedy = f"install the package that brings it again, or remove [{name}]"
+                    self.findings.append(Finding(path, why, remedy))
 
     def validate(self) -> MachineFile:
         """Check every value for itself; returns the file, or what is valid of it."""
@@ -120,7 +122,7 @@ class _Reading:
         if unknown:
             _, errors = _validated(meant)
         self._say([error for error in errors if error["type"] != "extra_forbidden"], meant)
-        part = valid_part(MachineFile, meant)
+        part = valid_part(machine_file_model(), meant)
         assert isinstance(part, MachineFile)  # noqa: S101 - for the type checker
         return part
 
@@ -131,7 +133,7 @@ class _Reading:
         for number, path in enumerate(sorted(unknown, key=len, reverse=True)):
             table = value_at(meant, path[:-1])
             key = str(path[-1])
-            section = section_of(declared_at(MachineFile, meant, path[:-1]), table)
+            section = section_of(declared_at(machine_file_model(), meant, path[:-1]), table)
             # A secret in the file is refused, never taken for the value of some other key.
             usable = None if is_secret(path) or number >= _MOST_PROBLEMS else section
             better = None if usable is None else suggested_key(usable, table, key)
@@ -142,7 +144,7 @@ class _Reading:
         return meant
 
     def _say(self, errors: Iterable[ErrorDetails], document: dict[str, Any]) -> None:
-        words = ErrorFormatter(MachineFile, document)
+        words = ErrorFormatter(machine_file_model(), document)
         for error in islice(errors, _MOST_PROBLEMS):
             path = tuple(step for step in error["loc"] if step != "[key]")
             message, remedy = words.say(error, path)
@@ -177,7 +179,7 @@ class _Reading:
 def _validated(document: dict[str, Any]) -> tuple[MachineFile | None, list[ErrorDetails]]:
     """The file if every value is valid for itself, else what is wrong."""
     try:
-        return MachineFile.model_validate(document), []
+        return machine_file_model().model_validate(document), []
     except ValidationError as error:
         return None, [item for item in error.errors(include_url=False) if not only_follows(item, document)]
 
@@ -209,7 +211,7 @@ def _shown(path: KeyPath, source: str) -> str:
     """A value as the file has it, on one short line and without secrets."""
     if source and is_secret(path):
         return _MASK
-    if path == ("mqtt", "url") and "@" in source:
+    if "@" in source and (path[-1:] == ("url",) or "://" in source):
         return json.dumps(re.sub(r"^(\w+://)?.*@", r"\1***@", source.strip("\"'")))
     line = " ".join(source.split())
     return line if len(line) <= _LONGEST_VALUE else f"{line[: _LONGEST_VALUE - 4]} ..."

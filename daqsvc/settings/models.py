@@ -19,10 +19,15 @@ from daqsvc.settings.alarms import (
     VotingAlarm,
 )
 from daqsvc.settings.buses import Bus, Layout
-from daqsvc.settings.mqtt import Mqtt
 from daqsvc.settings.packing import Channel, Counter
-from daqsvc.settings.pipeline import Pipeline
-from daqsvc.settings.registry import INSTALLED, configured, no_detectors
+from daqsvc.settings.pipeline import Pipeline, TableT
+from daqsvc.settings.registry import (
+    INSTALLED,
+    configured,
+    configured_outputs,
+    no_detectors,
+    with_outputs,
+)
 from daqsvc.settings.section import AngleDeg, DampingRatio, Line, Name, PositionUm, Section
 from daqsvc.settings.sensors import (
     Accelerometer,
@@ -53,7 +58,6 @@ __all__ = [
     "LevelAlarm",
     "Machine",
     "MachineFile",
-    "Mqtt",
     "Origin",
     "Pipeline",
     "ProximityProbe",
@@ -162,7 +166,8 @@ class MachineFile(Section):
     """Everything a box knows about the machine it watches.
 
     `daqsvc.settings.load.load_machine_file` makes it and guarantees that its tables fit each other;
-    validating a dict with this class alone checks each value, not how they fit.
+    validating a dict alone checks each value, not how they fit. `machine_file_model` adds the tables of the
+    outputs that are installed.
     """
 
     schema_version: Annotated[Literal[1], Field(description="version of this file's format", examples=[1])]
@@ -185,7 +190,6 @@ class MachineFile(Section):
         default=(), description="the alarms"
     )
     alarm_handling: AlarmHandling = Field(default=AlarmHandling(), description="what holds for all alarms")
-    mqtt: Mqtt | None = Field(default=None, description="the broker; none is configured if absent")
     store: Store | None = Field(default=None, description="the journal's place")
 
     _origin: Origin = PrivateAttr(default_factory=Origin)
@@ -224,12 +228,13 @@ class MachineFile(Section):
         named = (sensor for sensor in self.sensors if sensor.name in probes)
         return any(sensor.ac_coupled for sensor in named if isinstance(sensor, ProximityProbe))
 
-    @property
-    def mqtt_client_id(self) -> str:
-        """The client id for the broker: as in the file, else from site and box."""
-        given = self.mqtt.client_id if self.mqtt is not None else None
-        # No name holds a colon, so that no two boxes come to the same.
-        return given or f"daqsvc-{self.site}:{self.box}"
+    def output(self, kind: type[TableT]) -> TableT | None:
+        """The table of an output, by its class; None if the file has none.
+
+        Raises:
+            UnusableValueError: it is there and not valid.
+        """
+        return next((given for _, _, given in configured_outputs(self) if isinstance(given, kind)), None)
 
     def resolve(self, path: Path) -> Path:
         """A path of the file, made absolute: relative ones start at the directory of the machine file."""
@@ -270,3 +275,8 @@ class MachineFile(Section):
     def column(self, sensor: Sensor) -> int:
         """Where a sensor stands among the channels of its stream."""
         return self.streams[sensor.stream].layout.channel_names.index(sensor.channel)
+
+
+def machine_file_model() -> type[MachineFile]:
+    """The machine file with a table for each output that is installed."""
+    return with_outputs(MachineFile)

@@ -1,14 +1,14 @@
-"""What drivers and detectors bring to the machine file: checks of their tables, and words for a person."""
+"""What plugins bring to the machine file: checks of their tables, and words for a person."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
 from daqsvc.settings import registry
 from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.problems import Finding
-from daqsvc.settings.registry import DetectorKind, DriverKind
+from daqsvc.settings.registry import DetectorKind, DriverKind, OutputKind
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
@@ -52,6 +52,33 @@ class PipelineTable(DetectorKind[SettingsT]):
 
     def describe(self, machine: MachineFile, given: SettingsT) -> str:
         """What was understood of the table, for a person."""
+        del machine
+        return ", ".join(f"{key} {value}" for key, value in given)
+
+
+class OutputTable(OutputKind[SettingsT]):
+    """What an output says of its table; `daqsvc.publish.plugin` adds the output.
+
+    Attributes:
+        label: what `daqsvc check` writes before its words; an output below another adds its words to those.
+        absent: these words where the file has no such table; empty for none.
+    """
+
+    label: ClassVar[str] = ""
+    absent: ClassVar[str] = ""
+
+    def checks(self, draft: MachineFile, given: SettingsT) -> Iterator[Iterator[Finding]]:
+        """Every check of what the table says, and of what it asks of other tables.
+
+        Args:
+            draft: the machine file, or what is valid of it.
+            given: the table, or what is valid of it.
+        """
+        del draft, given
+        return iter(())
+
+    def describe(self, machine: MachineFile, given: SettingsT) -> str:
+        """What was understood of the table, for a person; empty for nothing."""
         del machine
         return ", ".join(f"{key} {value}" for key, value in given)
 
@@ -142,3 +169,16 @@ def configured(
     """See `registry.configured`."""
     found = registry.configured(pipeline, valid_only=valid_only)
     return cast("Iterator[tuple[str, PipelineTable[Any], Any]]", found)
+
+
+def output_tables() -> Mapping[str, OutputTable[Any]]:
+    """See `registry.output_tables`."""
+    return cast("Mapping[str, OutputTable[Any]]", registry.output_tables())
+
+
+def configured_outputs(
+    root: Section, *, valid_only: bool = False
+) -> Iterator[tuple[str, OutputTable[Any], Any]]:
+    """See `registry.configured_outputs`."""
+    found = registry.configured_outputs(root, valid_only=valid_only)
+    return cast("Iterator[tuple[str, OutputTable[Any], Any]]", found)

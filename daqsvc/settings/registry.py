@@ -1,11 +1,12 @@
 """The plugins that tables of a machine file belong to, found by their entry points, once a process.
 
-No driver and no detector is named in `daqsvc.settings`: what a machine file may say of them, they say.
+No driver, detector or output is named in `daqsvc.settings`: what a machine file may say of them, they say.
 The plugins are looked for when a file is read, not when the models are imported: they import these.
 """
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -31,6 +32,13 @@ DRIVERS = "daqsvc.drivers"
 """The group of entry points that drivers are registered in, by the name that ``driver = "..."`` gives."""
 DETECTORS = "daqsvc.detectors"
 """The group of entry points that detectors are registered in, by the key of their table in ``[pipeline]``."""
+OUTPUTS = "daqsvc.outputs"
+"""The group of entry points that outputs are registered in, by the path of their table."""
+
+log = logging.getLogger(__name__)
+
+_with_outputs: dict[type[Section], type[Any]] = {}
+"""Each table with those of the outputs below it, once they are known."""
 
 SettingsT = TypeVar("SettingsT", bound=Section)
 
@@ -61,6 +69,20 @@ class DetectorKind(Generic[SettingsT]):
         """
         del given
         return ()
+
+
+class OutputKind(Generic[SettingsT]):
+    """What an output says of its table in the machine file to have it read; `OutputTable` adds to it.
+
+    Attributes:
+        settings: the table.
+        about: what it is for, in a few words.
+        place: where it stands among other outputs; the smallest first.
+    """
+
+    settings: type[SettingsT]
+    about: ClassVar[str] = "an output"
+    place: ClassVar[int] = 100
 
 
 class DriverKind:
@@ -144,6 +166,7 @@ def forget() -> None:
     """Look for plugins anew: for whoever installs one in a running process."""
     _installed.cache_clear()
     pipeline_model.cache_clear()
+    _with_outputs.clear()
     forget_homes()
 
 
@@ -165,6 +188,16 @@ def bus_tables() -> Mapping[str, DriverKind]:
 def broken_drivers() -> Mapping[str, str]:
     """Why a driver that is installed cannot be loaded, by name."""
     return _installed(DRIVERS, "driver", DriverKind).broken
+
+
+def output_tables() -> Mapping[str, OutputKind[Any]]:
+    """The outputs that are installed, by the path of their table, in the order of their place."""
+    return _installed(OUTPUTS, "output", OutputKind).tables
+
+
+def broken_outputs() -> Mapping[str, str]:
+    """Why an output that is installed cannot be loaded, by the path of its table."""
+    return _installed(OUTPUTS, "output", OutputKind).broken
 
 
 def driver_of_layout(layout: Layout) -> DriverKind | None:
@@ -219,6 +252,33 @@ def no_detectors() -> Pipeline:
     return pipeline_model()()
 
 
+def with_outputs(base: type[SettingsT], path: str = "") -> type[SettingsT]:
+    """A table with those of the outputs below it, at any depth.
+
+    Args:
+        base: the table as it is without any.
+        path: where it stands; empty for the whole file.
+    """
+    if base not in _with_outputs:
+        _with_outputs[base] = _made_with_outputs(base, path)
+    made: type[SettingsT] = _with_outputs[base]
+    return made
+
+
+def _made_with_outputs(base: type[SettingsT], path: str) -> type[SettingsT]:
+    fields: dict[str, Any] = {}
+    for key, plugin in output_tables().items():
+        above, _, name = key.rpartition(".")
+        if above != path:
+            continue
+        if name in base.model_fields:
+            log.warning("output %s is left out: [%s] is a table of daqsvc itself; rename it", key, key)
+            continue
+        table: Any = with_outputs(plugin.settings, key)
+        fields[name] = (table | None, Field(default=None, description=plugin.about))
+    return create_model(base.__name__, __base__=base, __doc__=base.__doc__, **fields) if fields else base
+
+
 INSTALLED: Final = Kinds(lambda _table: pipeline_model(), lambda: (pipeline_model(),))
 """Annotation of the table ``[pipeline]``."""
 
@@ -240,3 +300,38 @@ def configured(
             given = getattr(pipeline, key)
             if given is not None:
                 yield key, plugin, given
+
+
+def table_at(root: Section, path: str) -> Section | None:
+    """The table of an output in a machine file; None if the file has none.
+
+    Args:
+        root: the machine file, or what is valid of it.
+        path: keys with a dot between them.
+
+    Raises:
+        UnusableValueError: there is one that is no table at all.
+    """
+    given: Section | None = root
+    for key in path.split("."):
+        given = getattr(given, key, None)
+    return given
+
+
+def configured_outputs(
+    root: Section, *, valid_only: bool = False
+) -> Iterator[tuple[str, OutputKind[Any], Any]]:
+    """The outputs that a machine file has a table for: path, plugin and table, in order.
+
+    Args:
+        root: the machine file, or what is valid of it.
+        valid_only: leave out a table that is no table at all.
+
+    Raises:
+        UnusableValueError: there is such a one.
+    """
+    for path, plugin in output_tables().items():
+        with suppress(*((UnusableValueError,) if valid_only else ())):
+            given = table_at(root, path)
+            if given is not None:
+                yield path, plugin, given

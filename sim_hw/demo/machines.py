@@ -12,6 +12,7 @@ import numpy as np
 
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.detectors.rotor_bank.settings import RotorBank
+from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file
 from sim_hw.demo.errors import DemoError
 
@@ -98,7 +99,8 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
     assert rig.machine.rotor is not None  # noqa: S101 - the file next to this one has it
     bank = rig.pipeline.table(RotorBank)
     assert bank is not None  # noqa: S101
-    assert rig.mqtt is not None  # noqa: S101
+    mqtt = rig.output(Mqtt)
+    assert mqtt is not None  # noqa: S101
     plant, rotor = scenario.plant, scenario.plant.rotor
     described = rig.machine.rotor.model_copy(
         update={
@@ -117,7 +119,7 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
             "machine": rig.machine.model_copy(update={"speed_rpm": plant.speed_rpm, "rotor": described}),
             "streams": {"shaft": rig.streams["shaft"].model_copy(update={"rate_hz": scenario.rate_hz})},
             "pipeline": rig.pipeline.model_copy(update={"rotor_bank": bank}),
-            "mqtt": rig.mqtt.model_copy(update={"url": url}),
+            "mqtt": mqtt.model_copy(update={"url": url}),
         }
     )
 

@@ -257,9 +257,9 @@ def _node(bus: can.BusABC, layout: FrameLayout, script: Script) -> CanNode:
 
 
 async def _links_up(service: Service) -> None:
-    publisher = service.publisher
+    publisher = service.alarms.outputs.get("mqtt")
     await _until(lambda: all(driver.link.state == "up" for driver in service.drivers))
-    await _until(lambda: publisher is None or publisher.counters.connected)
+    await _until(lambda: publisher is None or bool(publisher.figures()["connected"]))
 
 
 async def _until(true: Callable[[], bool]) -> None:

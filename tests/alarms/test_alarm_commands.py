@@ -14,6 +14,7 @@ import pytest
 from support.brokers import Consumer, eventually, running_mosquitto
 from support.can_gateway import MACHINE, CanGateway
 from support.live_service import running
+from support.mqtt_publishing import mqtt, outputs
 
 from daqsvc import alarm_service, audit
 from daqsvc.acquisition.clock import DrivenClock
@@ -24,13 +25,15 @@ from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.alarms.states import AlarmState
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.journal import Journal
-from daqsvc.publish.settings import MqttSettings
-from daqsvc.self_check import NS_PER_DAY
+from daqsvc.publish.mqtt.conditions import NS_PER_DAY
+from daqsvc.publish.mqtt.publisher import MqttPublisher
 from daqsvc.settings import parse_machine_file
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+    from daqsvc.publish.output import OutputSet
 
 pytestmark = pytest.mark.integration
 RUB = "rub"
@@ -40,11 +43,11 @@ ACK = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm=RUB, by="ann")
 
 @contextlib.asynccontextmanager
 async def desk_in(
-    store: Path, clock: DrivenClock | None = None, mqtt: MqttSettings | None = None
+    store: Path, clock: DrivenClock | None = None, asked: OutputSet | None = None
 ) -> AsyncIterator[AlarmService]:
     """A desk with latching alarms on what detectors of the same names find."""
     rules = [DiagnosisRule(name, name, latching=True) for name in (RUB, *OTHERS)]
-    desk = AlarmService(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), mqtt)
+    desk = AlarmService(Identity("lab", "edge-1", "pump"), rules, store, clock or DrivenClock(), asked)
     await desk.open()
     try:
         await desk.resume({})
@@ -291,15 +294,16 @@ async def test_shelving_ends_by_itself_and_survives_a_restart(tmp_path: Path) ->
 
 async def test_a_certificate_that_ends_soon_is_an_alarm_until_it_is_renewed(tmp_path: Path) -> None:
     clock = DrivenClock()
-    async with desk_in(tmp_path, clock, MqttSettings("localhost", 8883, "box", tls=True)) as desk:
-        assert desk.publisher is not None
-        desk.publisher._expiry["client"] = clock.wall_ns() + 13 * NS_PER_DAY
+    async with desk_in(tmp_path, clock, outputs(mqtt(8883, "box", "localhost", tls=True))) as desk:
+        publisher = desk.outputs["mqtt"]
+        assert isinstance(publisher, MqttPublisher)
+        publisher._expiry["client"] = clock.wall_ns() + 13 * NS_PER_DAY
         for _ in range(3):
             desk.tick()
         assert state(desk, "certificate/client") is AlarmState.ACTIVE_UNACKNOWLEDGED
         acknowledge = AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="certificate/client", by="ann")
         assert (await desk.execute(acknowledge, "test")).accepted
-        desk.publisher._expiry["client"] += 90 * NS_PER_DAY
+        publisher._expiry["client"] += 90 * NS_PER_DAY
         desk.tick()
         assert state(desk, "certificate/client") is AlarmState.NORMAL
         await desk.settle(5.0)

@@ -100,7 +100,7 @@ async def test_alarms_that_a_damaged_journal_forgot_are_told_as_normal(tmp_path,
     for message in await desk.outbox.latest():
         payload = json.loads(message.payload)
         told[payload["alarm"]] = (payload["kind"], payload["state"], payload["occurrence"])
-    names = ("fault", "other") if knows else ("fault", "other", "sensor-ok/x", *conditions(None))
+    names = ("fault", "other") if knows else ("fault", "other", "sensor-ok/x", *conditions())
     assert told == dict.fromkeys(names, ("returned", "normal", None))
     await desk.close(1.0)
 

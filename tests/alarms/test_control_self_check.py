@@ -9,23 +9,16 @@ import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import Level
-from daqsvc.publish.settings import MqttSettings
-from daqsvc.self_check import MIB, NS_PER_DAY, BusHealth, SelfCheck, Vitals, conditions
+from daqsvc.self_check import MIB, BusHealth, SelfCheck, Vitals, conditions
 from daqsvc.settings.registry import bus_tables
 from drivers.base import BusCounters
 from drivers.can.errors import CanCounters
 from drivers.serial.driver import SerialCounters
 
-HOUR_NS = 3600 * NS_PER_S
-NOW_NS = 1_795_264_095 * NS_PER_S
 STORE = Path("/var/lib/daqsvc")
 FINE: dict[str, Any] = {
     "now_ns": 0,
-    "wall_ns": NOW_NS,
-    "certificates_end_ns": {},
-    "broker_has_expired": False,
     "conditions_told": frozenset(),
-    "connected": True,
     "free_bytes": None,
     "waiting": 0,
     "write_errors": 0,
@@ -46,58 +39,11 @@ def self_check() -> SelfCheck:
 
 
 def test_a_service_that_is_well_says_nothing_but_normal() -> None:
-    found = look(self_check(), free_bytes=65 * MIB, certificates_end_ns={"broker": NOW_NS + 90 * NS_PER_DAY})
+    found = look(self_check(), free_bytes=65 * MIB)
     assert {level for level, _ in found.values()} == {Level.NORMAL}
     assert set(found) == {
-        "certificate/broker",
         *(f"store/{part}" for part in ("disk", "journal", "damage", "telemetry", "audit-log")),
     }
-
-
-@pytest.mark.parametrize(
-    ("days", "level", "words"),
-    [
-        (14.1, Level.NORMAL, "lasts until"),
-        (13.9, Level.ALERT, "ends at 2026-12-05T10:04:15.000000Z, in less than 14 days: renew it"),
-        (0.1, Level.ALERT, "renew it"),
-        (-0.1, Level.DANGER, "ended at"),
-    ],
-)
-def test_a_certificate_that_ends_is_told_a_fortnight_before(days: float, level: Level, words: str) -> None:
-    found = look(self_check(), certificates_end_ns={"client": NOW_NS + round(days * NS_PER_DAY)})
-    assert found["certificate/client"][0] is level
-    assert words in found["certificate/client"][1]
-
-
-def test_a_broker_that_is_refused_as_expired_is_dangerous_whatever_it_showed_before() -> None:
-    check, before = self_check(), {"broker": NOW_NS + 90 * NS_PER_DAY}
-    for known in ({}, before):
-        found = look(check, certificates_end_ns=known, connected=False, broker_has_expired=True)
-        level, sentence = found["certificate/broker"]
-        assert level is Level.DANGER
-        assert "has expired; renew it" in sentence
-    assert look(check, certificates_end_ns=before)["certificate/broker"][0] is Level.NORMAL
-
-
-def test_a_clock_that_is_set_by_an_hour_makes_no_certificate_alarm_come_and_go() -> None:
-    check, ends = self_check(), {"client": NOW_NS + 14 * NS_PER_DAY + HOUR_NS // 2}
-    levels = [
-        look(check, wall_ns=NOW_NS + step_ns, certificates_end_ns=ends)["certificate/client"][0]
-        for step_ns in (0, HOUR_NS, 0, -HOUR_NS, HOUR_NS)
-    ]
-    assert levels == [Level.NORMAL, *[Level.ALERT] * 4]
-    renewed = {"client": NOW_NS + 90 * NS_PER_DAY}
-    assert look(check, certificates_end_ns=renewed)["certificate/client"][0] is Level.NORMAL
-
-
-def test_a_certificate_that_is_no_longer_in_use_stands_no_longer() -> None:
-    told = frozenset({"certificate/ca", "alarm-flood"})
-    assert "certificate/ca" not in look(self_check(), conditions_told=told, connected=False), (
-        "nobody knows yet"
-    )
-    found = look(self_check(), conditions_told=told)
-    assert found["certificate/ca"] == (Level.NORMAL, "it is no longer in use")
-    assert "alarm-flood" not in found
 
 
 def test_a_disk_that_fills_is_told_by_the_limit() -> None:
@@ -149,24 +95,6 @@ def test_set_aside_is_said_of_files_that_are_there() -> None:
         look(check)
         _, sentence = look(check, damaged=1, set_aside=there)["store/damage"]
         assert ("corrupt-" in sentence) is there
-
-
-def test_what_the_broker_refuses_is_named_once_without_a_count() -> None:
-    check = self_check()
-    assert "broker/refused" not in look(check), "there is no broker"
-    assert "broker/refused" not in look(check, refused={}), "nobody knows yet"
-    assert look(check, refused={}, is_refused_known=True)["broker/refused"][0] is Level.NORMAL
-    level, one = look(check, refused={"a/b": "not allowed"})["broker/refused"]
-    assert level is Level.ALERT
-    assert "will not take messages on a/b (not allowed): they wait on disk" in one
-    many = {f"a/{n}": "no" for n in range(3, 9)}
-    _, several = look(check, refused=many)["broker/refused"]
-    assert several == look(check, refused=many | {"a/9": "no"})["broker/refused"][1]
-    assert "a/3 (no); a/4 (no); a/5 (no), and others" in several
-    gone = look(check, conditions_told=frozenset({"broker/refused"}))
-    assert gone["broker/refused"][0] is Level.NORMAL
-    assert "broker/refused" in conditions(MqttSettings("h", 1, "c"))
-    assert "broker/refused" not in conditions(None)
 
 
 NOW_AND_THEN = {
@@ -264,7 +192,7 @@ def test_a_bus_that_is_no_longer_there_has_no_alarm() -> None:
 def test_the_alarms_of_a_bus_are_known_before_they_are_raised() -> None:
     drivers = {"can0": "can", "tty": "serial", "plc": "modbus", "log": "replay"}
     buses = {name: bus_tables()[driver].self_checks for name, driver in drivers.items()}
-    assert set(conditions(None, buses)) - set(conditions(None)) == {
+    assert set(conditions(buses)) - set(conditions()) == {
         "bus-overrun/can0",
         "bus-controller/can0",
         "bus-recording/can0",

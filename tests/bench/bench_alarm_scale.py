@@ -20,7 +20,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nothing_lost.broker import LOOPBACK, Broker, mosquitto_program
+from nothing_lost.broker import Broker, mosquitto_program
+from support.mqtt_publishing import mqtt, outputs
 from targets import Targets
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
@@ -33,9 +34,9 @@ from daqsvc.alarms.manager import AlarmManager, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.output import Watched
 from daqsvc.publish.payloads import status_payload
-from daqsvc.publish.settings import HomeAssistantSettings
 from daqsvc.service import LoopLag
 
 if TYPE_CHECKING:
@@ -135,10 +136,8 @@ class Rig:
 
     def __init__(self, count: int, store: Path, port: int) -> None:
         names = (*(rule.alarm for rule in rules(count)), *(f"sensor-ok/probe-{i}" for i in range(count)))
-        mqtt = MqttSettings(
-            LOOPBACK, port, "bench", home_assistant=HomeAssistantSettings("rig", alarms=names)
-        )
-        self.alarms = AlarmService(RIG, rules(count), store, CLOCK, mqtt, handling=HANDLING)
+        told = outputs(mqtt(port, "bench"), Watched("rig", alarms=names), home_assistant=HomeAssistant())
+        self.alarms = AlarmService(RIG, rules(count), store, CLOCK, told, handling=HANDLING)
         self.lag = LoopLag()
         self._count = count
         self._said = 0
@@ -164,10 +163,10 @@ async def to_the_broker(directory: Path, port: int, seconds: float, targets: Tar
     desk, counters = rig.alarms, rig.alarms.outbox.counters
     await desk.open()
     await desk.resume(active_detectors(FLOOD_ALARMS))
-    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
+    running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     helpers = [asyncio.create_task(desk.keep_time()), asyncio.create_task(rig.lag.watch())]
     try:
-        while not (desk.publisher and desk.publisher.counters.connected):
+        while not desk.outputs["mqtt"].figures()["connected"]:
             await asyncio.sleep(0.1)
         await rig.flood(FLOOD_EVENTS_PER_S, 2.0)
         gc.freeze()  # as daqsvc run does once it is ready

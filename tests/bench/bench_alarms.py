@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from nothing_lost.broker import LOOPBACK, Broker, mosquitto_program
+from support.mqtt_publishing import mqtt, outputs
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
@@ -29,7 +30,6 @@ from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis, Severity
-from daqsvc.publish.mqtt import MqttSettings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -126,11 +126,11 @@ class Timed(Decider):
 async def running_desk(store: Path, port: int) -> AsyncIterator[AlarmService]:
     """A desk that publishes to the broker at ``port``."""
     desk = AlarmService(
-        RIG, [DiagnosisRule("rotor-fault", "rotor-bank")], store, CLOCK, MqttSettings(LOOPBACK, port, "bench")
+        RIG, [DiagnosisRule("rotor-fault", "rotor-bank")], store, CLOCK, outputs(mqtt(port, "bench"))
     )
     await desk.open()
     await desk.resume({"rotor-bank": ("probe-x",)})
-    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
+    running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     try:
         yield desk
     finally:
@@ -208,7 +208,7 @@ async def backlog(store: Path, broker: Broker, count: int) -> None:
         filled_s = time.perf_counter() - begun
         full_mb = rss_mb()
         await broker.start()
-        while not (desk.publisher and desk.publisher.counters.connected):
+        while not desk.outputs["mqtt"].figures()["connected"]:
             await asyncio.sleep(0.01)
         begun = time.perf_counter()
         most_mb = full_mb

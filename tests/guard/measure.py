@@ -264,7 +264,7 @@ def main() -> int:
     for word in (
         "load_machine_file",
         "parse_machine_file",
-        "MachineFile.model_validate",
+        "machine_file_model().model_validate",
         "isinstance(counters",
     ):
         users = [path for path, text in texts.items() if word in text]

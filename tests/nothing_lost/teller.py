@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from nothing_lost.script import RULES, SENSORS, Script
+from support.mqtt_publishing import mqtt, outputs
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.link import Backoff
 from daqsvc.alarm_service import AlarmService
 from daqsvc.outbox.messages import event_id
-from daqsvc.publish.mqtt import MqttSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -182,18 +182,18 @@ async def first_untold(witness: Witness, outbox: Outbox) -> int:
 async def run(arguments: argparse.Namespace) -> None:
     script = Script.of_seed(arguments.seed)
     clock = SteppedClock()
-    mqtt = MqttSettings(
-        arguments.host,
+    table = mqtt(
         arguments.port,
         f"daqsvc-{arguments.seed}",
+        arguments.host,
         keepalive_s=1,
         protocol=arguments.protocol,
     )
     bypassed = arguments.mutation == "bypass"
-    desk = AlarmService(script.identity, RULES, arguments.store, clock, None if bypassed else mqtt)
-    if desk.publisher is not None:
-        assert hasattr(desk.publisher, "_backoff")
-        desk.publisher._backoff = QUICK_RETRY
+    desk = AlarmService(script.identity, RULES, arguments.store, clock, None if bypassed else outputs(table))
+    if desk.outputs:
+        assert hasattr(desk.outputs["mqtt"], "_backoff")
+        desk.outputs["mqtt"]._backoff = QUICK_RETRY
     await desk.open()
     if bypassed:
         Bypass(desk.outbox, arguments.host, arguments.port)
@@ -205,7 +205,7 @@ async def run(arguments: argparse.Namespace) -> None:
     teller.write("started")
     clock.wall_offset_s = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s
     await desk.resume(SENSORS)
-    running = [asyncio.create_task(each.run()) for each in desk.tellers.values()]
+    running = [asyncio.create_task(each.run()) for each in desk.outputs.values()]
     timekeeper = asyncio.create_task(desk.keep_time())
     await teller.tell(script.steps[untold:])
     while desk.outbox.counters.waiting or desk.outbox.counters.depth:

@@ -70,13 +70,14 @@ def test_the_machine_file_is_read_once(
 ) -> None:
     """However many recordings: reading it compiles what it names, and checks it against this computer."""
     read: list[Path] = []
-    parsed = settings_load.MachineFile.model_validate
+    model = settings_load.machine_file_model()
+    parsed = model.model_validate
 
     def counting(document: Any) -> Any:
         read.append(machine)
         return parsed(document)
 
-    monkeypatch.setattr(settings_load.MachineFile, "model_validate", counting)
+    monkeypatch.setattr(model, "model_validate", counting)
     recordings = [Orbit(30, seed=seed).save(tmp_path / f"{seed}.npz") for seed in range(3)]
     _, found, _ = analyze(machine, *recordings)
     assert (len(found), len(read)) == (3, 1)

@@ -11,6 +11,7 @@ from collections import Counter
 
 import pytest
 from support.brokers import Consumer, eventually, free_port, running_mosquitto
+from support.mqtt_publishing import mqtt, outputs
 from support.small_disks import failing, mounted
 
 from daqsvc.acquisition.clock import SystemClock
@@ -21,7 +22,6 @@ from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox import writer
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.reading import read_journal
-from daqsvc.publish.settings import MqttSettings
 
 pytestmark = pytest.mark.integration
 CLOCK = SystemClock()
@@ -44,11 +44,12 @@ def disk(tmp_path):
 @contextlib.asynccontextmanager
 async def desk_at(store, port, *, stop_s=2.0):
     """The alarms of a service with a broker, from its start to its stop."""
-    mqtt = MqttSettings("127.0.0.1", port, "daqsvc-test")
-    desk = AlarmService(Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, mqtt, limits=LIMITS)
+    desk = AlarmService(
+        Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, outputs(mqtt(port)), limits=LIMITS
+    )
     await desk.open()
     await desk.resume({})
-    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
+    running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     try:
         yield desk
     finally:
@@ -148,7 +149,7 @@ async def test_a_stop_on_a_full_disk_hands_everything_over(disk, mosquitto, capl
     store = disk.directory / "store"
     async with Consumer(mosquitto.port) as consumer:
         async with desk_at(store, mosquitto.port) as desk:
-            await eventually(lambda: desk.publisher.counters.connected, "there is a broker")
+            await eventually(lambda: desk.outputs["mqtt"].counters.connected, "there is a broker")
             await desk.outbox.pending(0, 1)
             disk.fill()
             find(desk, "race-fault", "danger")

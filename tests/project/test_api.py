@@ -11,6 +11,7 @@ NAMES = {
     *("StreamAssembler", "assembler_of", "SampleBlock", "FrameLayout", "LayoutError"),
     *("Attempt", "CannotOpenError", "in_thread", "run_with_reconnect"),
     *("Detector", "DetectorPlugin", "WindowDetector", "Judgement", "Window", "Diagnosis", "Reading"),
+    *("Output", "OutputPlugin", "OutputPort", "OutboxMessage", "Watched", "Condition", "Level"),
     *("MachineFile", "Section", "Bus", "Layout", "PackedLayout", "Stream", "Sensor", "Name", "Text"),
     *("AssemblyError", "Finding", "StreamWords", "choice"),
 }

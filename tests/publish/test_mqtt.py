@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import json
 import logging
 
 import pytest
 from support.brokers import PATIENCE_S, Consumer, TcpProxy, eventually, free_port, running_mosquitto
+from support.mqtt_publishing import publishing
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.events import Identity
@@ -17,7 +17,6 @@ from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.connection import Connection
-from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
 from daqsvc.publish.topics import Topics
 from sim_hw.demo.broker import EmbeddedBroker
@@ -45,23 +44,6 @@ async def broker(request, tmp_path):
     else:
         with running_mosquitto(tmp_path) as mosquitto:
             yield mosquitto.port, protocol
-
-
-@contextlib.asynccontextmanager
-async def publishing(outbox, port, protocol="5", **settings):
-    publisher = MqttPublisher(
-        MqttSettings("127.0.0.1", port, "daqsvc-test", protocol=protocol, **settings),
-        "lab",
-        "edge-1",
-        outbox,
-        CLOCK,
-    )
-    running = asyncio.create_task(publisher.run())
-    try:
-        yield publisher
-    finally:
-        await publisher.stop()
-        await running
 
 
 class Service:

@@ -5,25 +5,25 @@ from __future__ import annotations
 import json
 import logging
 import tempfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.mqtt_publishing import commands
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.outbox.command_ids import CommandIds
-from daqsvc.publish.command_intake import CommandIntake
-from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.connection import Incoming
-from daqsvc.publish.settings import CommandSettings
+from daqsvc.publish.mqtt.command_intake import CommandIntake
+from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.topics import Topics
 
 NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=UTC)
-SETTINGS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE, Verb.SHELVE}), max_age_s=60.0)
+SETTINGS = commands(Verb.ACKNOWLEDGE, Verb.SHELVE, max_age_s=60.0)
 TOPICS = Topics("daqsvc", "lab", "edge-1")
 ACKNOWLEDGE = "daqsvc/lab/edge-1/rig/commands/acknowledge"
 COMMAND = {
@@ -56,9 +56,10 @@ def intake(desk, tmp_path):
     return make(desk, tmp_path)
 
 
-def make(desk, store, settings=SETTINGS):
+def make(desk, store, settings=SETTINGS, reserved=()):
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
-    return CommandIntake(settings, TOPICS, desk, clock, CommandIds(store / "command-ids"))
+    ids = CommandIds(store / "command-ids")
+    return CommandIntake(settings, "rig", TOPICS, desk, clock, ids, reserved)
 
 
 def message(payload=None, topic=ACKNOWLEDGE, *, retain=False, properties=None, **changes):
@@ -293,7 +294,7 @@ async def test_a_flood_of_commands_cannot_make_the_box_forget_an_id(intake, desk
 async def test_ids_are_forgotten_when_a_repeat_would_be_too_old_anyway(desk, tmp_path, monkeypatch):
     monkeypatch.setattr("daqsvc.outbox.command_ids.REMEMBERED", 1)
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
-    intake = CommandIntake(SETTINGS, TOPICS, desk, clock, CommandIds(tmp_path / "ids"))
+    intake = CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, CommandIds(tmp_path / "ids"))
     await answer(intake)
     clock.advance_to(clock.monotonic_ns() + 121 * 10**9)
     repeated, _ = await answer(intake)
@@ -340,7 +341,7 @@ async def test_mqtt5_senders_are_answered_where_they_want_and_recognise_it(intak
 )
 async def test_an_answer_never_speaks_in_the_name_of_somebody_else(desk, tmp_path, topic):
     """The box may write where the sender may not: the sender must not borrow that."""
-    intake = make(desk, tmp_path, replace(SETTINGS, reserved=("ha/discovery",)))
+    intake = make(desk, tmp_path, reserved=("ha/discovery",))
     response, told = await answer(intake, properties={"response_topic": topic})
     assert told.topic == f"{ACKNOWLEDGE}/response"
     assert response.accepted
@@ -360,7 +361,7 @@ async def test_a_sender_writes_no_lines_into_the_log(intake, caplog):
 
 
 async def test_the_limit_of_the_size_is_the_machine_files(desk, tmp_path):
-    intake = make(desk, tmp_path, replace(SETTINGS, max_bytes=300))
+    intake = make(desk, tmp_path, commands(*SETTINGS.allow, max_bytes=300))
     response, _ = await answer(intake, reason="x" * 250)
     assert "at most 300" in response.reason
 
@@ -389,7 +390,7 @@ async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_p
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp()) * 10**9)
     ids = CommandIds(tmp_path / "command-ids")
     assert not ids.open(clock.wall_ns(), is_new=True)
-    response, _ = await answer(CommandIntake(SETTINGS, TOPICS, desk, clock, ids))
+    response, _ = await answer(CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, ids))
     assert response.accepted
     if damage is None:
         (tmp_path / "command-ids").unlink()
@@ -398,7 +399,7 @@ async def test_with_its_ids_lost_a_restart_obeys_nothing_from_before(desk, tmp_p
     clock = DrivenClock(wall_start_ns=round(NOW.timestamp() + 10) * 10**9)
     ids = CommandIds(tmp_path / "command-ids")
     assert ids.open(clock.wall_ns(), is_new=False)
-    again = CommandIntake(SETTINGS, TOPICS, desk, clock, ids)
+    again = CommandIntake(SETTINGS, "rig", TOPICS, desk, clock, ids)
     response, _ = await answer(again)
     assert not response.accepted
     assert "before the service started" in response.reason

@@ -12,15 +12,14 @@ import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from support.brokers import PATIENCE_S, Consumer, TcpProxy, eventually, running_mosquitto
-from support.mqtt_publishing import Desk, publishing, say
+from support.mqtt_publishing import Desk, commands, publishing, say
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
-from daqsvc.publish.command_payloads import ResponsePayload
-from daqsvc.publish.settings import CommandSettings
+from daqsvc.publish.mqtt.command_payloads import ResponsePayload
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 ACKNOWLEDGE = "daqsvc/lab/edge-1/rig/commands/acknowledge"
-SETTINGS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE}))
+SETTINGS = commands(Verb.ACKNOWLEDGE)
 
 
 def command(identifier="c1", **changes):

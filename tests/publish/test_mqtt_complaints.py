@@ -15,9 +15,9 @@ from support.deaf_broker import DeafBroker
 from support.mqtt_publishing import CLOCK, publishing
 
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish import credentials
 from daqsvc.publish.delivery import IN_FLIGHT
-from daqsvc.publish.mqtt import FIRST_RETRY_NS
+from daqsvc.publish.mqtt import credentials
+from daqsvc.publish.mqtt.publisher import FIRST_RETRY_NS
 
 pytestmark = pytest.mark.integration
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
@@ -150,9 +150,9 @@ async def test_a_broker_that_tells_of_a_rival_is_believed_at_once(mosquitto, out
 async def test_a_connected_broker_without_traffic_is_reconnected_to_in_a_storm(outbox, monkeypatch):
     """telegraf#16038: connected, nothing gets through, a new connection, and so on at the same pace."""
     monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 0.1)
-    monkeypatch.setattr("daqsvc.publish.mqtt.PUBACK_S", 0.1)
-    monkeypatch.setattr("daqsvc.publish.mqtt.STABLE_S", 0.05)
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 10_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.PUBACK_S", 0.1)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)
     await append(outbox, 1)
     async with DeafBroker() as broker, publishing(outbox, broker.port, "3.1.1") as publisher:
         await eventually(lambda: broker.connections >= 5, "it keeps trying")
@@ -275,7 +275,7 @@ async def test_reading_certificates_blocks_the_event_loop(mosquitto, outbox, mon
         threads.append(threading.current_thread())
         return read(settings)
 
-    monkeypatch.setattr("daqsvc.publish.mqtt.read_credentials", remember)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.read_credentials", remember)
     async with publishing(outbox, mosquitto.port) as publisher:
         await eventually(lambda: publisher.counters.connected, "connected")
     assert threads

@@ -10,8 +10,8 @@ from support.brokers import eventually
 from support.mqtt_publishing import publishing
 from support.picky_broker import PickyBroker, length_of
 
-from daqsvc.publish import session
-from daqsvc.publish.mqtt import MqttPublisher
+from daqsvc.publish.mqtt import session
+from daqsvc.publish.mqtt.publisher import MqttPublisher
 
 pytestmark = pytest.mark.integration
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
@@ -35,7 +35,7 @@ async def test_whatever_goes_wrong_in_the_publisher_is_said_once_and_tried_again
         return await work(self, *arguments)
 
     monkeypatch.setattr(MqttPublisher, where, fails)
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     async with (
         PickyBroker(lambda _topic, _size: True) as broker,
         publishing(outbox, broker.port) as publisher,
@@ -61,7 +61,7 @@ async def test_a_part_of_the_session_that_fails_takes_nothing_else_with_it(outbo
         await work(self)
 
     monkeypatch.setattr(session.Session, part, fails)
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     async with (
         PickyBroker(lambda _topic, _size: True) as broker,
         publishing(outbox, broker.port) as publisher,
@@ -94,7 +94,7 @@ class OldBroker(PickyBroker):
 
 async def test_a_broker_that_knows_no_mqtt_5_is_found_out_once(outbox, monkeypatch):
     """And asked for it again when it may be another one."""
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     monkeypatch.setattr("daqsvc.publish.spoken.HASTE_S", 0.05)
     async with OldBroker() as broker:
         for _ in range(3):
@@ -109,7 +109,7 @@ async def test_a_broker_that_knows_no_mqtt_5_is_found_out_once(outbox, monkeypat
 
 async def test_a_broker_of_mqtt_5_that_takes_its_time_gets_it(outbox, monkeypatch):
     """It is asked in 3.1.1, does not answer to that either, and then is waited for."""
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     monkeypatch.setattr("daqsvc.publish.spoken.HASTE_S", 0.05)
     monkeypatch.setattr("daqsvc.publish.spoken.CONSENT_S", 1.0)
 

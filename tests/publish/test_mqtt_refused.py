@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 from support.brokers import Consumer, eventually, free_port, running_mosquitto
-from support.mqtt_publishing import CLOCK, publishing
+from support.mqtt_publishing import CLOCK, mqtt, outputs, publishing
 from support.picky_broker import PickyBroker
 
 from daqsvc.alarm_service import AlarmService
@@ -20,7 +20,6 @@ from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.connection import Connection
 from daqsvc.publish.errors import MqttError
-from daqsvc.publish.settings import MqttSettings
 
 pytestmark = pytest.mark.integration
 BASE = "daqsvc/lab/edge-1"
@@ -126,7 +125,7 @@ async def test_a_broker_that_ends_the_connection_for_one_topic_loses_nothing_els
     outbox, caplog, monkeypatch
 ):
     """MQTT 3.1.1 has no other way to refuse: the culprit is found by sending one at a time."""
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 10_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)
     caplog.set_level(logging.INFO)
     async with PickyBroker(lambda topic, _size: topic != BAD) as broker:
         good = await append(outbox, GOOD, 5)
@@ -154,7 +153,7 @@ async def test_a_broker_that_ends_the_connection_for_one_topic_loses_nothing_els
 
 
 async def test_a_broker_that_ends_the_connection_for_a_size_loses_nothing_else(outbox, caplog, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 10_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)
     async with PickyBroker(lambda _topic, size: size < 2000) as broker:
         large = await append(outbox, GOOD, size=3000)
         others = await append(outbox, BAD, 3)
@@ -265,7 +264,7 @@ async def test_a_store_that_cannot_be_read_makes_no_outage_of_the_broker(outbox,
 async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_path, monkeypatch):
     """Also where its own topic is among the refused."""
     monkeypatch.setattr("daqsvc.publish.delivery.TRY_AGAIN_S", 0.1)
-    monkeypatch.setattr("daqsvc.publish.mqtt.STABLE_S", 0.3)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.3)
     store = tmp_path / "store"
     alarm = f"{BASE}/rig/alarms/broker/refused"
     rules = [DiagnosisRule(name, name) for name in ("rotor-fault", "sensor")]
@@ -274,12 +273,10 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
         return Diagnosis("rig", detector, CLOCK.monotonic_ns(), "shaft", 0, 1, "bad", severity="alert")
 
     async def desk_at(port):
-        desk = AlarmService(
-            Identity("lab", "edge-1", "rig"), rules, store, CLOCK, MqttSettings("127.0.0.1", port, "c")
-        )
+        desk = AlarmService(Identity("lab", "edge-1", "rig"), rules, store, CLOCK, outputs(mqtt(port, "c")))
         await desk.open()
         await desk.resume({})
-        return desk, asyncio.create_task(desk.publisher.run())
+        return desk, asyncio.create_task(desk.outputs["mqtt"].run())
 
     async def closed(desk, running):
         await desk.settle(2.0)
@@ -312,7 +309,7 @@ async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_p
                 # A restart knows nothing at first, and without a broker for long: it says nothing new.
                 desk, running = await desk_at(port)
                 try:
-                    letters, publisher = desk.outbox.dead_letters, desk.publisher
+                    letters, publisher = desk.outbox.dead_letters, desk.outputs["mqtt"]
                     await ticking(desk, partial(getattr, letters, "is_known"), "the file was read")
                     if port == strict.port:
                         await ticking(desk, partial(getattr, publisher, "is_refused_known"), "it was asked")

@@ -18,14 +18,15 @@ import pytest
 from support.brokers import Consumer, eventually
 from support.live_service import play, running
 from support.mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
-from support.mqtt_publishing import publishing
+from support.mqtt_publishing import commands, publishing
 from support.rogue_broker import CONSENT, RogueBroker
 from support.sparkplug_edge import Machine, edge_node
 from test_mqtt_schemas import rig
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
 from daqsvc.publish.connection import OWED, Connection
-from daqsvc.publish.settings import CommandSettings, HomeAssistantSettings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.output import Watched
 from daqsvc.publish.wire import Wire
 
 pytestmark = pytest.mark.integration
@@ -88,18 +89,18 @@ def nothing_but_counters_move(caplog, most_growth_mib=MOST_GROWTH_MIB):
 @contextlib.asynccontextmanager
 async def listening(outbox, port, protocol, desk):
     """A publisher that takes commands and tells Home Assistant, and comes back at once after each loss."""
-    commands = CommandSettings(("rig",), frozenset(Verb))
-    home = HomeAssistantSettings("rig", alarms=("rotor-fault",))
+    rig = Watched("rig", alarms=("rotor-fault",))
+    allowed = commands(*Verb)
     async with publishing(
-        outbox, port, protocol, handler=desk, commands=commands, home_assistant=home
+        outbox, port, protocol, handler=desk, commands=allowed, home_assistant=HomeAssistant(), watched=rig
     ) as publisher:
         publisher._backoff.next_ns = lambda: 1_000_000
         yield publisher
 
 
 async def rogue_broker(outbox, caplog, monkeypatch, protocol, packets):
-    monkeypatch.setattr("daqsvc.publish.mqtt.TAKEN_OVER_S", 0.001)
-    monkeypatch.setattr("daqsvc.publish.home_assistant_link.EARLIER_S", 0.01)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.TAKEN_OVER_S", 0.001)
+    monkeypatch.setattr("daqsvc.publish.home_assistant.link.EARLIER_S", 0.01)
     monkeypatch.setattr("daqsvc.publish.suspects.FIRST_BAR_S", 0.001)
     monkeypatch.setattr("daqsvc.publish.suspects.LONGEST_BAR_S", 0.001)
     desk = Desk()
@@ -374,10 +375,10 @@ async def test_nothing_is_read_while_too_many_acknowledgements_wait():
 
 
 async def test_a_rogue_broker_ends_no_acquisition(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.mqtt.FIRST_RETRY_NS", 1_000_000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     with nothing_but_counters_move(caplog, most_growth_mib=400):  # compiled kernels among them
         async with RogueBroker(11, 300) as broker, running(rig(broker.port), tmp_path / "store") as service:
-            service.publisher._backoff.next_ns = lambda: 1_000_000
+            service.alarms.outputs["mqtt"]._backoff.next_ns = lambda: 1_000_000
             await play(service, np.zeros((1280, 3)), 640.0)
             await eventually(lambda: not broker.left, "it has sent what it wanted")
             streams = service.figures()["streams"]

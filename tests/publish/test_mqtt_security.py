@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import dataclasses
 import os
 import shutil
 import subprocess
 
 import pytest
 from support.brokers import Consumer, TcpProxy, eventually, free_port, listens, running_mosquitto
+from support.mqtt_publishing import mqtt, output_port, running_output
 from support.tls_files import authority, self_signed, signed
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.publish.certificates import CertificateError
-from daqsvc.publish.credentials import read_credentials
-from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
+from daqsvc.publish.mqtt.certificates import CertificateError
+from daqsvc.publish.mqtt.credentials import read_credentials
+from daqsvc.publish.mqtt.publisher import MqttPublisher
 from daqsvc.publish.payloads import status_payload
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
@@ -24,15 +23,8 @@ CLOCK = SystemClock()
 SECRET = "correct horse battery staple"  # noqa: S105  nobody's
 
 
-@contextlib.asynccontextmanager
-async def publishing(outbox, settings):
-    publisher = MqttPublisher(settings, "lab", "edge-1", outbox, CLOCK)
-    running = asyncio.create_task(publisher.run())
-    try:
-        yield publisher
-    finally:
-        await publisher.stop()
-        await running
+def publishing(outbox, settings):
+    return running_output(MqttPublisher(settings, output_port(outbox)))
 
 
 def tls_config(pair, clients=None):
@@ -44,8 +36,7 @@ def tls_config(pair, clients=None):
 
 
 def tls_settings(port, ca_file, own=None):
-    return MqttSettings(
-        "127.0.0.1",
+    return mqtt(
         port,
         "daqsvc-tls",
         tls=True,
@@ -100,12 +91,12 @@ async def test_the_reason_why_a_broker_does_not_come_back_is_told_when_it_change
                 pair.replaces(good)
                 mosquitto.start()
                 await eventually(lambda words=words: words in caplog.text, "the new reason is told")
-                assert publisher.broker_has_expired is (pair is expired)
+                assert publisher._has_expired is (pair is expired)
             mosquitto.stop()
             again.replaces(good)
             mosquitto.start()
             await eventually(lambda: publisher.counters.connections == 2, "connected again")
-            assert not publisher.broker_has_expired
+            assert not publisher._has_expired
     said = [r.getMessage() for r in caplog.records if "away" in r.getMessage()]
     assert len(said) == len(set(said)), "each reason is told once"
     assert "[code" not in caplog.text
@@ -141,7 +132,7 @@ async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
     tmp_path, outbox, monkeypatch, caplog
 ):
     """The complaint: a renewed certificate takes effect only after a restart, if somebody thinks of it."""
-    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.session.LOOK_S", 0.05)
     old_ca, new_ca = authority(tmp_path, "old-ca"), authority(tmp_path, "new-ca", days=60)
     broker, box = signed(tmp_path, "broker", old_ca, host="127.0.0.1"), signed(tmp_path, "box", old_ca)
     new_broker = signed(tmp_path, "new-broker", new_ca, host="127.0.0.1", days=9)
@@ -149,7 +140,7 @@ async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
     with running_mosquitto(tmp_path, config=tls_config(broker, old_ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, old_ca.cert, box)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected with the old certificates")
-            before = dict(publisher.certificate_expiry)
+            before = dict(publisher._expiry)
             assert {name: ns / 1e9 for name, ns in before.items()} == {
                 "client": box.not_after_s,
                 "broker": broker.not_after_s,
@@ -160,20 +151,20 @@ async def test_tls_rotation_of_both_sides_reaches_a_standing_connection(
                 new.replaces(old)
             mosquitto.start()
             await eventually(lambda: publisher.counters.connections == 2, "connected with the new ones")
-            after = publisher.certificate_expiry
+            after = dict(publisher._expiry)
             assert all(after[name] > before[name] for name in ("client", "broker", "ca"))
             seconds = publisher.figures()["certificates"]["client"]["not_after_seconds"]
             assert seconds == new_box.not_after_s
             renewed = signed(tmp_path, "renewed", new_ca, days=20)
             renewed.replaces(box)
             await eventually(lambda: publisher.counters.connections == 3, "a renewal alone is enough")
-            assert publisher.certificate_expiry["client"] / 1e9 == renewed.not_after_s
+            assert publisher._expiry["client"] / 1e9 == renewed.not_after_s
             assert mosquitto.log_text.count("u'renewed'") == 1
     assert "Traceback" not in caplog.text
 
 
 async def test_a_renewal_is_no_outage_to_anybody(tmp_path, outbox, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.session.LOOK_S", 0.05)
     ca = authority(tmp_path, "ca")
     broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     renewed = signed(tmp_path, "renewed", ca)
@@ -196,19 +187,19 @@ async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_lo
     tmp_path, outbox, monkeypatch
 ):
     """A broker that is told to reload keeps its connections: the old certificate would alarm for ever."""
-    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.05)
-    monkeypatch.setattr("daqsvc.publish.session.LOOK_AGAIN_S", 0.2)
+    monkeypatch.setattr("daqsvc.publish.mqtt.session.LOOK_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.session.LOOK_AGAIN_S", 0.2)
     ca = authority(tmp_path, "ca")
     broker = signed(tmp_path, "broker", ca, host="127.0.0.1", days=5)
     renewed = signed(tmp_path, "renewed", ca, host="127.0.0.1", days=29)
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
-            assert publisher.certificate_expiry["broker"] / 1e9 == broker.not_after_s
+            assert publisher._expiry["broker"] / 1e9 == broker.not_after_s
             renewed.replaces(broker)
             mosquitto.reload()
             ends_s = renewed.not_after_s
-            await eventually(lambda: publisher.certificate_expiry["broker"] / 1e9 == ends_s, "it is seen")
+            await eventually(lambda: publisher._expiry["broker"] / 1e9 == ends_s, "it is seen")
             await eventually(lambda: publisher.counters.connected, "connected again")
             connections = publisher.counters.connections
             await asyncio.sleep(0.5)
@@ -216,7 +207,7 @@ async def test_a_certificate_that_was_renewed_at_the_broker_is_seen_without_a_lo
 
 
 async def test_a_half_written_renewal_does_not_cost_the_connection(tmp_path, outbox, monkeypatch, caplog):
-    monkeypatch.setattr("daqsvc.publish.session.LOOK_S", 0.02)
+    monkeypatch.setattr("daqsvc.publish.mqtt.session.LOOK_S", 0.02)
     ca = authority(tmp_path, "ca")
     broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     whole = box.cert.read_bytes()
@@ -240,14 +231,14 @@ async def test_a_certificate_that_only_openssl_can_read_is_used_all_the_same(
     def unreadable(_certificate):
         raise CertificateError("not an X.509 certificate: it is stranger than that")
 
-    monkeypatch.setattr("daqsvc.publish.credentials.certificates", unreadable)
-    monkeypatch.setattr("daqsvc.publish.mqtt.certificate", unreadable)
+    monkeypatch.setattr("daqsvc.publish.mqtt.credentials.certificates", unreadable)
+    monkeypatch.setattr("daqsvc.publish.mqtt.publisher.certificate", unreadable)
     ca = authority(tmp_path, "ca")
     broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     with running_mosquitto(tmp_path, config=tls_config(broker, ca)) as mosquitto:
         async with publishing(outbox, tls_settings(mosquitto.port, ca.cert, box)) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
-            assert dict(publisher.certificate_expiry) == {}
+            assert dict(publisher._expiry) == {}
     assert f"when the certificates in {box.cert} end" in caplog.text
 
 
@@ -275,7 +266,7 @@ async def test_a_corrected_password_is_read_at_the_next_attempt_and_never_logged
     mine = tmp_path / "mine"
     mine.write_text("wrong " + SECRET + "\n")
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
-        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        settings = mqtt(mosquitto.port, "c", username="daq", password_file=mine)
         async with publishing(outbox, settings) as publisher:
             await eventually(lambda: "is away" in caplog.text, "it is refused")
             assert "is away: this client is not authorised" in caplog.text
@@ -290,12 +281,9 @@ async def test_password_and_key_may_be_systemd_credentials(tmp_path, outbox, mon
     broker, box = signed(tmp_path, "broker", ca, host="127.0.0.1"), signed(tmp_path, "box", ca)
     config = f"{tls_config(broker)}\n{password_config(tmp_path)}"
     with running_mosquitto(tmp_path, config=config, anonymous=False) as mosquitto:
-        settings = dataclasses.replace(
-            tls_settings(mosquitto.port, ca.cert, box),
-            username="daq",
-            password_credential="mqtt-password",  # noqa: S106  a name
-            key_file=None,
-            key_credential="mqtt-key",
+        credentials = {"password_credential": "mqtt-password", "key_credential": "mqtt-key"}
+        settings = tls_settings(mosquitto.port, ca.cert, box).model_copy(
+            update={"username": "daq", "key_file": None} | credentials
         )
         monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
         async with publishing(outbox, settings) as publisher:
@@ -315,7 +303,7 @@ async def test_secrets_are_in_no_log_and_in_nothing_that_is_published(tmp_path, 
     mine = tmp_path / "mine"
     mine.write_bytes(b"\xff" + SECRET.encode())
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
-        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        settings = mqtt(mosquitto.port, "c", username="daq", password_file=mine)
         async with publishing(outbox, settings) as publisher:
             await eventually(lambda: "is not UTF-8 text" in caplog.text, "the file is named")
             mine.write_text(f"{SECRET}\nsecond {SECRET}\n")
@@ -333,7 +321,7 @@ async def test_secrets_are_in_no_log_and_in_nothing_that_is_published(tmp_path, 
 async def test_a_missing_password_file_is_named_and_awaited(tmp_path, outbox, caplog):
     mine = tmp_path / "mine"
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
-        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        settings = mqtt(mosquitto.port, "c", username="daq", password_file=mine)
         async with publishing(outbox, settings) as publisher:
             await eventually(lambda: str(mine) in caplog.text, "the file is named")
             mine.write_text(SECRET)
@@ -345,7 +333,7 @@ async def test_what_is_no_password_is_said_and_awaited(tmp_path, outbox, caplog)
     mine = tmp_path / "mine"
     os.mkfifo(mine)
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
-        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        settings = mqtt(mosquitto.port, "c", username="daq", password_file=mine)
         async with publishing(outbox, settings):
             await eventually(lambda: f"{mine} is no regular file" in caplog.text, "the pipe is named")
         mine.unlink()
@@ -360,7 +348,7 @@ async def test_what_is_no_password_is_said_and_awaited(tmp_path, outbox, caplog)
 
 @pytest.mark.parametrize("host", ["a..b", "x" * 64, ""])
 async def test_a_host_that_cannot_be_one_is_an_outage_like_any_other(outbox, caplog, host):
-    async with publishing(outbox, MqttSettings(host, 1883, "c")) as publisher:
+    async with publishing(outbox, mqtt(1883, "c", host)) as publisher:
         await eventually(lambda: "is away" in caplog.text, "it is said")
         assert publisher.figures()["faults"] == 0
     assert "Traceback" not in caplog.text
@@ -371,10 +359,12 @@ async def test_a_secret_that_everybody_can_read_is_warned_of_once(tmp_path, outb
     mine.write_text(SECRET + "\n")
     mine.chmod(0o644)
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:
-        settings = MqttSettings("127.0.0.1", mosquitto.port, "c", username="daq", password_file=mine)
+        settings = mqtt(mosquitto.port, "c", username="daq", password_file=mine)
         async with (
             TcpProxy(mosquitto.port) as wire,
-            publishing(outbox, dataclasses.replace(settings, port=wire.port)) as publisher,
+            publishing(
+                outbox, settings.model_copy(update={"url": f"mqtt://127.0.0.1:{wire.port}"})
+            ) as publisher,
         ):
             await eventually(lambda: publisher.counters.connected, "connected")
             wire.cut()
@@ -387,7 +377,9 @@ async def test_a_certificate_whose_common_name_alone_is_the_host_is_refused(tmp_
     ca = authority(tmp_path, "ca")
     broker = signed(tmp_path, "localhost", ca, host="a@example")  # CN=localhost
     with running_mosquitto(tmp_path, config=tls_config(broker)) as mosquitto:
-        settings = dataclasses.replace(tls_settings(mosquitto.port, ca.cert), host="localhost")
+        settings = tls_settings(mosquitto.port, ca.cert).model_copy(
+            update={"url": f"mqtts://localhost:{mosquitto.port}"}
+        )
         async with publishing(outbox, settings) as publisher:
             await eventually(lambda: "is away" in caplog.text, "it is refused")
             assert "for another host" in caplog.text

@@ -9,7 +9,11 @@ import pytest
 from support.machine_files import LAVAL, changed, only_problem
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.assembly_mqtt import mqtt_settings, sparkplug_settings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.make import output_set
+from daqsvc.publish.mqtt.settings import Mqtt
+from daqsvc.publish.sparkplug.settings import Sparkplug
+from daqsvc.self_check import conditions
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -121,7 +125,8 @@ def test_what_would_go_unencrypted_to_another_host_is_warned_of():
 
 
 def test_files_start_at_the_directory_of_the_machine_file():
-    settings = mqtt_settings(machine((ROOT, f'{ROOT}\ncert_file = "tls/box.crt"\nkey_file = "tls/box.key"')))
+    told = machine((ROOT, f'{ROOT}\ncert_file = "tls/box.crt"\nkey_file = "tls/box.key"'))
+    settings = told.output(Mqtt).on(told)
     assert settings.cert_file == LAVAL.parent / "tls/box.crt"
     assert settings.key_file == LAVAL.parent / "tls/box.key"
     assert settings.ca_file == Path("/etc/daqsvc/ca.pem")
@@ -129,24 +134,29 @@ def test_files_start_at_the_directory_of_the_machine_file():
 
 def test_without_being_asked_nothing_is_taken_and_nobody_else_is_told():
     text = LAVAL.read_text(encoding="utf-8")
-    settings = mqtt_settings(parse_machine_file(text[: text.index("[mqtt.commands]")], LAVAL))
-    assert settings.commands is None
-    assert settings.home_assistant is None
+    told = parse_machine_file(text[: text.index("[mqtt.commands]")], LAVAL)
+    assert not told.output(Mqtt).commands.enabled
+    assert told.output(HomeAssistant) is None
+    assert told.output(Sparkplug) is None
 
 
 def test_only_enabled_commands_are_taken():
     listed = 'allow = ["acknowledge", "reset"]'
-    assert mqtt_settings(machine((ALLOWED, listed), ("enabled = true", ""))).commands is None
+    assert not machine((ALLOWED, listed), ("enabled = true", "")).output(Mqtt).commands.enabled
     enabled = machine((ALLOWED, listed))
-    commands = mqtt_settings(enabled).commands
-    assert commands.machines == ("laval-rig",)
-    assert commands.allow == {Verb.ACKNOWLEDGE, Verb.RESET}
+    commands = enabled.output(Mqtt).commands
+    assert commands.enabled
+    assert commands.allow == (Verb.ACKNOWLEDGE, Verb.RESET)
     assert "takes commands: acknowledge, reset" in describe(enabled)
+
+
+def watched(machine):
+    return output_set(machine, conditions()).watched
 
 
 def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
     told = machine((ROOT, f"{ROOT}\n[mqtt.home_assistant]"))
-    settings = mqtt_settings(told).home_assistant
+    settings = watched(told)
     assert settings.alarms == tuple(alarm.name for alarm in told.alarms)
     assert {"sensor-ok/probe-x", "sensor-ok/probe-y", "detector-ok/rotor-bank"} <= set(settings.services)
     assert {"certificate/broker", "certificate/ca", "store/disk"} <= set(settings.services)
@@ -154,7 +164,7 @@ def test_home_assistant_is_told_of_every_alarm_and_of_the_sensors_behind_them():
     assert "alarm-flood" in settings.services
     assert not {"certificate/client", "trip-multiply"} & set(settings.services)
     off = machine((ROOT, f"{ROOT}\n[mqtt.home_assistant]\nenabled = false"))
-    assert not mqtt_settings(off).home_assistant.enabled
+    assert not off.output(HomeAssistant).enabled
 
 
 START_UP = """[alarm_handling.start_up]
@@ -164,14 +174,12 @@ between = [60.0, 540.0]
 """
 
 
-def test_home_assistant_and_sparkplug_are_told_of_what_the_machine_file_makes_possible(tmp_path):
+def test_home_assistant_and_sparkplug_are_told_of_what_the_machine_file_makes_possible():
     asked = f"{ROOT}\n[mqtt.home_assistant]\n[mqtt.sparkplug]\n{START_UP}"
     told = machine((ROOT, asked))
-    services = set(mqtt_settings(told).home_assistant.services)
-    assert {"alarm-flood", "trip-multiply"} <= services
-    assert services <= set(sparkplug_settings(told, tmp_path).alarms)
+    assert {"alarm-flood", "trip-multiply"} <= set(watched(told).services)
     calm = machine((ROOT, asked.replace(START_UP, "")), ("flood_alarms = 10", "flood_alarms = 0"))
-    assert not {"alarm-flood", "trip-multiply"} & set(mqtt_settings(calm).home_assistant.services)
+    assert not {"alarm-flood", "trip-multiply"} & set(watched(calm).services)
 
 
 def test_no_two_boxes_get_the_same_client_id():
@@ -181,6 +189,6 @@ def test_no_two_boxes_get_the_same_client_id():
         for site in named
         for box in named
     ]
-    ids = [each.mqtt_client_id for each in machines]
-    ids += [f"{each.mqtt_client_id}:sparkplug" for each in machines]
+    ids = [each.output(Mqtt).client_id_of(each) for each in machines]
+    ids += [f"{each.output(Mqtt).client_id_of(each)}:sparkplug" for each in machines]
     assert len(set(ids)) == len(ids)

@@ -6,20 +6,26 @@ import asyncio
 import contextlib
 import json
 from typing import TYPE_CHECKING
+from unittest.mock import AsyncMock
 
 from support.alarm_rig import AlarmRig
+from support.mqtt_publishing import commands, output_port
 
 from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.outbox.messages import OutboxMessage
-from daqsvc.publish import home_assistant_link
-from daqsvc.publish.home_assistant_link import HomeAssistantLink
+from daqsvc.outbox.store import Outbox
+from daqsvc.publish.home_assistant import link as home_assistant_link
+from daqsvc.publish.home_assistant.link import HomeAssistantLink
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.home_assistant.summary import Summary, SummaryPayload
+from daqsvc.publish.output import Watched
 from daqsvc.publish.payloads import alarm_payload
-from daqsvc.publish.settings import HomeAssistantSettings
-from daqsvc.publish.summary import Summary, SummaryPayload
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pytest
 
 TOPICS = Topics("daqsvc", "lab", "edge-1")
@@ -71,10 +77,15 @@ class Heard:
         pass
 
 
-async def test_a_flood_of_events_is_summed_up_and_the_last_of_them_told(monkeypatch: pytest.MonkeyPatch):
+async def test_a_flood_of_events_is_summed_up_and_the_last_of_them_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(home_assistant_link, "EARLIER_S", 0.0)
     rig, told = messages(*[5.0, 1.0] * 100)
-    link = HomeAssistantLink(HomeAssistantSettings("rig", alarms=ALARMS), TOPICS, rig.clock)
+    outbox = Outbox(tmp_path / "outbox.sqlite", rig.clock)
+    monkeypatch.setattr(outbox, "retained", AsyncMock(return_value=[]))
+    port = output_port(outbox, Watched("rig", alarms=ALARMS), clock=rig.clock)
+    link = HomeAssistantLink(HomeAssistant(), commands(), port)
     heard = Heard()
     running = asyncio.create_task(link.run(heard))
     try:

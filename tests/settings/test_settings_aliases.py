@@ -6,7 +6,7 @@ import pytest
 from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
 from daqsvc.settings.aliases import _WORDS, meant_key
-from daqsvc.settings.models import MachineFile
+from daqsvc.settings.models import machine_file_model
 from daqsvc.settings.schema import _homes
 
 PUMP = MACHINES / "modbus-vibration-temperature.toml"
@@ -72,7 +72,7 @@ def test_a_key_in_the_wrong_table_is_shown_its_place(path, old, new, home):
 
 
 def test_every_word_leads_to_a_key_that_there_is():
-    keys = set(_homes(MachineFile))
+    keys = set(_homes(machine_file_model()))
     assert {key for meant in _WORDS for key in meant} <= keys
     for meant, words in _WORDS.items():
         for word in words.split():

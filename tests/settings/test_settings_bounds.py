@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from support.machine_files import LAVAL, changed, only_problem
 from support.paths import ROOT
 
-from daqsvc.settings.models import MachineFile
+from daqsvc.settings.models import machine_file_model
 from daqsvc.settings.schema import field_type
 from daqsvc.settings.section import Kinds, Section
 
@@ -70,7 +70,7 @@ def fields(section, seen):
             yield from leaves(field_type(field), path, [], seen)
 
 
-EVERYTHING = list(fields(MachineFile, set()))
+EVERYTHING = list(fields(machine_file_model(), set()))
 
 
 def has(marks, *kinds):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
 
+from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 from daqsvc.settings.models import LevelAlarm
 from drivers.can.checks import frame_time
@@ -65,7 +66,7 @@ def test_the_laval_rig_as_it_is_read():
     assert probe.gain * -10.0 + probe.shift == pytest.approx(0.0)  # the gap voltage of a centred shaft
     assert probe.gain * -9.213 + probe.shift == pytest.approx(100.0)
     assert machine.detectors == ("rotor-bank",)
-    assert machine.mqtt_client_id == "daqsvc-lab:edge-1"
+    assert machine.output(Mqtt).client_id_of(machine) == "daqsvc-lab:edge-1"
     assert (machine.mqtt.tls, machine.mqtt.host, machine.mqtt.port) == (True, "broker.example", 8883)
     with pytest.raises(KeyError, match="no sensor 'probe-z'; there are probe-x, probe-y, keyphasor"):
         machine.sensor("probe-z")

@@ -10,11 +10,11 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules
-from daqsvc.assembly_mqtt import mqtt_settings
 from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.reading import Reading
+from daqsvc.publish.make import watched
 from daqsvc.settings import load_machine_file, parse_machine_file
 from daqsvc.settings.describe import describe
 
@@ -74,7 +74,7 @@ def test_a_pump_becomes_detectors_rules_and_readings():
     assert (vibration.sensors, vibration.vote, vibration.measure) == (("de-axial", "de-radial"), 1, "value")
     assert isinstance(temperature, LevelRule)
     assert temperature.setpoint == Setpoint(80.0, 95.0, 2.0, 10 * 10**9, 10 * 10**9, 2.0, None)
-    told = mqtt_settings(machine).home_assistant
+    told = watched(machine)
     assert Reading("levels/de-temperature", "statistics", "value", "degC") in told.readings
     assert not [reading for reading in told.readings if reading.key != "value"]
     assert "sensor-ok/nde-radial" in told.services
@@ -83,9 +83,9 @@ def test_a_pump_becomes_detectors_rules_and_readings():
 def test_a_value_a_minute_is_shown_until_it_is_missed():
     text, _ = changed(PUMP, ("[pipeline]", MQTT))
     machine = parse_machine_file(text.replace("rate_hz = 1.0", "rate_hz = 0.0166667"), PUMP)
-    stale_s = {reading.stale_s for reading in mqtt_settings(machine).home_assistant.readings}
+    stale_s = {reading.stale_s for reading in watched(machine).readings}
     assert stale_s == {210}
-    fast = mqtt_settings(parse_machine_file(text, PUMP)).home_assistant.readings
+    fast = watched(parse_machine_file(text, PUMP)).readings
     assert {reading.stale_s for reading in fast} == {120}
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 DOCS = ROOT / "docs"
 DRIVER = DOCS / "example_driver"
 DETECTOR = DOCS / "example_detector"
+OUTPUT = DOCS / "example_output"
 
 
 def installed(example: Path, site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:

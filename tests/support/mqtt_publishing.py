@@ -1,38 +1,124 @@
-"""A publisher under test, who carries out its commands, and a client that sends one message."""
+"""Outputs under test, who carries out their commands, and a client that sends one message."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import time
+from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from support.brokers import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import CommandOutcome
-from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
+from daqsvc.alarms.events import Identity
+from daqsvc.publish.home_assistant.left_over import LeftOver
+from daqsvc.publish.home_assistant.link import HomeAssistantLink
+from daqsvc.publish.mqtt.publisher import MqttPublisher
+from daqsvc.publish.mqtt.settings import Mqtt, MqttCommands
+from daqsvc.publish.output import Output, OutputPort, OutputSet, Watched
+from daqsvc.publish.sparkplug.edge import SparkplugEdge
+from daqsvc.publish.topics import Topics
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Mapping
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.home_assistant.settings import HomeAssistant
+    from daqsvc.publish.mqtt.link import MqttLink
+    from daqsvc.publish.sparkplug.settings import Sparkplug
 
 CLOCK = SystemClock()
+RIG = Watched("rig")
+
+
+def mqtt(
+    port: int, client_id: str = "daqsvc-test", host: str = "127.0.0.1", *, tls: bool = False, **given: Any
+) -> Mqtt:
+    """The table [mqtt] for a broker; what is ``given`` is not held against its bounds."""
+    url = f"mqtt{'s' * tls}://{host}:{port}"
+    return Mqtt(url="mqtt://broker", client_id=client_id).model_copy(update={"url": url} | given)
+
+
+def commands(*allow: str, **given: Any) -> MqttCommands:
+    """The table [mqtt.commands] that allows these verbs."""
+    return MqttCommands(enabled=True, allow=allow, **given)  # type: ignore[arg-type]
+
+
+def output_port(
+    outbox: Outbox,
+    watched: Watched = RIG,
+    *,
+    box: str = "edge-1",
+    handler: CommandHandler | None = None,
+    clock: Clock = CLOCK,
+) -> OutputPort:
+    """What an output of a box at site ``lab`` works with."""
+    return OutputPort(
+        identity=Identity("lab", box, watched.machine),
+        watched=watched,
+        store=outbox.directory,
+        clock=clock,
+        outbox=outbox,
+        topics=Topics("daqsvc", "lab", box),
+        commands=handler,
+    )
+
+
+def publisher_of(settings: Mqtt, port: OutputPort, home_assistant: HomeAssistant | None) -> MqttPublisher:
+    """The publisher as its plugin makes it."""
+    link: MqttLink = LeftOver(port.store)
+    if home_assistant is not None:
+        link = HomeAssistantLink(home_assistant, settings.commands, port)
+    return MqttPublisher(settings, port, [link])
+
+
+def outputs(
+    settings: Mqtt,
+    watched: Watched = RIG,
+    *,
+    home_assistant: HomeAssistant | None = None,
+    sparkplug: Sparkplug | None = None,
+) -> OutputSet:
+    """What a machine file with these tables asks for."""
+
+    def make(port: OutputPort) -> Mapping[str, Output]:
+        made: dict[str, Output] = {"mqtt": publisher_of(settings, port, home_assistant)}
+        if sparkplug is not None:
+            made["mqtt.sparkplug"] = SparkplugEdge(sparkplug, settings, port)
+        return made
+
+    return OutputSet(watched=watched, make=make, topic_root=settings.topic_root)
 
 
 @contextlib.asynccontextmanager
-async def publishing(outbox, port, protocol="5", *, client_id="daqsvc-test", handler=None, **settings):
-    """A running publisher of box ``edge-1`` at site ``lab``."""
-    publisher = MqttPublisher(
-        MqttSettings("127.0.0.1", port, client_id, protocol=protocol, **settings),
-        "lab",
-        "edge-1",
-        outbox,
-        CLOCK,
-        commands=handler,
-    )
-    running = asyncio.create_task(publisher.run())
+async def running_output(output: MqttPublisher) -> AsyncIterator[MqttPublisher]:
+    """The publisher at work, until it is stopped."""
+    running = asyncio.create_task(output.run())
     try:
-        yield publisher
+        yield output
     finally:
-        await publisher.stop()
+        await output.stop()
         await running
+
+
+def publishing(
+    outbox: Outbox,
+    port: int,
+    protocol: str = "5",
+    *,
+    client_id: str = "daqsvc-test",
+    handler: CommandHandler | None = None,
+    home_assistant: HomeAssistant | None = None,
+    watched: Watched = RIG,
+    **settings: Any,
+) -> contextlib.AbstractAsyncContextManager[MqttPublisher]:
+    """A running publisher of box ``edge-1`` at site ``lab``."""
+    table = mqtt(port, client_id, protocol=protocol, **settings)
+    return running_output(publisher_of(table, output_port(outbox, watched, handler=handler), home_assistant))
 
 
 class Desk:

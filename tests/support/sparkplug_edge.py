@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from support.brokers import LOOPBACK, eventually
+from support.mqtt_publishing import mqtt, output_port
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -14,11 +16,11 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.publish.mqtt import MqttSettings
+from daqsvc.publish.output import Watched
 from daqsvc.publish.payloads import alarm_payload
 from daqsvc.publish.sparkplug.codec import DataType, Metric, Payload, encode
 from daqsvc.publish.sparkplug.edge import SparkplugEdge
-from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
+from daqsvc.publish.sparkplug.settings import Sparkplug
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
@@ -91,20 +93,14 @@ class Machine:
 
 @contextlib.asynccontextmanager
 async def edge_node(outbox, tmp_path, *ports, primary_host=None, protocol="5"):
-    settings = SparkplugSettings(
-        group="lab",
-        edge_node="edge-1",
-        device="rig",
-        machine="rig",
-        servers=tuple(Server(LOOPBACK, port, tls=False) for port in ports),
+    settings = Sparkplug(
+        servers=tuple(f"mqtt://{LOOPBACK}:{port}" for port in ports),
         client_id="edge-1-sparkplug",
-        memory=tmp_path / "sparkplug.json",
         primary_host=primary_host,
-        alarms=("rotor-fault",),
-        readings=READINGS,
     )
-    mqtt = MqttSettings(LOOPBACK, ports[0], "edge-1", protocol=protocol)
-    edge = SparkplugEdge(settings, mqtt, outbox, TOPICS, CLOCK)
+    watched = Watched("rig", alarms=("rotor-fault",), readings=READINGS)
+    port = replace(output_port(outbox, watched, clock=CLOCK), store=tmp_path)
+    edge = SparkplugEdge(settings, mqtt(ports[0], "edge-1", protocol=protocol), port)
     running = asyncio.create_task(edge.run())
     try:
         yield edge

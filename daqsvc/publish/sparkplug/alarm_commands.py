@@ -13,18 +13,16 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.publish.command_intake import CommandIntake
 from daqsvc.publish.connection import Incoming
+from daqsvc.publish.mqtt.command_intake import CommandIntake
 from daqsvc.publish.sparkplug.codec import DataType, Metric
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler, CommandOutcome
-    from daqsvc.outbox.command_ids import CommandIds
-    from daqsvc.publish.settings import CommandSettings
-    from daqsvc.publish.topics import Topics
+    from daqsvc.publish.mqtt.settings import MqttCommands
+    from daqsvc.publish.output import OutputPort
 
 log = logging.getLogger(__name__)
 
@@ -62,27 +60,18 @@ class AlarmCommands:
 
     Args:
         settings: what the machine file allows.
-        machine: name of the machine.
-        topics: the box.
+        port: the box, and the ids of the commands that have come.
         handler: carries commands out.
-        clock: its wall clock tells how old a command is.
-        ids: those of the commands that have come.
     """
 
-    def __init__(
-        self,
-        settings: CommandSettings,
-        machine: str,
-        topics: Topics,
-        handler: CommandHandler,
-        clock: Clock,
-        ids: CommandIds,
-    ) -> None:
-        self._machine = machine
-        self._topics = topics
+    def __init__(self, settings: MqttCommands, port: OutputPort, handler: CommandHandler) -> None:
+        self._machine = port.identity.machine
+        self._topics = port.topics
         self._handler = handler
         self._parts = {part: verb for verb, part in WRITABLE.items() if verb in settings.allow}
-        self._intake = CommandIntake(settings, topics, self._execute, clock, ids)
+        self._intake = CommandIntake(
+            settings, self._machine, port.topics, self._execute, port.clock, port.outbox.command_ids
+        )
         self._topic = ""
 
     def of_node(self, alarm: str) -> list[Metric]:

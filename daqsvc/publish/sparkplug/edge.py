@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import daqsvc
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.publish.connection import Connection, Will
-from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
 from daqsvc.publish.errors import MqttError
 from daqsvc.publish.faults import Faults
+from daqsvc.publish.mqtt.credentials import read_credentials
 from daqsvc.publish.outage import Outage
+from daqsvc.publish.output import Output
 from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands
 from daqsvc.publish.sparkplug.host import HostReports
 from daqsvc.publish.sparkplug.memory import Memory
@@ -38,92 +39,86 @@ from daqsvc.publish.spoken import Spoken
 from daqsvc.publish.stopping import unless
 
 if TYPE_CHECKING:
-    from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import CommandHandler
-    from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.outbox.store import Outbox
-    from daqsvc.publish.settings import MqttSettings
-    from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
-    from daqsvc.publish.topics import Topics
+    from collections.abc import Mapping
 
-__all__ = ["SparkplugEdge"]
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.publish.mqtt.settings import Mqtt
+    from daqsvc.publish.output import OutputPort
+    from daqsvc.publish.sparkplug.settings import Sparkplug
 
 log = logging.getLogger(__name__)
 
 FIRST_RETRY_NS = 800_000_000
 GOODBYE_S = 0.3
 
+MEMORY = "sparkplug.json"
+"""File in the store for what must survive a restart."""
 
-class SparkplugEdge:
+
+class SparkplugEdge(Output):
     """The box as a Sparkplug B 3.0 edge node, its machine as a device.
 
     Args:
         settings: what it is, and where.
         mqtt: credentials and protocol, shared with the box's own topics.
-        outbox: where the alarms are; open while `run` runs.
-        topics: the box's own topics, by which the alarms are known in the outbox.
-        clock: for time stamps.
-        commands: carries out what hosts write to alarms, where the machine file allows it; None: nothing.
+        port: what there is to tell, and who carries out what hosts write to alarms where `mqtt` allows it.
 
     Raises:
         ValueError: an id that a Sparkplug topic cannot hold.
     """
 
-    def __init__(
-        self,
-        settings: SparkplugSettings,
-        mqtt: MqttSettings,
-        outbox: Outbox,
-        topics: Topics,
-        clock: Clock,
-        commands: CommandHandler | None = None,
-    ) -> None:
+    def __init__(self, settings: Sparkplug, mqtt: Mqtt, port: OutputPort) -> None:
+        machine, watched = port.identity.machine, port.watched
         self.counters = SparkplugCounters()
-        self.node = EdgeNode(settings.group, settings.edge_node)
+        self.node = EdgeNode(settings.group or port.identity.site, settings.edge_node or port.identity.box)
         self._settings = settings
-        self._mqtt = mqtt
-        self._outbox = outbox
-        self._topics = topics
-        self._clock = clock
-        self._memory = Memory(settings.memory)
+        self._port = port
+        self._device = settings.device or machine
+        self._brokers = [mqtt.model_copy(update={"url": url}) for url in settings.servers or (mqtt.url,)]
+        self._client_id = settings.client_id or f"{mqtt.client_id}:sparkplug"
+        self._clock = port.clock
+        self._memory = Memory(port.store / MEMORY)
         self._board = Board()
-        self._board.put(None, node_properties(daqsvc.__version__, topics.site, topics.box))
+        self._board.put(None, node_properties(daqsvc.__version__, port.identity.site, port.identity.box))
         self._commands: AlarmCommands | None = None
-        if mqtt.commands is not None and commands is not None:
-            self._commands = AlarmCommands(
-                mqtt.commands, settings.machine, topics, commands, clock, outbox.command_ids
-            )
-        for alarm in settings.alarms:
-            self._board.put(None, quiet_alarm(settings.machine, alarm))
+        if mqtt.commands.enabled and port.commands is not None:
+            self._commands = AlarmCommands(mqtt.commands, port, port.commands)
+        alarms = (*watched.alarms, *watched.services)
+        for alarm in alarms:
+            self._board.put(None, quiet_alarm(machine, alarm))
             if self._commands is not None:
                 self._board.put(None, self._commands.of_node(alarm))
-        self._board.put(settings.device, declared(settings.readings))
+        self._board.put(self._device, declared(watched.readings))
         if self._commands is not None:
-            self._board.put(settings.device, self._commands.of_device(settings.alarms))
-        self._watched = {reading.detector for reading in settings.readings}
+            self._board.put(self._device, self._commands.of_device(alarms))
+        self._watched = {reading.detector for reading in watched.readings}
         self._there = True
-        self._server = 0
+        self._turn = 0
         self._backoff = Backoff(FIRST_RETRY_NS)
-        self._spoken = {
-            server: Spoken(outbox.directory, server.host, server.port, mqtt.protocol, clock.wall_ns)
-            for server in settings.servers
-        }
+        self._spoken = [
+            Spoken(port.store, broker.host, broker.port, mqtt.protocol, port.clock.wall_ns)
+            for broker in self._brokers
+        ]
         self._outage = Outage(log)
         self._host_reports = HostReports()
         self._faults = Faults()
         self._stopping = asyncio.Event()
         self._running: asyncio.Future[None] | None = None
 
-    def observe(self, diagnosis: Diagnosis) -> None:
-        """Take in a statement of a detector; its figures are told within a second. Never waits."""
+    def report(self, diagnosis: Diagnosis) -> None:
+        """Take in a statement of a detector; its figures are told within a second."""
         if diagnosis.detector in self._watched:
             wall_ns = self._clock.wall_ns() - self._clock.monotonic_ns() + diagnosis.t_ns
-            metrics = diagnosis_metrics(diagnosis, self._settings.readings, wall_ns)
-            self._board.put(self._settings.device, metrics)
+            metrics = diagnosis_metrics(diagnosis, self._port.watched.readings, wall_ns)
+            self._board.put(self._device, metrics)
 
-    def reach(self, *, there: bool) -> None:
-        """Say whether the machine can be reached, that is, whether any of its buses is up."""
-        self._there = there
+    def status(self, figures: Mapping[str, Any]) -> None:
+        """Take in whether the machine can be reached, that is, whether any of its buses is up."""
+        self._there = any(bus["up"] for bus in figures["buses"].values())
+
+    def figures(self) -> dict[str, Any]:
+        """See `Output.figures`."""
+        return asdict(self.counters)
 
     async def run(self) -> None:
         """Be an edge node until `stop`."""
@@ -132,7 +127,7 @@ class SparkplugEdge:
             await asyncio.to_thread(self._memory.load)
             while not self._stopping.is_set():
                 try:
-                    await self._one_session(self._settings.servers[self._server])
+                    await self._one_session(self._brokers[self._turn], self._spoken[self._turn])
                 except Exception as error:  # noqa: BLE001  any, for watching the machine must go on
                     self._faults.note(
                         "Sparkplug was interrupted and begins anew with a new connection", error
@@ -147,12 +142,12 @@ class SparkplugEdge:
         if self._running is not None:
             await asyncio.wait({self._running}, timeout=deadline_s)
 
-    async def _one_session(self, server: Server) -> None:
+    async def _one_session(self, server: Mqtt, spoken: Spoken) -> None:
         """Connect to one broker and stay until that ends, for whatever reason."""
         try:
-            made = await unless(self._stopping, self._connect(server))
+            made = await unless(self._stopping, self._connect(server, spoken))
         except (MqttError, OSError, ValueError) as error:
-            if self._spoken[server].falls_back(error):
+            if spoken.falls_back(error):
                 return
             self._report_outage(server, error)
             self._walk()
@@ -180,30 +175,28 @@ class SparkplugEdge:
             self.node.die()
             connection.abandon()
 
-    async def _connect(self, server: Server) -> tuple[Connection, EdgeSession]:
+    async def _connect(self, server: Mqtt, spoken: Spoken) -> tuple[Connection, EdgeSession]:
         """A connection whose last will is the node's death."""
-        spoken = self._spoken[server]
         await asyncio.to_thread(spoken.recall)
-        mqtt = replace(self._mqtt, host=server.host, port=server.port, tls=server.tls)
-        credentials = await asyncio.to_thread(read_credentials, mqtt)
+        credentials = await asyncio.to_thread(read_credentials, server)
         death = self.node.will(self._memory.bd_seq, self._clock.wall_ns() // NS_PER_MS)
         connection = Connection(
             server.host,
             server.port,
             in_flight=IN_FLIGHT,
             mqtt5=spoken.mqtt5,
-            identifier=self._settings.client_id,
-            username=mqtt.username,
+            identifier=self._client_id,
+            username=server.username,
             password=credentials.password,
             tls_context=credentials.context,
-            keepalive=mqtt.keepalive_s,
+            keepalive=server.keepalive_s,
             will=Will(death.topic, death.payload, qos=death.qos, retain=False),
         )
         try:
             await connection.open(spoken.consent_s)
             await asyncio.to_thread(spoken.agreed)
             bd_seq = self._memory.bd_seq
-            newest = max((message.sequence for message in await self._outbox.latest()), default=0)
+            newest = max((message.sequence for message in await self._port.outbox.latest()), default=0)
             # Only now: a connection that failed has used no number up.
             await asyncio.to_thread(self._memory.begin_session, newest)
         except BaseException:
@@ -219,11 +212,11 @@ class SparkplugEdge:
             bd_seq,
             node=self.node,
             board=self._board,
-            settings=self._settings,
+            device=self._device,
+            primary_host=self._settings.primary_host,
+            alone=len(self._brokers) == 1,
+            port=self._port,
             memory=self._memory,
-            outbox=self._outbox,
-            topics=self._topics,
-            clock=self._clock,
             counters=self.counters,
             reports=self._host_reports,
             commands=self._commands,
@@ -232,11 +225,11 @@ class SparkplugEdge:
 
     def _walk(self) -> None:
         """The next broker's turn."""
-        self._server = (self._server + 1) % len(self._settings.servers)
+        self._turn = (self._turn + 1) % len(self._brokers)
 
     async def _wait(self) -> None:
         await unless(self._stopping, asyncio.sleep(self._backoff.next_ns() / NS_PER_S))
 
-    def _report_outage(self, server: Server, error: Exception) -> None:
+    def _report_outage(self, server: Mqtt, error: Exception) -> None:
         broker = f"Sparkplug broker {server.host}:{server.port}"
         self._outage.tell(broker, error, "trying again until one is there")

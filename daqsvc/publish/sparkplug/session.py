@@ -16,17 +16,14 @@ from daqsvc.publish.sparkplug.metrics import NS_PER_MS, alarm_metrics
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
-    from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.outbox.store import Outbox
     from daqsvc.publish.connection import Connection, Incoming
+    from daqsvc.publish.output import OutputPort
     from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands, HostCommand
     from daqsvc.publish.sparkplug.codec import Metric
     from daqsvc.publish.sparkplug.memory import Memory
     from daqsvc.publish.sparkplug.metrics import Board
     from daqsvc.publish.sparkplug.node import EdgeNode, Publication
-    from daqsvc.publish.sparkplug.settings import SparkplugSettings
-    from daqsvc.publish.topics import Topics
 
 log = logging.getLogger(__name__)
 
@@ -98,11 +95,11 @@ class EdgeSession:
         bd_seq: number of the session, as in the will.
         node: makes the messages.
         board: present values.
-        settings: device, host and brokers.
+        device: id of the device that the machine is.
+        primary_host: host application to wait for; None waits for nobody.
+        alone: whether there is no other broker to try.
+        port: the alarms, and the machine.
         memory: where to go on in the outbox.
-        outbox: the alarms.
-        topics: by which alarms are known in the outbox.
-        clock: for time stamps.
         counters: what is counted here.
         reports: what is said of the primary host; goes on over sessions.
         commands: takes what hosts write to alarms; None if they may not.
@@ -115,11 +112,11 @@ class EdgeSession:
         *,
         node: EdgeNode,
         board: Board,
-        settings: SparkplugSettings,
+        device: str,
+        primary_host: str | None,
+        alone: bool,
+        port: OutputPort,
         memory: Memory,
-        outbox: Outbox,
-        topics: Topics,
-        clock: Clock,
         counters: SparkplugCounters,
         reports: HostReports,
         commands: AlarmCommands | None = None,
@@ -128,14 +125,14 @@ class EdgeSession:
         self._bd_seq = bd_seq
         self._node = node
         self._board = board
-        self._device = settings.device
-        self._machine = settings.machine
-        self._alone = len(settings.servers) == 1
-        self._host = None if settings.primary_host is None else PrimaryHost(settings.primary_host)
+        self._device = device
+        self._machine = port.identity.machine
+        self._alone = alone
+        self._host = None if primary_host is None else PrimaryHost(primary_host)
         self._memory = memory
-        self._outbox = outbox
-        self._topics = topics
-        self._clock = clock
+        self._outbox = port.outbox
+        self._topics = port.topics
+        self._clock = port.clock
         self._counters = counters
         self._reports = reports
         self._commands = commands

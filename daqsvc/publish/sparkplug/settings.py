@@ -1,54 +1,30 @@
-"""What the box is to Sparkplug, and where."""
+"""The box as an edge node of Sparkplug B."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Annotated
 
-if TYPE_CHECKING:
-    from pathlib import Path
+from pydantic import Field
 
-    from daqsvc.diagnosis.reading import Reading
+from daqsvc.publish.mqtt.settings import BrokerUrl  # noqa: TC001 - pydantic reads the annotations
+from daqsvc.settings.section import ClientId, Name, Section
 
 
-class Server(NamedTuple):
-    """A broker that the edge node may connect to.
+class Sparkplug(Section):
+    """The edge node: alarms are its metrics, the machine is its device.
 
-    Attributes:
-        host: host name or address.
-        port: TCP port.
-        tls: whether to use TLS.
+    Credentials and protocol are those of ``[mqtt]``.
     """
 
-    host: str
-    port: int
-    tls: bool
-
-
-@dataclass(frozen=True, slots=True)
-class SparkplugSettings:
-    """The edge node.
-
-    Attributes:
-        group: Sparkplug group id.
-        edge_node: edge node id.
-        device: id of the device that the machine is.
-        machine: name of the machine, by which its alarms are known.
-        servers: brokers in the order of preference, one connection at a time.
-        client_id: MQTT client id, another than that of the box's own topics.
-        primary_host: host application to wait for; None waits for nobody.
-        alarms: names of the machine's alarms, known before any of them is raised.
-        readings: figures of the detectors that are metrics of the device.
-        memory: file for what must survive a restart.
-    """
-
-    group: str
-    edge_node: str
-    device: str
-    machine: str
-    servers: tuple[Server, ...]
-    client_id: str
-    memory: Path
-    primary_host: str | None = None
-    alarms: tuple[str, ...] = ()
-    readings: tuple[Reading, ...] = ()
+    group: Name | None = Field(default=None, description="Sparkplug group id; the site if absent")
+    edge_node: Name | None = Field(default=None, description="edge node id; the box if absent")
+    device: Name | None = Field(default=None, description="device id; the machine's name if absent")
+    client_id: ClientId | None = Field(
+        default=None, description="MQTT client id; that of [mqtt] with :sparkplug if absent"
+    )
+    primary_host: Name | None = Field(
+        default=None, description="host application to wait for; waits for nobody if absent"
+    )
+    servers: Annotated[tuple[BrokerUrl, ...], Field(strict=False, max_length=16)] = Field(
+        default=(), description="brokers to walk through, one at a time; that of [mqtt] if empty"
+    )

@@ -9,23 +9,25 @@ from dataclasses import replace
 import pytest
 from support.brokers import Consumer, TcpProxy, eventually, running_mosquitto
 from support.home_assistant_rules import check_discovery, rendered
-from support.mqtt_publishing import publishing, say
+from support.mqtt_publishing import commands, publishing, say
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.publish.settings import HomeAssistantSettings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.output import Watched
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
-RIG = HomeAssistantSettings(
-    machine="rig",
+WATCHED = Watched(
+    "rig",
     alarms=("rotor-fault",),
     services=("sensor-ok/probe-x",),
     readings=(Reading("levels/probe-x", "statistics", "rms", "um"),),
     rests_on={"rotor-fault": ("sensor-ok/probe-x",)},
     findings=("rotor-bank",),
-    buttons=(Verb.ACKNOWLEDGE, Verb.RESET),
 )
+BUTTONS = commands(Verb.ACKNOWLEDGE, Verb.RESET)
+RIG = {"home_assistant": HomeAssistant(), "watched": WATCHED, "commands": BUTTONS}
 LEVEL = Diagnosis("rig", "levels/probe-x", 0, "shaft", 0, 320, "normal", statistics={"rms": 41.2487})
 CONFIG = "homeassistant/device/daqsvc_2flab_2fedge-1_2frig/config"
 SUMMARY = "daqsvc/lab/edge-1/rig/summary"
@@ -68,7 +70,7 @@ def entity(live, name):
 async def test_alarms_show_up_and_follow(mosquitto, outbox, protocol):
     async with (
         Consumer(mosquitto.port) as live,
-        publishing(outbox, mosquitto.port, protocol, home_assistant=RIG) as publisher,
+        publishing(outbox, mosquitto.port, protocol, **RIG) as publisher,
     ):
         await eventually(lambda: live.on("/summary"), "the machine is told")
         (discovery,) = [m.payload for m in live.messages if m.topic == CONFIG]
@@ -98,7 +100,7 @@ async def test_alarms_show_up_and_follow(mosquitto, outbox, protocol):
 async def test_without_good_data_no_alarm_is_said_to_be_off(mosquitto, outbox):
     async with (
         Consumer(mosquitto.port) as live,
-        publishing(outbox, mosquitto.port, home_assistant=RIG) as publisher,
+        publishing(outbox, mosquitto.port, **RIG) as publisher,
     ):
         await eventually(lambda: live.on("/summary"), "the machine is told")
         sensor = publisher.topics.alarm("rig", "sensor-ok/probe-x")
@@ -124,13 +126,13 @@ async def test_without_good_data_no_alarm_is_said_to_be_off(mosquitto, outbox):
 
 
 async def test_a_restart_knows_how_the_alarms_stand_before_anything_happens(mosquitto, outbox):
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG) as publisher:
+    async with publishing(outbox, mosquitto.port, **RIG) as publisher:
         await eventually_told(mosquitto, "rotor-fault")
         topic = publisher.topics.alarm("rig", "rotor-fault")
         await outbox.append(topic, alarm("active_acknowledged", "danger"), retain=True)
         await eventually(lambda: outbox.counters.sent == 1, "the broker has it")
     for _ in range(5):
-        async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, home_assistant=RIG):
+        async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, **RIG):
             await eventually(lambda: any(not m.retained for m in live.on("/summary")), "the machine is told")
             fresh = [m.payload for m in live.on("/summary") if not m.retained]
         standings = [(p["alarms"]["rotor-fault"]["problem"]) for p in fresh]
@@ -140,12 +142,12 @@ async def test_a_restart_knows_how_the_alarms_stand_before_anything_happens(mosq
 async def test_discovery_is_told_again_at_reconnect_and_at_home_assistants_birth(
     mosquitto, outbox, monkeypatch
 ):
-    monkeypatch.setattr("daqsvc.publish.home_assistant_link.BIRTH_DELAY_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.home_assistant.link.BIRTH_DELAY_S", 0.05)
 
     async with (
         Consumer(mosquitto.port, CONFIG) as live,
         TcpProxy(mosquitto.port) as wire,
-        publishing(outbox, wire.port, home_assistant=RIG) as publisher,
+        publishing(outbox, wire.port, **RIG) as publisher,
     ):
         await eventually(lambda: len(live.messages) == 1, "the machine is told")
         await asyncio.to_thread(say, mosquitto.port, "homeassistant/status", "online")
@@ -157,14 +159,14 @@ async def test_discovery_is_told_again_at_reconnect_and_at_home_assistants_birth
 
 
 async def test_what_the_machine_file_no_longer_has_disappears(mosquitto, outbox):
-    renamed = replace(RIG, alarms=("rotor-rub",))
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+    renamed = RIG | {"watched": replace(WATCHED, alarms=("rotor-rub",))}
+    async with publishing(outbox, mosquitto.port, **RIG):
         await eventually_told(mosquitto, "rotor-fault")
-    async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, home_assistant=renamed):
+    async with Consumer(mosquitto.port) as live, publishing(outbox, mosquitto.port, **renamed):
         await eventually(lambda: any(not m.retained for m in live.on("/summary")), "the machine is told")
         told = [m.payload["components"] for m in live.messages if m.topic == CONFIG and not m.retained]
     removal, last = told
-    old = RIG.alarms[0]
+    old = WATCHED.alarms[0]
     gone = {name for name, entity in removal.items() if set(entity) == {"platform"}}
     assert len(gone) == 5, "alarm, level, state and two buttons"
     assert all(old in name.replace("_2f", "/") for name in gone)
@@ -178,10 +180,10 @@ async def eventually_told(mosquitto, alarm):
 
 
 async def test_switched_off_the_machine_is_taken_away(mosquitto, outbox):
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+    async with publishing(outbox, mosquitto.port, **RIG):
         await eventually_told(mosquitto, "rotor-fault")
-    off = replace(RIG, enabled=False)
-    async with publishing(outbox, mosquitto.port, home_assistant=off) as publisher:
+    off = RIG | {"home_assistant": HomeAssistant(enabled=False)}
+    async with publishing(outbox, mosquitto.port, **off) as publisher:
         async with Consumer(mosquitto.port) as live:
             await eventually(lambda: publisher.counters.connected, "connected")
             await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
@@ -192,22 +194,22 @@ async def test_switched_off_the_machine_is_taken_away(mosquitto, outbox):
 
 
 async def test_without_its_section_the_machine_is_taken_away_too(mosquitto, outbox):
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+    async with publishing(outbox, mosquitto.port, **RIG):
         await eventually_told(mosquitto, "rotor-fault")
     async with publishing(outbox, mosquitto.port) as publisher:
         await eventually(lambda: publisher.counters.connected, "connected")
         await eventually(lambda: mosquitto.log_text.count(CONFIG) > 1, "it is taken away")
-        await eventually(lambda: not publisher._told.left_over(), "that is remembered")
+        await eventually(lambda: not publisher._links[0].left_over(), "that is remembered")
     assert await retained(mosquitto.port, CONFIG) == []
     assert await retained(mosquitto.port, SUMMARY) == []
 
 
 async def test_under_another_prefix_the_old_one_is_taken_away(mosquitto, outbox):
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG):
+    async with publishing(outbox, mosquitto.port, **RIG):
         await eventually_told(mosquitto, "rotor-fault")
-    moved = replace(RIG, prefix="ha2")
-    async with publishing(outbox, mosquitto.port, home_assistant=moved) as publisher:
-        await eventually(lambda: not publisher._told.left_over(), "the old one is taken away")
+    moved = RIG | {"home_assistant": HomeAssistant(prefix="ha2")}
+    async with publishing(outbox, mosquitto.port, **moved) as publisher:
+        await eventually(lambda: not publisher._links[0]._left_over.left_over(), "the old one is taken away")
         async with Consumer(mosquitto.port, "ha2/#") as live:
             await eventually(lambda: live.messages, "it is told under the new one")
     assert await retained(mosquitto.port, CONFIG) == []
@@ -219,7 +221,7 @@ async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, o
     directory = tmp_path / "strict"
     directory.mkdir()
     with running_mosquitto(directory, acl=acl) as strict:
-        async with publishing(outbox, strict.port, home_assistant=RIG) as publisher:
+        async with publishing(outbox, strict.port, **RIG) as publisher:
             await eventually(lambda: "Home Assistant is not told of rig" in caplog.text, "it is said")
             await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
             await eventually(lambda: outbox.counters.sent == 1, "alarms pass")

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.home_assistant_rules import check_discovery, rendered
 from support.machine_files import LAVAL, MACHINES
+from support.mqtt_publishing import commands
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_mqtt import mqtt_settings
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.reading import Reading
-from daqsvc.publish.command_payloads import CommandPayload
-from daqsvc.publish.home_assistant import Discovery
-from daqsvc.publish.home_assistant_readings import Readings
-from daqsvc.publish.settings import HomeAssistantSettings
+from daqsvc.publish.home_assistant.discovery import Discovery
+from daqsvc.publish.home_assistant.readings import Readings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.make import watched
+from daqsvc.publish.mqtt.command_payloads import CommandPayload
+from daqsvc.publish.mqtt.settings import Mqtt
+from daqsvc.publish.output import Watched
 from daqsvc.publish.topics import Topics
 from daqsvc.settings import parse_machine_file
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.sensors import keyphasor_voltage
 
 BROKER = '[mqtt]\nurl = "mqtts://broker.example"\n'
+NONE = commands()
 EXAMPLES = sorted(MACHINES.glob("*.toml"))
 
 
@@ -39,7 +42,12 @@ def machine(path):
 
 def discovery(path):
     told = machine(path)
-    return Discovery(mqtt_settings(told).home_assistant, Topics("daqsvc", told.site, told.box))
+    settings = told.output(HomeAssistant), told.output(Mqtt).commands
+    return Discovery(*settings, watched(told), Topics("daqsvc", told.site, told.box))
+
+
+def told_of(machine, box="edge-1", commands=NONE):
+    return Discovery(HomeAssistant(), commands, machine, Topics("daqsvc", "lab", box))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
@@ -53,7 +61,7 @@ def test_every_example_machine_is_told_in_home_assistants_terms(path):
 
 
 def test_units_are_written_as_home_assistant_writes_them():
-    settings = HomeAssistantSettings(
+    rig = Watched(
         "rig",
         readings=(
             Reading("d", "statistics", "rms", "um"),
@@ -63,7 +71,7 @@ def test_units_are_written_as_home_assistant_writes_them():
             Reading("d", "probabilities", "F1"),
         ),
     )
-    entities = Discovery(settings, Topics("daqsvc", "lab", "edge-1")).payload()["components"].values()
+    entities = told_of(rig).payload()["components"].values()
     shown = {e["name"]: (e.get("unit_of_measurement"), e.get("device_class")) for e in entities}
     assert shown == {
         "d rms": ("µm", None),
@@ -79,25 +87,24 @@ def test_units_are_written_as_home_assistant_writes_them():
     [("g", 0.012), ("m/s2", 0.12), ("mm/s", 0.28), ("um", 1.7), ("mil", 0.07), ("mm", 0.0017), ("V", 0.25)],
 )
 def test_the_level_of_a_smooth_machine_is_not_shown_as_nothing(unit, small):
-    settings = HomeAssistantSettings("rig", readings=(Reading("d", "statistics", "rms", unit),))
-    components = Discovery(settings, Topics("daqsvc", "lab", "edge-1")).payload()["components"]
+    rig = Watched("rig", readings=(Reading("d", "statistics", "rms", unit),))
+    components = told_of(rig).payload()["components"]
     (digits,) = (entity["suggested_display_precision"] for entity in components.values())
     assert round(small, digits) == small
 
 
 def test_names_that_differ_stay_apart():
-    topics = Topics("daqsvc", "lab", "edge-1")
-    told = {Discovery(HomeAssistantSettings(name), topics).topic for name in ("a.b", "a-b", "a_b", "a_2eb")}
+    told = {told_of(Watched(name)).topic for name in ("a.b", "a-b", "a_b", "a_2eb")}
     assert len(told) == 4
-    settings = HomeAssistantSettings("rig", alarms=("a.b", "a-b", "a_b", "a_2eb"))
-    assert len(Discovery(settings, topics).payload()["components"]) == 12
+    rig = Watched("rig", alarms=("a.b", "a-b", "a_b", "a_2eb"))
+    assert len(told_of(rig).payload()["components"]) == 12
 
 
 @pytest.mark.parametrize(
     "earlier", [b"", b"{", b"[]", b'{"components": 7}', b'{"components": {"x": 1}}', b"[" * 100_000]
 )
 def test_an_earlier_message_that_is_none_removes_nothing(earlier):
-    told = Discovery(HomeAssistantSettings("rig", alarms=("a",)), Topics("daqsvc", "lab", "edge-1"))
+    told = told_of(Watched("rig", alarms=("a",)))
     assert told.removals(earlier) == {}
 
 
@@ -110,7 +117,8 @@ def said():
     x, y = (um + 2.0 * rng.standard_normal(len(um)) for um in motion.in_um(100.0))
     samples = np.column_stack((x, y, keyphasor_voltage(motion.revolution))).astype(np.float32)
     period_ns = 1e9 / 640.0
-    readings = Readings(mqtt_settings(rig).home_assistant, Topics("daqsvc", rig.site, rig.box), SystemClock())
+    topics = Topics("daqsvc", rig.site, rig.box)
+    readings = Readings(rig.output(HomeAssistant), watched(rig), topics, SystemClock())
     units = {}
     for detector in detectors(rig):
         detector.warm()
@@ -143,8 +151,8 @@ def test_buttons_ask_for_what_the_box_would_obey():
     rig = machine(LAVAL)
     entities = discovery(LAVAL).payload()["components"].values()
     buttons = [entity for entity in entities if entity["platform"] == "button"]
-    allowed = {verb for verb in ("acknowledge", "reset") if verb in rig.mqtt.commands.allow}
-    assert rig.mqtt.commands.enabled
+    allowed = {verb for verb in ("acknowledge", "reset") if verb in rig.output(Mqtt).commands.allow}
+    assert rig.output(Mqtt).commands.enabled
     assert len(buttons) == len(allowed) * len(rig.alarms) > 0
     for button in buttons:
         # The templates in it, as Home Assistant fills them.
@@ -156,16 +164,17 @@ def test_buttons_ask_for_what_the_box_would_obey():
         assert button["command_topic"] == f"daqsvc/{rig.site}/{rig.box}/{rig.machine.name}/commands/{verb}"
         assert verb in allowed
         assert button["unique_id"].endswith(f"/{verb}/{command.alarm}")
-    silent = replace(mqtt_settings(rig).home_assistant, buttons=())
-    none = Discovery(silent, Topics("daqsvc", rig.site, rig.box)).payload()["components"]
-    assert not [entity for entity in none.values() if entity["platform"] == "button"]
+    off = rig.output(Mqtt).commands.model_copy(update={"enabled": False})
+    for silent in (NONE, off):
+        none = told_of(watched(rig), commands=silent).payload()["components"]
+        assert not [entity for entity in none.values() if entity["platform"] == "button"]
 
 
 def test_names_read_right_beside_problem_and_boxes_stay_apart():
-    settings = HomeAssistantSettings(
+    pump = Watched(
         "pump", alarms=("shaking",), services=("sensor-ok/probe-x", "detector-ok/bearing", "store/disk")
     )
-    told = [Discovery(settings, Topics("daqsvc", "lab", box)).payload() for box in ("one", "two")]
+    told = [told_of(pump, box).payload() for box in ("one", "two")]
     assert [payload["device"]["name"] for payload in told] == ["pump (lab/one)", "pump (lab/two)"]
     problems = {e["name"] for e in told[0]["components"].values() if e["platform"] == "binary_sensor"}
     assert problems == {"shaking", "probe-x sensor fault", "bearing detector fault", "store/disk"}

@@ -11,13 +11,14 @@ import pytest
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
-from daqsvc.publish.home_assistant_memory import FILE, ToldTopics
-from daqsvc.publish.home_assistant_readings import Readings
-from daqsvc.publish.settings import HomeAssistantSettings
+from daqsvc.publish.home_assistant.left_over import FILE, LeftOver
+from daqsvc.publish.home_assistant.readings import Readings
+from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.output import Watched
 from daqsvc.publish.topics import Topics
 
-SETTINGS = HomeAssistantSettings(
-    machine="rig",
+WATCHED = Watched(
+    "rig",
     findings=("rotor-bank",),
     readings=(
         Reading("levels/probe-x", "statistics", "rms", "um"),
@@ -42,9 +43,9 @@ BANK = Diagnosis(
 class Told:
     """What goes out while diagnoses come at a rate."""
 
-    def __init__(self, settings=SETTINGS):
+    def __init__(self):
         self.clock = DrivenClock()
-        self.readings = Readings(settings, Topics("daqsvc", "lab", "edge-1"), self.clock)
+        self.readings = Readings(HomeAssistant(), WATCHED, Topics("daqsvc", "lab", "edge-1"), self.clock)
         self.messages = []
 
     def say(self, *diagnoses, for_s=1.0, rate_hz=2.0):
@@ -125,13 +126,13 @@ def test_a_detector_that_nobody_shows_costs_nothing():
 def test_what_was_told_is_remembered_whatever_became_of_the_file(tmp_path, content):
     if content is not None:
         (tmp_path / FILE).write_bytes(content)
-    ToldTopics(tmp_path, ["a", "b"]).remember()
-    assert ToldTopics(tmp_path, ["b", "c"]).left_over() == ["a"]
-    assert ToldTopics(tmp_path, []).left_over() == ["a", "b"]
-    ToldTopics(tmp_path, ["b"]).remember(["a"])
-    assert ToldTopics(tmp_path, []).left_over() == ["a", "b"]
+    LeftOver(tmp_path, ["a", "b"]).remember()
+    assert LeftOver(tmp_path, ["b", "c"]).left_over() == ["a"]
+    assert LeftOver(tmp_path, []).left_over() == ["a", "b"]
+    LeftOver(tmp_path, ["b"]).remember(["a"])
+    assert LeftOver(tmp_path, []).left_over() == ["a", "b"]
 
 
 def test_a_disk_that_takes_nothing_is_said_and_stops_nothing(tmp_path, caplog):
-    ToldTopics(tmp_path / "gone", ["a"]).remember()
+    LeftOver(tmp_path / "gone", ["a"]).remember()
     assert "cannot be written" in caplog.text

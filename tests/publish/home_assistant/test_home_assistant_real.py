@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.home_assistant_server import running_home_assistant
-from support.mqtt_publishing import Desk, publishing
-from test_home_assistant import LEVEL, RIG, alarm
+from support.mqtt_publishing import Desk, mqtt, output_port, publisher_of, publishing
+from test_home_assistant import LEVEL, RIG, WATCHED, alarm
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import Verb
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.mqtt import MqttPublisher, MqttSettings
-from daqsvc.publish.settings import CommandSettings
 
 pytestmark = [
     pytest.mark.integration,
@@ -26,7 +24,6 @@ pytestmark = [
     pytest.mark.timeout(1800),
 ]
 
-COMMANDS = CommandSettings(("rig",), frozenset({Verb.ACKNOWLEDGE, Verb.RESET}))
 DEVICE = "rig (lab/edge-1)"
 BANK = Diagnosis("rig", "rotor-bank", 0, "shaft", 0, 320, "U2", group=("U2", "D1"), severity="alert")
 
@@ -66,9 +63,7 @@ class Seen:
 
 async def test_a_person_sees_how_things_stand_and_can_act(home_assistant, mosquitto, outbox, tmp_path):
     seen, desk = Seen(home_assistant), Desk()
-    async with publishing(
-        outbox, mosquitto.port, home_assistant=RIG, commands=COMMANDS, handler=desk
-    ) as publisher:
+    async with publishing(outbox, mosquitto.port, **RIG, handler=desk) as publisher:
         fault, sensor = (publisher.topics.alarm("rig", name) for name in ("rotor-fault", "sensor-ok/probe-x"))
         publisher.report(LEVEL)
         publisher.report(BANK)
@@ -129,8 +124,8 @@ async def test_a_person_sees_how_things_stand_and_can_act(home_assistant, mosqui
 async def _two_boxes_stay_apart(server, mosquitto, store):
     outbox = Outbox(store, SystemClock())
     await outbox.open()
-    settings = MqttSettings("127.0.0.1", mosquitto.port, "second", home_assistant=RIG)
-    publisher = MqttPublisher(settings, "lab", "edge-2", outbox, SystemClock())
+    settings = mqtt(mosquitto.port, "second", commands=RIG["commands"])
+    publisher = publisher_of(settings, output_port(outbox, WATCHED, box="edge-2"), RIG["home_assistant"])
     running = asyncio.create_task(publisher.run())
     try:
         other = Seen(server, "rig (lab/edge-2)")
@@ -148,7 +143,7 @@ async def _two_boxes_stay_apart(server, mosquitto, store):
 
 async def test_a_healthy_machine_hardly_fills_the_database(home_assistant, mosquitto, outbox):
     seen, rng = Seen(home_assistant), np.random.default_rng(1)
-    async with publishing(outbox, mosquitto.port, home_assistant=RIG) as publisher:
+    async with publishing(outbox, mosquitto.port, **RIG) as publisher:
         publisher.report(LEVEL)
         await seen.until(rotor__fault="off")
         entity = seen.entities["levels/probe-x rms"]["entity_id"]

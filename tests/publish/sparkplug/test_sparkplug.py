@@ -42,7 +42,7 @@ async def test_tck_id_principles_birth_certificates_order(mosquitto, outbox, tmp
     machine = Machine(outbox)
     await machine.flips(3)
     async with Host(mosquitto.port) as host, edge_node(outbox, tmp_path, mosquitto.port) as edge:
-        edge.observe(said("F1"))
+        edge.report(said("F1"))
         await born(host)
         await machine.says("F9")
         await eventually(lambda: host.told(STATE, historical=False), "the alarm is told")
@@ -115,7 +115,7 @@ async def test_tck_id_operational_behavior_data_publish_nbirth_values(mosquitto,
     machine = Machine(outbox)
     await machine.says("F1")
     async with Host(mosquitto.port) as host, edge_node(outbox, tmp_path, mosquitto.port) as edge:
-        edge.observe(said("F1", speed=612.5))
+        edge.report(said("F1", speed=612.5))
         await born(host)
         birth = host.of("NBIRTH")[0]
         assert birth.value(STATE) == "active_unacknowledged"
@@ -141,9 +141,9 @@ def _speeds(host: Host) -> list[float]:
 async def test_tck_id_operational_behavior_data_publish_dbirth_change(mosquitto, outbox, tmp_path) -> None:
     """Figures are told when they change, and only then."""
     async with Host(mosquitto.port) as host, edge_node(outbox, tmp_path, mosquitto.port) as edge:
-        edge.observe(said("F1", speed=600.0))
+        edge.report(said("F1", speed=600.0))
         await eventually(lambda: 600.0 in _speeds(host), "the first speed")
-        edge.observe(said("F1", speed=601.0))
+        edge.report(said("F1", speed=601.0))
         await eventually(lambda: 601.0 in _speeds(host), "the second speed")
         last = [message for message in host.of("DDATA") if len(message.metrics) == 1]
         assert [metric.value for metric in last[-1].metrics] == [601.0]
@@ -203,15 +203,15 @@ async def test_tck_id_operational_behavior_device_ddeath(mosquitto, outbox, tmp_
     machine = Machine(outbox)
     async with Host(mosquitto.port) as host, edge_node(outbox, tmp_path, mosquitto.port) as edge:
         await born(host)
-        edge.reach(there=False)
+        edge.status({"buses": {"can0": {"up": 0}}})
         await eventually(lambda: host.of("DDEATH"), "the device dies")
         assert host.of("DDEATH")[0].seq == 2
-        edge.observe(said("F1"))
+        edge.report(said("F1"))
         await machine.says("F1")
         await eventually(lambda: host.of("NDATA"), "the alarm is told")
         assert not host.of("DDATA")
         assert len(host.of("DBIRTH")) == 1
-        edge.reach(there=True)
+        edge.status({"buses": {"can0": {"up": 1}}})
         await born(host, 2)
         assert host.of("DBIRTH")[1].value("bank/Decision") == "F1"
 

@@ -9,7 +9,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import LOOPBACK, eventually
+from support.brokers import eventually
+from support.mqtt_publishing import commands, mqtt, outputs
 from support.sparkplug_edge import BOOLEAN, CLOCK, NODE, born, rebirth, said
 from support.sparkplug_host import Host
 
@@ -18,10 +19,10 @@ from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.events import Identity
 from daqsvc.alarms.rules import DiagnosisRule
 from daqsvc.alarms.states import AlarmState
-from daqsvc.publish.mqtt import MqttSettings
-from daqsvc.publish.settings import CommandSettings
+from daqsvc.publish.mqtt.settings import MqttCommands
+from daqsvc.publish.output import Watched
 from daqsvc.publish.sparkplug.codec import DataType, Metric, Payload, encode
-from daqsvc.publish.sparkplug.settings import Server, SparkplugSettings
+from daqsvc.publish.sparkplug.settings import Sparkplug
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -38,28 +39,18 @@ NCMD, DCMD = NODE.format("NCMD"), f"{NODE.format('DCMD')}/rig"
 @contextlib.asynccontextmanager
 async def box(tmp_path: Path, port: int, allow: frozenset[Verb] | None = BOTH) -> AsyncIterator[AlarmService]:
     """A desk whose alarm latches, at a broker, as an edge node."""
-    sparkplug = SparkplugSettings(
-        group="lab",
-        edge_node="edge-1",
-        device="rig",
-        machine="rig",
-        servers=(Server(LOOPBACK, port, tls=False),),
-        client_id="edge-1:sparkplug",
-        memory=tmp_path / "sparkplug.json",
-        alarms=("rotor-fault",),
-    )
-    commands = None if allow is None else CommandSettings(("rig",), allow)
+    watched = Watched("rig", alarms=("rotor-fault",))
+    allowed = MqttCommands() if allow is None else commands(*allow)
     desk = AlarmService(
         Identity("lab", "edge-1", "rig"),
         [DiagnosisRule("rotor-fault", "bank", latching=True)],
         tmp_path / "store",
         CLOCK,
-        MqttSettings(LOOPBACK, port, "edge-1", commands=commands),
-        sparkplug=sparkplug,
+        outputs(mqtt(port, "edge-1", commands=allowed), watched, sparkplug=Sparkplug()),
     )
     await desk.open()
     await desk.resume({"bank": ("x",)})
-    running = [asyncio.create_task(teller.run()) for teller in desk.tellers.values()]
+    running = [asyncio.create_task(teller.run()) for teller in desk.outputs.values()]
     try:
         yield desk
     finally:
@@ -99,7 +90,10 @@ async def test_a_host_acknowledges_and_resets_what_it_has_seen_in_a_birth(
         await eventually(lambda: told(host, "Acknowledged") == [False, True], "the host sees what came of it")
         assert state(desk) is AlarmState.ACTIVE_ACKNOWLEDGED
         host.ask(topic, written(true(name.replace("Acknowledge", "Reset"))))
-        await eventually(lambda: desk.sparkplug.counters.commands_refused == 1, "the condition still stands")
+        await eventually(
+            lambda: desk.outputs["mqtt.sparkplug"].counters.commands_refused == 1,
+            "the condition still stands",
+        )
         desk.take(said("N", "normal"))
         alias = Metric(
             alias=next(
@@ -112,7 +106,7 @@ async def test_a_host_acknowledges_and_resets_what_it_has_seen_in_a_birth(
         host.ask(topic, written(alias))
         await eventually(lambda: state(desk) is AlarmState.NORMAL, "it is reset")
         await eventually(lambda: told(host, "State")[-1] == "normal", "the host sees it")
-        await eventually(lambda: desk.sparkplug.counters.commands == 2, "both are counted")
+        await eventually(lambda: desk.outputs["mqtt.sparkplug"].counters.commands == 2, "both are counted")
     log = [(line["verb"], line["outcome"]) for line in audited(tmp_path)]
     assert log == [
         ("acknowledge", "asked"),
@@ -156,7 +150,7 @@ async def test_what_is_not_allowed_too_old_or_nothing_is_refused(mosquitto, tmp_
         ]
         for topic, payload in refused:
             host.ask(topic, payload)
-        counters = desk.sparkplug.counters
+        counters = desk.outputs["mqtt.sparkplug"].counters
         await eventually(lambda: counters.commands_refused == len(refused), "each is counted")
         assert state(desk) is AlarmState.ACTIVE_UNACKNOWLEDGED
         assert counters.commands == 0
@@ -178,6 +172,8 @@ async def test_nothing_can_be_written_without_leave_of_the_machine_file(mosquitt
         desk.take(said("F1", "danger"))
         host.ask(DCMD, written(true(DEVICE_ACK)))
         host.ask(NCMD, written(true(NODE_ACK)))
-        await eventually(lambda: desk.sparkplug.counters.commands_refused == 2, "both are refused")
+        await eventually(
+            lambda: desk.outputs["mqtt.sparkplug"].counters.commands_refused == 2, "both are refused"
+        )
         assert state(desk) is AlarmState.ACTIVE_UNACKNOWLEDGED
     assert not (tmp_path / "store" / "audit.jsonl").exists()

@@ -9,14 +9,17 @@ import pytest
 from support.brokers import eventually, running_mosquitto
 from support.live_service import play, running
 from support.machine_files import LAVAL, changed, only_problem
+from support.mqtt_publishing import CLOCK, output_port
 from support.sparkplug_host import Host
 
-from daqsvc.assembly_mqtt import sparkplug_settings
-from daqsvc.publish.sparkplug.settings import Server
+from daqsvc.outbox.store import Outbox
+from daqsvc.publish.make import output_set
+from daqsvc.publish.mqtt.settings import Mqtt
+from daqsvc.publish.sparkplug.edge import SparkplugEdge
+from daqsvc.publish.sparkplug.settings import Sparkplug
 from daqsvc.recording.recording import Recording
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
-from daqsvc.settings.sparkplug import Sparkplug
 from sim_hw.demo.machines import Setpoints, for_recording
 
 pytestmark = pytest.mark.integration
@@ -30,7 +33,9 @@ async def test_the_service_is_an_edge_node(tmp_path: Path) -> None:
     recording = Recording(("accel",), samples, RATE_HZ, Path(__file__), 0)
     with running_mosquitto(tmp_path) as broker:
         plain = for_recording(recording, "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{broker.port}")
-        machine = plain.model_copy(update={"mqtt": plain.mqtt.model_copy(update={"sparkplug": Sparkplug()})})
+        machine = plain.model_copy(
+            update={"mqtt": plain.output(Mqtt).model_copy(update={"sparkplug": Sparkplug()})}
+        )
         name = machine.machine.name
         async with Host(broker.port) as host:
             async with running(machine, tmp_path) as service:
@@ -51,17 +56,21 @@ async def test_the_service_is_an_edge_node(tmp_path: Path) -> None:
 def test_what_is_not_said_follows_from_the_box(tmp_path: Path) -> None:
     text, _ = changed(LAVAL, (ROOT, f"{ROOT}\n[mqtt.sparkplug]"))
     machine = parse_machine_file(text, LAVAL)
-    settings = sparkplug_settings(machine, tmp_path)
-    assert (settings.group, settings.edge_node, settings.device) == ("lab", "edge-1", "laval-rig")
-    assert settings.servers == (Server("broker.example", 8883, tls=True),)
-    assert settings.client_id == "daqsvc-lab:edge-1:sparkplug"
-    assert "rotor-fault" in settings.alarms
+    outbox = Outbox(tmp_path / "outbox.sqlite", CLOCK)
+    asked = output_set(machine)
+    edge = asked.make(output_port(outbox, asked.watched))["mqtt.sparkplug"]
+    assert isinstance(edge, SparkplugEdge)
+    assert edge.node.commands == "spBv1.0/lab/NCMD/edge-1"
+    assert edge._device == "laval-rig"
+    assert [broker.url for broker in edge._brokers] == ["mqtts://broker.example:8883"]
+    assert edge._client_id == "daqsvc-lab:edge-1:sparkplug"
+    assert "Alarms/laval-rig/rotor-fault/State" in [metric.name for metric in edge._board.of(None, 0)]
     assert "Sparkplug B edge node lab/edge-1" in " ".join(describe(machine).split())
 
 
-def test_without_the_table_there_is_no_edge_node(tmp_path: Path) -> None:
+def test_without_the_table_there_is_no_edge_node() -> None:
     text, _ = changed(LAVAL, (ROOT, ROOT + " "))
-    assert sparkplug_settings(parse_machine_file(text, LAVAL), tmp_path) is None
+    assert parse_machine_file(text, LAVAL).output(Sparkplug) is None
 
 
 @pytest.mark.parametrize(
@@ -77,3 +86,10 @@ def test_what_does_not_fit_is_named(addition: str, key: str, message: str) -> No
     problem, _ = only_problem(LAVAL, (ROOT, f"{ROOT}\n[mqtt.sparkplug]\n{addition}"))
     assert problem.key == key
     assert message in problem.message or message in str(problem)
+
+
+def test_a_password_in_an_address_is_not_shown() -> None:
+    addition = 'servers = ["mqtts://daq:hunter2@other.example"]'
+    problem, _ = only_problem(LAVAL, (ROOT, f"{ROOT}\n[mqtt.sparkplug]\n{addition}"))
+    assert problem.value == '"mqtts://***@other.example"'
+    assert "hunter2" not in str(problem)

@@ -15,15 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.publish.certificates import Certificate, CertificateError, certificates
+from daqsvc.publish.mqtt.certificates import Certificate, CertificateError, certificates
+from daqsvc.publish.mqtt.settings import LONGEST_PASSWORD, first_line
 
 if TYPE_CHECKING:
-    from daqsvc.publish.settings import MqttSettings
+    from daqsvc.publish.mqtt.settings import Mqtt
 
 log = logging.getLogger(__name__)
-
-LONGEST_PASSWORD = 65_535
-"""Bytes of the longest password that MQTT can carry."""
 
 CREDENTIALS_DIRECTORY = "CREDENTIALS_DIRECTORY"
 """Where systemd tells a service the directory of its credentials (systemd.exec, LoadCredential=)."""
@@ -50,7 +48,7 @@ class Credentials:
     exposed: tuple[Path, ...] = ()
 
 
-def read_credentials(settings: MqttSettings) -> Credentials:
+def read_credentials(settings: Mqtt) -> Credentials:
     """Read password, key and certificates as the files are now; blocks.
 
     Raises:
@@ -73,7 +71,7 @@ def read_credentials(settings: MqttSettings) -> Credentials:
     return Credentials(password, context, own, trusted, stamp, exposed)
 
 
-def stamp_of(settings: MqttSettings) -> tuple[object, ...]:
+def stamp_of(settings: Mqtt) -> tuple[object, ...]:
     """Which files there are now: identity, size and time of change of each; blocks."""
     return tuple(_stamp(path) for path in _files(settings))
 
@@ -127,11 +125,11 @@ def _watched(path: Path) -> list[Certificate]:
         return []
 
 
-def _password(settings: MqttSettings) -> str | None:
+def _password(settings: Mqtt) -> str | None:
     file = _password_file(settings)
     if file is None:
         return None
-    line = _first_line(file)
+    line = first_line(file)
     if len(line) > LONGEST_PASSWORD:
         raise OSError(
             f"the first line of {file} has more than {LONGEST_PASSWORD} bytes, which MQTT cannot carry; "
@@ -142,14 +140,6 @@ def _password(settings: MqttSettings) -> str | None:
     except UnicodeDecodeError:
         # The error itself would hold the bytes of the password.
         raise OSError(f"{file} is not UTF-8 text; write the password into it, in its first line") from None
-
-
-def _first_line(file: Path) -> bytes:
-    """The first line, as far as it can be a password."""
-    # Not to wait for whoever might write into it: what it is may have changed since it was looked at.
-    handle = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    with os.fdopen(handle, "rb") as opened:
-        return opened.read(LONGEST_PASSWORD + 2).partition(b"\n")[0].rstrip(b"\r")
 
 
 def _check_regular(path: Path) -> None:
@@ -169,7 +159,7 @@ def _is_exposed(path: Path) -> bool:
         return False
 
 
-def _secrets(settings: MqttSettings) -> list[Path]:
+def _secrets(settings: Mqtt) -> list[Path]:
     """The files of password and key, as far as there are any."""
     found = []
     for wanted in (_password_file, _key_file) if settings.tls else (_password_file,):
@@ -180,13 +170,13 @@ def _secrets(settings: MqttSettings) -> list[Path]:
     return found
 
 
-def _password_file(settings: MqttSettings) -> Path | None:
+def _password_file(settings: Mqtt) -> Path | None:
     if settings.password_credential is not None:
         return _credential(settings.password_credential)
     return settings.password_file
 
 
-def _key_file(settings: MqttSettings) -> Path | None:
+def _key_file(settings: Mqtt) -> Path | None:
     if settings.key_credential is not None:
         return _credential(settings.key_credential)
     return settings.key_file
@@ -203,7 +193,7 @@ def _credential(name: str) -> Path:
     return Path(directory) / name
 
 
-def _files(settings: MqttSettings) -> list[Path]:
+def _files(settings: Mqtt) -> list[Path]:
     shown = [settings.ca_file, settings.cert_file] if settings.tls else []
     return [*(path for path in shown if path is not None), *_secrets(settings)]
 

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.credentials import read_credentials, stamp_of
 from daqsvc.publish.delivery import Delivery
 from daqsvc.publish.errors import MqttError, PublishRefusedError
+from daqsvc.publish.mqtt.credentials import read_credentials, stamp_of
 from daqsvc.publish.stopping import unless
 from daqsvc.publish.telemetry_delivery import TelemetryDelivery
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
-    from daqsvc.publish.command_intake import CommandIntake
     from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.counters import PublishCounters
-    from daqsvc.publish.credentials import Credentials
     from daqsvc.publish.faults import Faults
-    from daqsvc.publish.home_assistant_link import HomeAssistantLink
-    from daqsvc.publish.home_assistant_memory import ToldTopics
-    from daqsvc.publish.settings import MqttSettings
+    from daqsvc.publish.mqtt.command_intake import CommandIntake
+    from daqsvc.publish.mqtt.credentials import Credentials
+    from daqsvc.publish.mqtt.link import MqttLink
+    from daqsvc.publish.mqtt.settings import Mqtt
+    from daqsvc.publish.output import EarlierState
     from daqsvc.publish.topics import Topics
 
 log = logging.getLogger(__name__)
@@ -43,23 +42,6 @@ EARLIER_S = 3.0
 
 ANSWER_EXPIRY_S = 60.0
 """How long the answer to a command is of use."""
-
-
-@dataclass(slots=True)
-class EarlierState:
-    """A state of an earlier run, to be asked for once.
-
-    Attributes:
-        topic: where it is retained, if it is.
-        take: takes its payload.
-        is_asked: whether the broker was asked.
-        is_told: whether it has answered.
-    """
-
-    topic: str
-    take: Callable[[bytes], None]
-    is_asked: bool = False
-    is_told: bool = False
 
 
 class CredentialsReplacedError(Exception):
@@ -79,8 +61,7 @@ class Session:
         counters: what is counted here.
         faults: takes mistakes of this program.
         intake: takes commands; None if there are none over MQTT.
-        home_assistant: None to leave Home Assistant alone.
-        told: what it was told before.
+        links: who else speaks over the connection.
         ends_soon: whether the certificate that the broker has shown, or the one behind it, ends soon.
         stopping: ends the deliveries as soon as nothing is left.
         earlier: what to ask the broker for before anything is delivered; None for nothing.
@@ -91,15 +72,14 @@ class Session:
         connection: Connection,
         credentials: Credentials,
         *,
-        settings: MqttSettings,
+        settings: Mqtt,
         topics: Topics,
         outbox: Outbox,
         clock: Clock,
         counters: PublishCounters,
         faults: Faults,
         intake: CommandIntake | None,
-        home_assistant: HomeAssistantLink | None,
-        told: ToldTopics,
+        links: Sequence[MqttLink],
         ends_soon: Callable[[], bool],
         stopping: asyncio.Event,
         earlier: EarlierState | None = None,
@@ -113,8 +93,7 @@ class Session:
         self._counters = counters
         self._faults = faults
         self._intake = intake
-        self._home_assistant = home_assistant
-        self._told = told
+        self._links = links
         self._ends_soon = ends_soon
         self._stopping = stopping
         self._earlier = earlier
@@ -150,7 +129,7 @@ class Session:
             asyncio.create_task(self._listen(), name="mqtt-listen"),
             asyncio.create_task(self._look_after_credentials(), name="mqtt-credentials"),
             asyncio.create_task(self._stopping.wait(), name="mqtt-stopping"),
-            asyncio.create_task(self._tell_home_assistant(), name="mqtt-home-assistant"),
+            *(asyncio.create_task(self._run_link(link), name=f"mqtt-{link.name}") for link in self._links),
         }
         try:
             await self._until_stopped(deliveries, others)
@@ -213,8 +192,8 @@ class Session:
 
     def _acknowledged(self, message: OutboxMessage) -> None:
         self._counters.acknowledged += 1
-        if self._home_assistant is not None:
-            self._home_assistant.note(message)
+        for link in self._links:
+            link.note(message)
 
     def _refused(self, topic: str, reason: str) -> None:
         self._counters.refused += 1
@@ -229,38 +208,13 @@ class Session:
                 reason,
             )
 
-    async def _tell_home_assistant(self) -> None:
-        link = self._home_assistant
+    async def _run_link(self, link: MqttLink) -> None:
         try:
-            await self._take_away_left_over()
-            if link is None:
-                return
-            # What the broker has known for long is not told again in time: the summary must not begin
-            # without it.
-            for message in await self._outbox.retained():
-                link.note(message)
             await link.run(self._connection)
         except (MqttError, OutboxError):
             raise
-        except Exception as error:  # noqa: BLE001  alarms matter more than discovery
-            self._faults.note("Home Assistant is told nothing more until the next connection", error)
-
-    async def _take_away_left_over(self) -> None:
-        """Take away what an earlier start has told Home Assistant and this one does not."""
-        refused = []
-        for topic in await asyncio.to_thread(self._told.left_over):
-            try:
-                await self._connection.deliver(topic, b"", retain=True)
-                log.info("taken away from Home Assistant, as the machine file no longer has it: %s", topic)
-            except PublishRefusedError as error:
-                refused.append(topic)
-                log.warning(
-                    "Home Assistant keeps showing what the machine file no longer has: %s; take the retained "
-                    "message away from %s at the broker, or allow this client to",
-                    error,
-                    topic,
-                )
-        await asyncio.to_thread(self._told.remember, refused)
+        except Exception as error:  # noqa: BLE001  alarms matter more than what others show
+            self._faults.note(f"{link.name} is told nothing more until the next connection", error)
 
     async def _telemetry(self) -> None:
         delivery = TelemetryDelivery(
@@ -274,7 +228,7 @@ class Session:
         await delivery.run()
 
     async def _listen(self) -> None:
-        """Take what the broker sends: commands, and what Home Assistant says."""
+        """Take what the broker sends: commands, and what others say to the links."""
         if self._intake is not None and await self._connection.watch(self._topics.commands, fresh_only=True):
             log.warning(
                 "MQTT broker %s:%d does not let this client listen to %s: no commands come over it",
@@ -294,7 +248,7 @@ class Session:
                 self._faults.note("a message from the broker could not be dealt with", error)
 
     async def _take(self, message: Incoming) -> None:
-        if self._home_assistant is not None and self._home_assistant.take(message):
+        if any(link.take(message) for link in self._links):
             return
         if self._earlier is not None and message.topic == self._earlier.topic:
             if message.retain and not self._earlier.is_told:

@@ -10,17 +10,19 @@ import random
 from typing import TYPE_CHECKING
 
 from daqsvc.publish.errors import PublishRefusedError
-from daqsvc.publish.home_assistant import Discovery
-from daqsvc.publish.home_assistant_readings import Readings
-from daqsvc.publish.summary import Summary
+from daqsvc.publish.home_assistant.discovery import Discovery
+from daqsvc.publish.home_assistant.left_over import LeftOver
+from daqsvc.publish.home_assistant.readings import Readings
+from daqsvc.publish.home_assistant.summary import Summary
+from daqsvc.publish.mqtt.link import MqttLink
 
 if TYPE_CHECKING:
-    from daqsvc.acquisition.clock import Clock
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.connection import Connection, Incoming
-    from daqsvc.publish.settings import HomeAssistantSettings
-    from daqsvc.publish.topics import Topics
+    from daqsvc.publish.home_assistant.settings import HomeAssistant
+    from daqsvc.publish.mqtt.settings import MqttCommands
+    from daqsvc.publish.output import OutputPort
 
 log = logging.getLogger(__name__)
 
@@ -42,24 +44,32 @@ SUMMARY_BYTES_PER_S = 100_000
 _SHOWN = 200
 
 
-class HomeAssistantLink:
+class HomeAssistantLink(MqttLink):
     """Publishes the discovery message and the summary of the alarms.
 
     Args:
-        settings: what to tell.
-        topics: the box.
-        clock: for the time in the summary.
+        settings: whether and how often to tell.
+        commands: what may be asked over the broker.
+        port: what there is to tell.
     """
 
-    def __init__(self, settings: HomeAssistantSettings, topics: Topics, clock: Clock) -> None:
+    name = LeftOver.name
+
+    def __init__(self, settings: HomeAssistant, commands: MqttCommands, port: OutputPort) -> None:
+        watched, topics, clock = port.watched, port.topics, port.clock
+        self.reserved = (settings.prefix,)
         self._settings = settings
+        self._machine = watched.machine
+        self._outbox = port.outbox
         self._topics = topics
         self._clock = clock
-        self._discovery = Discovery(settings, topics)
+        self._discovery = Discovery(settings, commands, watched, topics)
         self._summary = Summary(
-            settings.machine, (*settings.alarms, *settings.services), topics, settings.rests_on
+            watched.machine, (*watched.alarms, *watched.services), topics, watched.rests_on
         )
-        self._readings = Readings(settings, topics, clock)
+        self._readings = Readings(settings, watched, topics, clock)
+        retained = (self._discovery.topic, topics.summary(watched.machine)) if settings.enabled else ()
+        self._left_over = LeftOver(port.store, retained)
         self._changed = asyncio.Event()
         self._born = asyncio.Event()
         self._earlier: asyncio.Future[bytes] | None = None
@@ -75,20 +85,13 @@ class HomeAssistantLink:
                 "message %d on %s is not in the summary of %s: %s",
                 message.sequence,
                 message.topic,
-                self._settings.machine,
+                self._machine,
                 " ".join(str(error).split())[:_SHOWN],  # of pydantic: several lines
             )
 
     def report(self, diagnosis: Diagnosis) -> None:
         """Take in what a detector says."""
         self._readings.note(diagnosis)
-
-    @property
-    def topics(self) -> tuple[str, ...]:
-        """Where something is retained at the broker while the machine is told; empty if it is not."""
-        if not self._settings.enabled:
-            return ()
-        return (self._discovery.topic, self._topics.summary(self._settings.machine))
 
     def take(self, message: Incoming) -> bool:
         """Take in a message from the broker; whether it was meant for this link."""
@@ -110,22 +113,26 @@ class HomeAssistantLink:
         Raises:
             MqttError: the connection is lost.
         """
+        await self._left_over.run(connection)
         try:
             await self._run(connection)
         except PublishRefusedError as error:
             log.warning(
                 "Home Assistant is not told of %s: %s; allow this client to write %s and %s at the broker",
-                self._settings.machine,
+                self._machine,
                 error,
                 self._discovery.topic,
-                self._topics.summary(self._settings.machine),
+                self._topics.summary(self._machine),
             )
 
     async def _run(self, connection: Connection) -> None:
         if not self._settings.enabled:
             await connection.deliver(self._discovery.topic, b"", retain=True)
-            await connection.deliver(self._topics.summary(self._settings.machine), b"", retain=True)
+            await connection.deliver(self._topics.summary(self._machine), b"", retain=True)
             return
+        # What the broker has known for long is not told again in time: no summary may begin without it.
+        for message in await self._outbox.retained():
+            self.note(message)
         self._born.clear()
         await connection.watch(self._discovery.birth_topic)
         await self._remove(connection)
@@ -176,7 +183,7 @@ class HomeAssistantLink:
         self._changed.clear()
         summary = self._summary.to_json(self._clock)
         self._pause_s = max(PAUSE_S, len(summary) / SUMMARY_BYTES_PER_S)
-        await connection.deliver(self._topics.summary(self._settings.machine), summary, retain=True)
+        await connection.deliver(self._topics.summary(self._machine), summary, retain=True)
 
 
 def _json(told: object) -> bytes:

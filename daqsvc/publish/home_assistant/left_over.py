@@ -6,15 +6,20 @@ was last seen, healthy for ever.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 from typing import TYPE_CHECKING, Final
 
 from daqsvc.outbox.files import replace_durably
+from daqsvc.publish.errors import PublishRefusedError
+from daqsvc.publish.mqtt.link import MqttLink
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
+
+    from daqsvc.publish.connection import Connection
 
 log = logging.getLogger(__name__)
 
@@ -22,17 +27,40 @@ FILE: Final = "home-assistant.json"
 _MOST_BYTES = 65_536
 
 
-class ToldTopics:
-    """Topics that hold a retained message of this box for Home Assistant.
+class LeftOver(MqttLink):
+    """Takes away what an earlier start has told Home Assistant and this one does not.
 
     Args:
-        directory: where they are remembered.
+        directory: where the topics are remembered that hold a retained message of this box.
         now: those that are told from now on.
     """
 
-    def __init__(self, directory: Path, now: Iterable[str]) -> None:
+    name = "Home Assistant"
+
+    def __init__(self, directory: Path, now: Iterable[str] = ()) -> None:
         self.now = frozenset(now)
         self._path = directory / FILE
+
+    async def run(self, connection: Connection) -> None:
+        """Take it away, and remember what is told from now on.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        refused = []
+        for topic in await asyncio.to_thread(self.left_over):
+            try:
+                await connection.deliver(topic, b"", retain=True)
+                log.info("taken away from Home Assistant, as the machine file no longer has it: %s", topic)
+            except PublishRefusedError as error:
+                refused.append(topic)
+                log.warning(
+                    "Home Assistant keeps showing what the machine file no longer has: %s; take the retained "
+                    "message away from %s at the broker, or allow this client to",
+                    error,
+                    topic,
+                )
+        await asyncio.to_thread(self.remember, refused)
 
     def left_over(self) -> list[str]:
         """Those that were told by an earlier start and are not any more; blocks."""

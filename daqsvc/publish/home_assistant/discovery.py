@@ -17,13 +17,15 @@ import daqsvc
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.reading import STALE_S
-from daqsvc.publish.home_assistant_readings import digits_of
+from daqsvc.publish.home_assistant.readings import digits_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.diagnosis.reading import Reading
-    from daqsvc.publish.settings import HomeAssistantSettings
+    from daqsvc.publish.home_assistant.settings import HomeAssistant
+    from daqsvc.publish.mqtt.settings import MqttCommands
+    from daqsvc.publish.output import Watched
     from daqsvc.publish.topics import Topics
 
 _UNITS = {"um": "µm", "m/s2": "m/s²", "deg": "°", "degC": "°C", "degF": "°F"}
@@ -56,11 +58,15 @@ class Discovery:
     """The discovery message of a machine.
 
     Args:
-        settings: what to tell.
+        settings: where, and how often figures are told.
+        commands: what may be asked over the broker: these have buttons.
+        watched: what there is to tell.
         topics: the box.
     """
 
-    settings: HomeAssistantSettings
+    settings: HomeAssistant
+    commands: MqttCommands
+    watched: Watched
     topics: Topics
 
     @property
@@ -75,14 +81,14 @@ class Discovery:
 
     def payload(self) -> dict[str, Any]:
         """The device with all its entities."""
-        settings = self.settings
+        watched = self.watched
         return {
             "device": {
                 "identifiers": [self._id],
                 # Entities are called after it, and two boxes may both watch a "pump".
-                "name": f"{settings.machine} ({self.topics.site}/{self.topics.box})",
+                "name": f"{watched.machine} ({self.topics.site}/{self.topics.box})",
                 "manufacturer": "daqsvc",
-                "model": settings.description or "rotating machine",
+                "model": watched.description or "rotating machine",
                 "sw_version": daqsvc.__version__,
             },
             "origin": {"name": "daqsvc", "sw_version": daqsvc.__version__},
@@ -125,24 +131,30 @@ class Discovery:
 
     @property
     def _id(self) -> str:
-        return f"{self.topics.base}/{self.settings.machine}"
+        return f"{self.topics.base}/{self.watched.machine}"
 
     @property
     def _object_id(self) -> str:
         return _safe_id(self._id)
 
+    @property
+    def _buttons(self) -> tuple[Verb, ...]:
+        """What a person may do with an alarm from there: of what needs one press, what the box obeys."""
+        allowed = self.commands.allow if self.commands.enabled else ()
+        return tuple(verb for verb in _BUTTONS if verb in allowed)
+
     def _components(self) -> dict[str, dict[str, Any]]:
         made: dict[str, dict[str, Any]] = {}
-        for alarm in self.settings.alarms:
+        for alarm in self.watched.alarms:
             made[f"alarm/{alarm}"] = self._problem(alarm)
             made[f"level/{alarm}"] = self._level(alarm)
             made[f"state/{alarm}"] = self._state(alarm)
-            made |= {f"{verb}/{alarm}": self._button(verb, alarm) for verb in self.settings.buttons}
-        for alarm in self.settings.services:
+            made |= {f"{verb}/{alarm}": self._button(verb, alarm) for verb in self._buttons}
+        for alarm in self.watched.services:
             made[f"alarm/{alarm}"] = {**self._problem(alarm), "entity_category": "diagnostic"}
-        for detector in self.settings.findings:
+        for detector in self.watched.findings:
             made[f"finding/{detector}"] = self._finding(detector)
-        for reading in self.settings.readings:
+        for reading in self.watched.readings:
             made[f"{reading.kind}/{reading.detector}/{reading.key}"] = self._sensor(reading)
         return {
             _safe_id(name): {**entity, "unique_id": f"{self._id}/{name}"}
@@ -150,7 +162,7 @@ class Discovery:
         }
 
     def _problem(self, alarm: str) -> dict[str, Any]:
-        summary = self.topics.summary(self.settings.machine)
+        summary = self.topics.summary(self.watched.machine)
         return {
             "platform": "binary_sensor",
             "name": _in_words(alarm),
@@ -167,7 +179,7 @@ class Discovery:
             "name": f"{alarm} level",
             "device_class": "enum",
             "options": [level.label for level in Level],
-            "state_topic": self.topics.summary(self.settings.machine),
+            "state_topic": self.topics.summary(self.watched.machine),
             # The level of an alarm that is covered, or that nobody can judge, is not "normal" but unknown.
             "value_template": _pick("alarms", alarm, "level", given="problem"),
         }
@@ -178,7 +190,7 @@ class Discovery:
             "name": f"{alarm} alarm state",
             "device_class": "enum",
             "options": [state.value for state in AlarmState],
-            "state_topic": self.topics.summary(self.settings.machine),
+            "state_topic": self.topics.summary(self.watched.machine),
             "value_template": _pick("alarms", alarm, "state"),
         }
 
@@ -194,7 +206,7 @@ class Discovery:
             "platform": "button",
             "name": f"{verb} {alarm}",
             "icon": _BUTTONS[verb],
-            "command_topic": self.topics.command(self.settings.machine, verb),
+            "command_topic": self.topics.command(self.watched.machine, verb),
             "command_template": json.dumps(command),
         }
 
@@ -203,7 +215,7 @@ class Discovery:
             "platform": "sensor",
             "name": f"{detector} finding",
             "icon": "mdi:stethoscope",
-            "state_topic": self.topics.readings(self.settings.machine, detector),
+            "state_topic": self.topics.readings(self.watched.machine, detector),
             "value_template": _pick("finding"),
             "expire_after": self._stale_s(STALE_S),
         }
@@ -216,7 +228,7 @@ class Discovery:
             "platform": "sensor",
             "name": f"{reading.detector} {reading.key.replace('_', ' ')}",
             "state_class": "measurement",
-            "state_topic": self.topics.readings(self.settings.machine, reading.detector),
+            "state_topic": self.topics.readings(self.watched.machine, reading.detector),
             "value_template": _pick(reading.kind, reading.key),
             "expire_after": self._stale_s(reading.stale_s),
             "suggested_display_precision": digits_of(reading.unit),

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.diagnosis.reading import Reading
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.publish.settings import HomeAssistantSettings
+    from daqsvc.publish.home_assistant.settings import HomeAssistant
+    from daqsvc.publish.output import Watched
     from daqsvc.publish.topics import Topics
 
 LEAST_NS = 10 * NS_PER_S
@@ -79,17 +80,19 @@ class Readings:
     """Decides which figures go out when.
 
     Args:
-        settings: the machine, its figures, and how often they are told.
+        settings: how often figures are told.
+        watched: the machine and its figures.
         topics: the box.
         clock: the service's clock.
     """
 
-    def __init__(self, settings: HomeAssistantSettings, topics: Topics, clock: Clock) -> None:
+    def __init__(self, settings: HomeAssistant, watched: Watched, topics: Topics, clock: Clock) -> None:
         self._settings = settings
+        self._machine = watched.machine
         self._topics = topics
         self._clock = clock
-        self._shown: dict[str, _Shown] = {name: _Shown(finds=True) for name in settings.findings}
-        for reading in settings.readings:
+        self._shown: dict[str, _Shown] = {name: _Shown(finds=True) for name in watched.findings}
+        for reading in watched.readings:
             self._shown.setdefault(reading.detector, _Shown()).readings.append(reading)
 
     def note(self, diagnosis: Diagnosis) -> None:
@@ -107,7 +110,7 @@ class Readings:
         messages = []
         for detector, shown in self._shown.items():
             if shown.latest is not None and self._is_due(shown):
-                messages.append((self._topics.readings(self._settings.machine, detector), self._tell(shown)))
+                messages.append((self._topics.readings(self._machine, detector), self._tell(shown)))
         return messages
 
     def _is_due(self, shown: _Shown) -> bool:
@@ -141,7 +144,7 @@ class Readings:
 
         return ReadingsPayload(
             **stamp_now(self._topics.site, self._topics.box, self._clock),
-            machine=self._settings.machine,
+            machine=self._machine,
             detector=shown.latest.detector,
             finding=shown.told_finding,
             statistics=of("statistics"),

@@ -7,17 +7,13 @@ import logging
 import ssl
 import time
 from dataclasses import asdict
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.certificates import CertificateError, certificate, issuer_of
-from daqsvc.publish.command_intake import CommandIntake
 from daqsvc.publish.connection import PUBACK_S, Connection, Will
 from daqsvc.publish.counters import PublishCounters
-from daqsvc.publish.credentials import read_credentials
 from daqsvc.publish.delivery import IN_FLIGHT
 from daqsvc.publish.errors import (
     MqttError,
@@ -26,29 +22,28 @@ from daqsvc.publish.errors import (
     TakenOverError,
 )
 from daqsvc.publish.faults import Faults
-from daqsvc.publish.home_assistant_link import HomeAssistantLink
-from daqsvc.publish.home_assistant_memory import ToldTopics
+from daqsvc.publish.mqtt.certificates import CertificateError, certificate, issuer_of
+from daqsvc.publish.mqtt.command_intake import CommandIntake
+from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
+from daqsvc.publish.mqtt.credentials import read_credentials
+from daqsvc.publish.mqtt.session import CredentialsReplacedError, Session
 from daqsvc.publish.outage import Outage, has_expired, in_words
-from daqsvc.publish.payloads import availability_payload
-from daqsvc.publish.session import CredentialsReplacedError, Session
-from daqsvc.publish.settings import MqttSettings
+from daqsvc.publish.output import Output
+from daqsvc.publish.payloads import availability_payload, diagnosis_payload, status_payload
 from daqsvc.publish.spoken import Spoken
 from daqsvc.publish.stopping import unless
 from daqsvc.publish.suspects import FIRST_BAR_S, Suspects
-from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.conditions import Condition
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.outbox.store import Outbox
-    from daqsvc.publish.credentials import Credentials
-    from daqsvc.publish.session import EarlierState
-
-__all__ = ["MqttPublisher", "MqttSettings", "PublishCounters"]
+    from daqsvc.publish.mqtt.credentials import Credentials
+    from daqsvc.publish.mqtt.link import MqttLink
+    from daqsvc.publish.mqtt.settings import Mqtt
+    from daqsvc.publish.output import OutputPort
 
 log = logging.getLogger(__name__)
 
@@ -67,61 +62,53 @@ TAKEN_OVER_S = 60.0
 GOODBYE_S = 0.3
 """What saying goodbye may take of the time to stop."""
 
-NS_PER_DAY = 86_400 * NS_PER_S
-
 SOON_DAYS = 15
 """A day before anybody is alarmed by a certificate that ends, the broker is asked for the one it has now."""
 
 
-class MqttPublisher:
+class MqttPublisher(Output):
     """Publishes the outbox to one broker, through its outages, and takes commands from there.
 
     `run` is the one task of it. Connecting, waiting and keep-alive go by real time, whatever clock the
     data has: the broker is real.
 
     Args:
-        settings: how to reach the broker.
-        site: name of the site.
-        box: name of the box.
-        outbox: what must reach the broker; open while `run` runs.
-        clock: for the time in what the publisher itself says, and the age of commands and telemetry.
-        commands: carries out the commands that `MqttSettings.commands` allows; None takes none.
-        earlier: a state of an earlier run that the broker is asked for before anything is delivered.
+        settings: how to reach the broker, with the client id and absolute paths; see `Mqtt.on`.
+        port: what must reach the broker, and who carries out the commands that the settings allow.
+        links: who else speaks over the connection.
     """
 
-    def __init__(
-        self,
-        settings: MqttSettings,
-        site: str,
-        box: str,
-        outbox: Outbox,
-        clock: Clock,
-        *,
-        commands: CommandHandler | None = None,
-        earlier: EarlierState | None = None,
-    ) -> None:
+    def __init__(self, settings: Mqtt, port: OutputPort, links: Sequence[MqttLink] = ()) -> None:
         self.counters = PublishCounters()
-        self.topics = Topics(settings.topic_root, site, box)
+        self.topics = port.topics
         self._settings = settings
-        self._outbox = outbox
-        self._clock = clock
-        self._earlier = earlier
+        self._port = port
+        self._outbox = port.outbox
+        self._clock = port.clock
+        self._links = links
+        self._check = BrokerCheck()
         self._intake: CommandIntake | None = None
-        if settings.commands is not None and commands is not None:
-            self._intake = CommandIntake(settings.commands, self.topics, commands, clock, outbox.command_ids)
-        self._home_assistant: HomeAssistantLink | None = None
-        if settings.home_assistant is not None:
-            self._home_assistant = HomeAssistantLink(settings.home_assistant, self.topics, clock)
-        self._told = ToldTopics(
-            outbox.directory, () if self._home_assistant is None else self._home_assistant.topics
-        )
+        if settings.commands.enabled and port.commands is not None:
+            reserved = [prefix for link in links for prefix in link.reserved]
+            self._intake = CommandIntake(
+                settings.commands,
+                port.identity.machine,
+                port.topics,
+                port.commands,
+                port.clock,
+                port.outbox.command_ids,
+                reserved,
+            )
         self._expiry: dict[str, int] = {}
+        """When certificates end, wall clock in ns since 1970, as far as they were seen: ``client`` is the
+        box's own, ``broker`` what that has shown, ``ca`` the authority of `ca_file` that vouches for it."""
         self._backoff = Backoff(FIRST_RETRY_NS)
         self._quick_losses = 0
         self._outage = Outage(log)
         self._has_expired = False
+        """Whether the broker was last refused because what it shows has expired, rather than verified."""
         self._spoken = Spoken(
-            outbox.directory, settings.host, settings.port, settings.protocol, clock.wall_ns
+            port.outbox.directory, settings.host, settings.port, settings.protocol, port.clock.wall_ns
         )
         self._suspects = Suspects()
         self._faults = Faults()
@@ -132,20 +119,6 @@ class MqttPublisher:
         self._stopping = asyncio.Event()
         self._stop_at_s = 0.0
         self._running: asyncio.Future[None] | None = None
-
-    @property
-    def certificate_expiry(self) -> Mapping[str, int]:
-        """When certificates end, as wall clock in ns since 1970, as far as they have been seen.
-
-        ``client`` is the box's own, ``ca`` the authority of `MqttSettings.ca_file` that vouches for the
-        broker, ``broker`` what the broker has shown.
-        """
-        return MappingProxyType(self._expiry)
-
-    @property
-    def broker_has_expired(self) -> bool:
-        """Whether the broker was last refused because what it shows has expired, rather than verified."""
-        return self._has_expired
 
     def figures(self) -> dict[str, Any]:
         """What the publisher has done, in numbers, for the status; without TLS or commands none of these."""
@@ -184,9 +157,30 @@ class MqttPublisher:
         )
 
     def report(self, diagnosis: Diagnosis) -> None:
-        """Take in what a detector says, for those who look at figures now and then; never waits."""
-        if self._home_assistant is not None:
-            self._home_assistant.report(diagnosis)
+        """Publish what a detector says, and pass it on to those who look at figures now and then."""
+        payload = diagnosis_payload(self._port.identity, diagnosis, self._clock).to_json()
+        self.telemetry(f"{self._port.identity.machine}/diagnosis/{diagnosis.detector}", payload)
+        for link in self._links:
+            link.report(diagnosis)
+
+    def status(self, figures: Mapping[str, Any]) -> None:
+        """Publish the figures of the service."""
+        payload = status_payload(self.topics.site, self.topics.box, figures, self._clock)
+        self.telemetry("status", payload.to_json())
+
+    def conditions(self, told: frozenset[str]) -> Iterator[Condition]:
+        """See `Output.conditions`."""
+        return self._check.look(
+            BrokerVitals(
+                wall_ns=self._clock.wall_ns(),
+                certificates_end_ns=self._expiry,
+                has_expired=self._has_expired,
+                connected=self.counters.connected,
+                refused=self.refused,
+                is_refused_known=self.is_refused_known,
+                told=told,
+            )
+        )
 
     @property
     def refused(self) -> Mapping[str, str]:
@@ -337,7 +331,7 @@ class MqttPublisher:
             on_taken=self._suspects.acknowledged,
             on_overlooked=self.counters.count_overlooked,
             on_ignored=self.counters.count_ignored,
-            identifier=settings.client_id,
+            identifier=settings.client_id or "",
             username=settings.username,
             password=credentials.password,
             tls_context=credentials.context,
@@ -379,11 +373,10 @@ class MqttPublisher:
             counters=self.counters,
             faults=self._faults,
             intake=self._intake,
-            home_assistant=self._home_assistant,
-            told=self._told,
+            links=self._links,
             ends_soon=self._ends_soon,
             stopping=self._stopping,
-            earlier=self._earlier,
+            earlier=self._port.earlier,
         )
         loop = asyncio.get_running_loop()
         since_s = loop.time()

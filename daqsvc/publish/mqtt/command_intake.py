@@ -21,16 +21,18 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.alarms.text_validation import refuse_twice
 from daqsvc.outbox.command_ids import REMEMBERED
-from daqsvc.publish.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import stamp_now
 from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import CommandHandler
     from daqsvc.outbox.command_ids import CommandIds
     from daqsvc.publish.connection import Incoming
-    from daqsvc.publish.settings import CommandSettings
+    from daqsvc.publish.mqtt.settings import MqttCommands
     from daqsvc.publish.topics import CommandTopic, Topics
 
 log = logging.getLogger(__name__)
@@ -96,27 +98,32 @@ class CommandIntake:
 
     Args:
         settings: what is allowed.
+        machine: name of the machine that commands may be for.
         topics: the box.
         handler: carries out what is allowed.
         clock: its wall clock tells how old a command is.
         ids: those of the commands that have come.
+        reserved: topics below which no answer goes, besides the box's own, e.g. a discovery prefix.
     """
 
     def __init__(
         self,
-        settings: CommandSettings,
+        settings: MqttCommands,
+        machine: str,
         topics: Topics,
         handler: CommandHandler,
         clock: Clock,
         ids: CommandIds,
+        reserved: Iterable[str] = (),
     ) -> None:
         self.counters = IntakeCounters()
         self._settings = settings
+        self._machine = machine
         self._topics = topics
         self._handler = handler
         self._clock = clock
         self._ids = ids
-        self._reserved = (*_RESERVED, f"{topics.root}/", *(f"{prefix}/" for prefix in settings.reserved))
+        self._reserved = (*_RESERVED, f"{topics.root}/", *(f"{prefix}/" for prefix in reserved))
         self._quiet_until_ns = clock.monotonic_ns()
 
     async def take(self, message: Incoming) -> Answer | None:
@@ -167,11 +174,11 @@ class CommandIntake:
         """
         machine, verb = topic.machine, topic.verb
         allowed = ", ".join(sorted(self._settings.allow)) or "nothing"
-        if machine not in self._settings.machines:
+        if machine != self._machine:
             self.counters.unauthorised += 1
             raise CommandRefusedError(
                 f"this box takes no commands for machine {machine[:_SHOWN_TOPIC]!r}; it watches "
-                f"{', '.join(self._settings.machines)}"
+                f"{self._machine}"
             )
         if verb not in set(Verb):
             self.counters.malformed += 1

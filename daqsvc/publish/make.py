@@ -1,0 +1,99 @@
+"""From a machine file to its outputs."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any, cast
+
+from daqsvc.alarms.expected import handling_conditions
+from daqsvc.detectors.make import plugins
+from daqsvc.publish.mqtt.settings import Mqtt
+from daqsvc.publish.output import OutputSet, Watched
+from daqsvc.settings.alarms import DiagnosisAlarm
+from daqsvc.settings.plugins import configured_outputs, output_tables
+from daqsvc.settings.problems import AssemblyError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from daqsvc.publish.output import Output, OutputPort
+    from daqsvc.publish.plugin import OutputPlugin
+    from daqsvc.settings.alarms import Alarm
+    from daqsvc.settings.models import MachineFile
+
+log = logging.getLogger(__name__)
+
+
+def output_plugins() -> dict[str, OutputPlugin[Any]]:
+    """The kinds of outputs that are installed, by the path of their table."""
+    return cast("dict[str, OutputPlugin[Any]]", dict(output_tables()))
+
+
+def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSet:
+    """The outputs that a machine file asks for.
+
+    Args:
+        machine: the machine file.
+        conditions: names of what the service may say of itself, outputs aside.
+    """
+    installed, given = output_plugins(), {path: given for path, _, given in configured_outputs(machine)}
+    own = tuple(name for path in given for name in installed[path].conditions(given[path]))
+    outdated = [plugin.outdated for path, plugin in installed.items() if path not in given]
+
+    def make(port: OutputPort) -> dict[str, Output]:
+        made: dict[str, Output] = {}
+        for path, table in given.items():
+            try:
+                output = installed[path].build(machine, table, port)
+            except AssemblyError:
+                raise
+            except Exception as error:  # noqa: BLE001  whatever a plugin does, the machine is watched
+                log.error("output %s cannot be made and is left out: %s", path, error)  # noqa: TRY400
+                continue
+            if output is not None:
+                made[path] = output
+        return made
+
+    mqtt = machine.output(Mqtt)
+    return OutputSet(
+        watched=watched(machine, (*conditions, *own)),
+        make=make,
+        topic_root=Mqtt.model_fields["topic_root"].default if mqtt is None else mqtt.topic_root,
+        conditions=own,
+        outdated={prefix: words for each in outdated for prefix, words in each.items()},
+    )
+
+
+def watched(machine: MachineFile, conditions: Iterable[str] = ()) -> Watched:
+    """What there is to tell of a machine.
+
+    Args:
+        machine: the machine file.
+        conditions: names of what the service may say of itself.
+    """
+    return Watched(
+        machine.machine.name,
+        machine.machine.description,
+        alarms=tuple(alarm.name for alarm in machine.alarms),
+        services=tuple(_services(machine, conditions)),
+        readings=tuple(one for plugin, given in plugins(machine) for one in plugin.readings(machine, given)),
+        findings=machine.detectors,
+        rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
+    )
+
+
+def _rests_on(alarm: Alarm) -> Iterator[str]:
+    """The alarms about sensors and detectors without which nobody can say that this one is not raised."""
+    if isinstance(alarm, DiagnosisAlarm):
+        yield f"detector-ok/{alarm.detector}"
+    else:
+        yield from (f"sensor-ok/{sensor}" for sensor in alarm.watched)
+
+
+def _services(machine: MachineFile, conditions: Iterable[str]) -> Iterator[str]:
+    """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
+    for plugin, given in plugins(machine):
+        yield from plugin.quality_alarms(machine, given)
+    handling = machine.alarm_handling
+    yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
+    yield from conditions

@@ -1,0 +1,1 @@
+"""The broker: alarms, diagnoses and status to it, commands from it."""

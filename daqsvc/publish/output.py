@@ -1,0 +1,146 @@
+"""What an output is given, and what it does: it tells others what the service finds.
+
+Whatever an output does wrong, acquisition, diagnosis, alarms and the other outputs go on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from pathlib import Path
+
+    from daqsvc.acquisition.clock import Clock
+    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.conditions import Condition
+    from daqsvc.alarms.events import Identity
+    from daqsvc.diagnosis.reading import Reading
+    from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.outbox.store import Outbox
+    from daqsvc.publish.topics import Topics
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """What there is to tell of a machine, known before anything of it happens.
+
+    Attributes:
+        machine: name of the machine.
+        description: what a person should know about it.
+        alarms: names of its alarms.
+        services: alarms about sensors, detectors and the service, rather than the machine.
+        readings: the figures to show.
+        findings: the detectors whose decision is shown.
+        rests_on: by alarm, the alarms about sensors and detectors that say whether it can be judged at all.
+    """
+
+    machine: str
+    description: str = ""
+    alarms: tuple[str, ...] = ()
+    services: tuple[str, ...] = ()
+    readings: tuple[Reading, ...] = ()
+    findings: tuple[str, ...] = ()
+    rests_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class EarlierState:
+    """A state of an earlier run, to be asked for once before this run takes its place.
+
+    Attributes:
+        topic: where it is retained, if it is.
+        take: takes its payload.
+        is_asked: whether the broker was asked.
+        is_told: whether it has answered.
+    """
+
+    topic: str
+    take: Callable[[bytes], None]
+    is_asked: bool = False
+    is_told: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputPort:
+    """What an output works with.
+
+    Attributes:
+        identity: whose alarms these are: site, box and machine.
+        watched: what there is to tell.
+        store: directory of what survives restarts.
+        clock: the service's clock.
+        outbox: the alarm events, on disk and numbered; an output goes on after the last one that it has told
+            by ``await outbox.next_following(sequence, most)``. Open while `Output.run` runs.
+        topics: by which events are known in the outbox.
+        commands: carries out what people ask of alarms; an output has to see that they may.
+        earlier: what a broker is asked for before it is told anything; None for nothing.
+    """
+
+    identity: Identity
+    watched: Watched
+    store: Path
+    clock: Clock
+    outbox: Outbox
+    topics: Topics
+    commands: CommandHandler | None = None
+    earlier: EarlierState | None = None
+
+
+class Output:
+    """Tells others what the service finds. Every method is called by the event loop and must not block it."""
+
+    async def run(self) -> None:
+        """Tell, until `stop` or until cancelled; begun again if it fails or ends before."""
+        raise NotImplementedError
+
+    async def stop(self, deadline_s: float) -> None:
+        """Hand over what is left, and end `run`; what takes longer than the deadline is cancelled."""
+
+    def report(self, diagnosis: Diagnosis) -> None:
+        """Take in a statement of a detector; several a second."""
+
+    def status(self, figures: Mapping[str, Any]) -> None:
+        """Take in the figures of the service, by what they belong to; once a second."""
+
+    def figures(self) -> dict[str, Any]:
+        """What it has done, in numbers, or mappings of numbers, by name: part of the status."""
+        return {}
+
+    def conditions(self, told: frozenset[str]) -> Iterable[Condition]:
+        """How things stand with it, as far as that is known; each is an alarm. Asked for once a second.
+
+        Args:
+            told: names of conditions that were ever told of, also before a restart.
+        """
+        del told
+        return ()
+
+
+def _nothing(_port: OutputPort) -> dict[str, Output]:
+    return {}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputSet:
+    """The outputs of a machine file, to be made once there is an outbox.
+
+    Attributes:
+        watched: what there is to tell.
+        make: makes them, by the path of their table.
+        topic_root: first part of the topics by which events are known in the outbox.
+        conditions: names of all that they may say of themselves.
+        outdated: see `OutputPlugin.outdated`, of those that the file has no table for.
+    """
+
+    watched: Watched
+    make: Callable[[OutputPort], Mapping[str, Output]] = _nothing
+    topic_root: str = "daqsvc"
+    conditions: tuple[str, ...] = ()
+    outdated: Mapping[str, str] = field(default_factory=dict)
+
+
+def output_name(path: str) -> str:
+    """What an output is called in the log and in the count of failures, by the path of its table."""
+    return path.rpartition(".")[2]

@@ -1,0 +1,50 @@
+"""What an output brings to the service, registered as an entry point in the group ``daqsvc.outputs``."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar, TypeVar
+
+from daqsvc.settings.plugins import OutputTable
+from daqsvc.settings.section import Section
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from daqsvc.publish.output import Output, OutputPort
+    from daqsvc.settings.models import MachineFile
+
+SettingsT = TypeVar("SettingsT", bound=Section)
+
+
+class OutputPlugin(OutputTable[SettingsT]):
+    """A kind of output: its table in the machine file, and what makes the output of it.
+
+    Importing one must be cheap: what takes time is imported when the output is made.
+
+    Attributes:
+        status_key: where its figures stand in the status; empty for nowhere.
+        outdated: by how the names of its conditions begin, what is said of those of an earlier run once the
+            machine file has no such table any more.
+    """
+
+    status_key: ClassVar[str] = ""
+    outdated: ClassVar[Mapping[str, str]] = MappingProxyType({})
+
+    def conditions(self, given: SettingsT) -> Iterable[str]:
+        """Names of all that `Output.conditions` may say, so that people may act on it before it is said."""
+        del given
+        return ()
+
+    def build(self, machine: MachineFile, given: SettingsT, port: OutputPort) -> Output | None:
+        """The output; None for one that another output takes with it. Making it opens nothing.
+
+        Args:
+            machine: the machine file.
+            given: the table.
+            port: what it works with.
+
+        Raises:
+            AssemblyError: what the table names cannot be used.
+        """
+        raise NotImplementedError
