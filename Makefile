@@ -26,6 +26,8 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 # Compiled kernels are kept here, so that only the first run compiles them.
 # Small linear systems only: threads of the linear algebra library cost more than they save.
+# Python keeps what it has compiled, else each process that a test starts compiles it anew.
+unexport PYTHONDONTWRITEBYTECODE
 export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 

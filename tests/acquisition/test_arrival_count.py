@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.machine_files import MACHINES, changed, only_problem
+from support.machine_files import MACHINES, only_problem, parsed
 
 from daqsvc.acquisition.arrivals import ArrivalCount
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from daqsvc.settings import describe, load_machine_file, parse_machine_file
+from daqsvc.settings import describe, load_machine_file
 from drivers.can.dbc import layout_from_dbc
 from drivers.can.plugin import frame_layout
 
@@ -108,8 +108,7 @@ def test_the_standard_acceleration_message_of_j1939_is_read_without_a_counter() 
 
 
 def test_a_message_of_a_data_base_may_have_no_counter_either() -> None:
-    text, _ = changed(TRIAXIAL, ("counter = {", "no_counter = true # {"))
-    machine = parse_machine_file(text, TRIAXIAL)
+    machine = parsed(TRIAXIAL, ("counter = {", "no_counter = true # {"))
     (stream,) = machine.streams
     assert frame_layout(machine, stream).counter is None
     given = machine.streams[stream].layout

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.alarm_rig import AlarmRig
-from support.machine_files import MACHINES, TRIAXIAL, changed, only_problem
+from support.machine_files import MACHINES, TRIAXIAL, only_problem, parsed
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.assembly_alarms import alarm_rules
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
-from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings import load_machine_file
 from drivers.can.dbc import layout_from_dbc
 from drivers.can.plugin import frame_layout
 from drivers.frames import FrameLayout, LayoutError
@@ -182,8 +182,7 @@ def test_a_sensor_without_values_neither_raises_nor_clears_an_alarm() -> None:
 
 def test_a_machine_file_names_the_raw_values_that_are_measurements() -> None:
     motor = MACHINES / "motor-accelerometer.toml"
-    text, _ = changed(motor, ('type = "int16"', 'type = "int16", valid_raw = [-32767, 32767]'))
-    machine = parse_machine_file(text, motor)
+    machine = parsed(motor, ('type = "int16"', 'type = "int16", valid_raw = [-32767, 32767]'))
     (stream,) = machine.streams
     read = frame_layout(machine, stream)
     frame = np.full((1, read.length), 0x55, np.uint8)
@@ -193,8 +192,7 @@ def test_a_machine_file_names_the_raw_values_that_are_measurements() -> None:
 
 
 def test_a_signal_of_a_data_base_has_them_too() -> None:
-    text, _ = changed(TRIAXIAL, ('name = "x"', 'valid_raw = [-2000, 2000], name = "x"'))
-    machine = parse_machine_file(text, TRIAXIAL)
+    machine = parsed(TRIAXIAL, ('name = "x"', 'valid_raw = [-2000, 2000], name = "x"'))
     (stream,) = machine.streams
     assert frame_layout(machine, stream).valid_raw == {"x": (-2000.0, 2000.0)}
 

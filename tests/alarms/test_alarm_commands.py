@@ -11,10 +11,11 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import Consumer, eventually, running_mosquitto
+from support.brokers import Consumer, running_mosquitto
 from support.can_gateway import MACHINE, CanGateway
 from support.live_service import running
 from support.mqtt_publishing import mqtt, outputs
+from support.waiting import eventually
 
 from daqsvc import alarm_service, audit
 from daqsvc.acquisition.clock import DrivenClock

@@ -12,6 +12,7 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.clocks import SettableClock
 
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -162,22 +163,11 @@ class WalkingManager(AlarmManager):
             yield from self._quality([name], self._unjudged(name, now), now)
 
 
-class Clock:
-    def __init__(self):
-        self.t_ns = 5 * SECOND_NS
-
-    def monotonic_ns(self):
-        return self.t_ns
-
-    def wall_ns(self):
-        return self.t_ns + 10**18
-
-
 class Twins:
     """The same happens to both; what they say must be the same, in the same order."""
 
     def __init__(self):
-        self.clock = Clock()
+        self.clock = SettableClock(5 * SECOND_NS)
         self.journal = {}
         self.rules = list(RULES)
         self.start()
@@ -204,7 +194,7 @@ class Twins:
         assert +Counter(manager.shown) == +shown
 
     def take(self, detector, sensors, seconds, **fields):
-        self.clock.t_ns += seconds * SECOND_NS
+        self.clock.advance(seconds)
         diagnosis = Diagnosis("m", detector, self.clock.t_ns, "s", 0, 1, sensors=sensors, **fields)
         self.same([manager.take(diagnosis) for manager in self.both])
 
@@ -222,7 +212,7 @@ class Twins:
         self.same(said)
 
     def tick(self, seconds):
-        self.clock.t_ns += seconds * SECOND_NS
+        self.clock.advance(seconds)
         self.same([manager.tick() for manager in self.both])
 
     def condition(self, level):

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from support.clocks import SettableClock
 
 from daqsvc.alarms.alarm import FINDINGS
 from daqsvc.alarms.chatter import ChatterLimit
@@ -66,26 +67,6 @@ HOLD_KINDS = {
 }
 
 
-class SteppingClock:
-    """Both clocks by hand; the wall clock may be set."""
-
-    def __init__(self, t_ns, wall_ns):
-        self.t_ns, self.wall = t_ns, wall_ns
-
-    def advance(self, ns):
-        self.t_ns += ns
-        self.wall += ns
-
-    def monotonic_ns(self):
-        return self.t_ns
-
-    def wall_ns(self):
-        return self.wall
-
-    async def sleep_ns(self, duration_ns):
-        raise AssertionError("alarms wait for nobody")
-
-
 def own(event):
     return event.to_state if event.covered is None else event.covered
 
@@ -93,7 +74,7 @@ def own(event):
 class Alarms(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
-        self.clock = SteppingClock(5 * SECOND_NS, 10**18)
+        self.clock = SettableClock(5 * SECOND_NS, 10**18)
         self.numbers = itertools.count()
         self.journal = {}
         self.sequence = itertools.count(1)
@@ -160,7 +141,7 @@ class Alarms(RuleBasedStateMachine):
             assert event.to_level >= event.from_level
 
     def take(self, detector, seconds, **fields):
-        self.clock.advance(seconds * SECOND_NS)
+        self.clock.advance(seconds)
         before = dict(self.manager.alarms)
         diagnosis = Diagnosis(
             "m", detector, self.clock.monotonic_ns(), "s", 0, 1, sensors=SPEAKERS[detector], **fields
@@ -255,7 +236,7 @@ class Alarms(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([0, 1, 4, 35]))
     def wait(self, seconds):
-        self.clock.advance(seconds * SECOND_NS)
+        self.clock.advance(seconds)
         self.tell(self.manager.tick())
         now_ns = self.clock.monotonic_ns()
         for status in self.manager.alarms.values():
@@ -285,7 +266,7 @@ class Alarms(RuleBasedStateMachine):
     )
     def restart(self, down_s, step_ns, rebooted):
         before, then_ns = dict(self.manager.alarms), self.clock.monotonic_ns()
-        self.clock.advance(down_s * SECOND_NS)
+        self.clock.advance(down_s)
         self.clock.wall += step_ns
         self.settings_of_the_wall += step_ns != 0
         if rebooted:

@@ -7,7 +7,7 @@ import json
 import shutil
 
 import pytest
-from support.brokers import eventually
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService

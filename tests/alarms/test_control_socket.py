@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import eventually
 from support.small_disks import mounted
+from support.waiting import eventually
 
 from daqsvc import control
 from daqsvc.acquisition.clock import SystemClock

@@ -13,8 +13,9 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import eventually, free_port
+from support.brokers import free_port
 from support.can_gateway import MACHINE, CanGateway, daqsvc_run
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome

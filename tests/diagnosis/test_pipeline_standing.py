@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -56,18 +57,12 @@ async def write(ring: SampleRing, listener: Listener | None = None) -> None:
             await asyncio.sleep(0.001)
 
 
-async def until(said: list[Diagnosis], count: int) -> None:
-    async with asyncio.timeout(20):
-        while len(said) < count:
-            await asyncio.sleep(0.001)
-
-
 async def test_nothing_is_judged_by_a_stream_in_doubt() -> None:
     ring, listener, said = SampleRing("s", ("a",), 1000), Listener(), []
     pipeline = Pipeline({"s": ring}, [listener], said.append, SystemClock())
     running = asyncio.create_task(pipeline.run())
     await write(ring, listener)
-    await until(said, 1)
+    await eventually(lambda: len(said) >= 1, "that is stated")
     pipeline.stand("s", StreamState(DOUBT, proven=True))
     assert [(d.quality, d.reason, d.decision) for d in said[1:]] == [("missing", DOUBT, "N")]
     await write(ring)
@@ -75,7 +70,7 @@ async def test_nothing_is_judged_by_a_stream_in_doubt() -> None:
     pipeline.stand("s", StreamState())
     await write(ring)  # may have begun before the doubt was over
     await write(ring, listener)
-    await until(said, 3)
+    await eventually(lambda: len(said) >= 3, "that is stated")
     ring.close()
     await running
     assert [(w.first_index, w.skipped) for w in listener.windows] == [(0, 0), (40, 30)]
@@ -93,7 +88,7 @@ async def test_what_is_said_before_the_rate_is_known_waits_for_it() -> None:
     await asyncio.sleep(0.02)
     assert said == []
     pipeline.stand("s", StreamState())
-    await until(said, 2)
+    await eventually(lambda: len(said) >= 2, "that is stated")
     ring.close()
     await running
     assert [d.first_index for d in said] == [0, 10]

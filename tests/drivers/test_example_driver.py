@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from conformance.example_transport import LoggerDevice
 from conformance.rig import samples_of
-from support.brokers import eventually
 from support.example_packages import DETECTOR, DOCS, DRIVER, installed, lines_of
 from support.live_service import running
 from support.machine_files import problems_of
 from support.machine_mutations import toml
+from support.waiting import eventually
 
 from daqsvc.settings import describe, load_machine_file, parse_machine_file, registry
 from daqsvc.settings.packing import PackedLayout

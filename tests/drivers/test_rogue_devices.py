@@ -9,10 +9,10 @@ import tracemalloc
 from typing import TYPE_CHECKING
 
 import pytest
-from support.brokers import eventually
 from support.machine_files import LAVAL
 from support.rogue_buses import LAYOUT, machine_text
 from support.rogue_devices import WORST, RogueDevices, recording
+from support.waiting import eventually
 
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
@@ -124,7 +124,7 @@ async def test_the_worst_on_all_buses_at_once(tmp_path: Path, caplog: pytest.Log
 async def test_the_worst_on_all_buses_for_long(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("support.brokers.PATIENCE_S", 120.0)
+    monkeypatch.setattr("support.waiting.PATIENCE_S", 120.0)
     tracemalloc.start()
     try:
         await all_do_their_worst(KINDS, tmp_path, 2.0, rounds=3)

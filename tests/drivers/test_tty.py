@@ -10,9 +10,9 @@ import termios
 
 import numpy as np
 import pytest
+from support.clocks import QuickClock
 from support.modbus_lines import Rig, until
 
-from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.layouts import TrendLayout
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
@@ -28,13 +28,6 @@ TREND = TrendLayout(1, "input", RegisterRecord((RegisterField("x", 0, "int16"),)
 LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
 
 
-class HastyClock(SystemClock):
-    """Waits a tenth of what it is asked to."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await super().sleep_ns(duration_ns // 10)
-
-
 def told(caplog):
     return [record.message for record in caplog.records if "is a pseudo-terminal" in record.message]
 
@@ -47,7 +40,7 @@ async def test_modbus_units_on_a_pseudo_terminal_are_read_with_the_parity_of_the
     unit.put("input", 0, b"\0\7")
     server = ModbusRtuServer({1: unit}, tmp_path / "ttyUSB0")
     options = {"transport": "rtu", "serial_port": str(tmp_path / "ttyUSB0"), "timeout_ms": 100.0}
-    rig = Rig(options | ({"parity": parity} if parity else {}), {"s": (TREND, 100.0)}, clock=HastyClock())
+    rig = Rig(options | ({"parity": parity} if parity else {}), {"s": (TREND, 100.0)}, clock=QuickClock(10))
     with caplog.at_level(logging.WARNING):
         async with rig.running() as driver:
             for plugged in (1, 2):  # the second opening is another one for the warning, too
@@ -66,7 +59,7 @@ async def test_a_serial_device_on_a_pseudo_terminal_is_opened_and_opened_again(t
     blocks = []
     given = {"port": str(tmp_path / "port"), "framing": "lines", "parity": "even", "data_bits": 7}
     spec = StreamSpec("x", LINE, 100.0)
-    driver = SerialDriver(BusPort("ser0", given, [spec], HastyClock(), blocks.append))
+    driver = SerialDriver(BusPort("ser0", given, [spec], QuickClock(10), blocks.append))
     with caplog.at_level(logging.WARNING), PseudoTerminal(tmp_path / "port") as cable:
         for _ in range(2):  # the C library fails at the second attempt to set what the first could not
             task = asyncio.create_task(driver.run())

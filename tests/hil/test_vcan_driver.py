@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from support.can_standin import frame_bytes
-from support.running_drivers import CountingDevice, QuickClock, running, until
+from support.clocks import QuickClock
+from support.running_drivers import CountingDevice, running
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -57,7 +59,7 @@ async def test_frames_of_can_utils_become_samples(vcan: VcanLink, tmp_path: Path
         lines = [f"(1.{3000 * k:06}) {vcan.name} {frame}\n" for k, frame in enumerate(frames)]
         log.write_text("".join(lines))
         await call("canplayer", "-I", str(log))
-        await until(lambda: driver.streams["s"][0].frames_received == 2)
+        await eventually(lambda: driver.streams["s"][0].frames_received == 2)
     got = np.concatenate([block.samples for block in blocks])[:, 0]
     assert got.tolist() == [0.5, 1.0, 1.5, -0.5, -1.0, 16383.5]
     assert blocks[0].first_index == 0
@@ -77,7 +79,9 @@ async def test_what_cangen_sends_is_counted_as_candump_counts_it(vcan: VcanLink,
         async with asyncio.timeout(20):
             await dump.wait()
         counters = driver.counters
-        await until(lambda: counters.frames_unknown + counters.frames_remote + _of_stream(driver) == 2000)
+        await eventually(
+            lambda: counters.frames_unknown + counters.frames_remote + _of_stream(driver) == 2000
+        )
     seen = re.findall(r" ([0-9A-F]+)#", seen_by_candump.read_text())
     assert len(seen) == 2000
     expected: dict[str, int] = {}
@@ -130,16 +134,16 @@ async def test_a_link_that_goes_down_a_hundred_times_leaves_nothing_behind(vcan:
         await asyncio.sleep(0.1)
         before = held()
         for k in range(1, 101):
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             with vcan.sender() as sender:
                 for _ in range(3):
                     sender.send(frame_bytes(0x101, (3 * sent).to_bytes(2, "big") + bytes(6)))
                     sent += 1
-            await until(lambda: driver.streams["s"][0].frames_received == sent)  # noqa: B023
+            await eventually(lambda: driver.streams["s"][0].frames_received == sent)  # noqa: B023
             vcan.down()
-            await until(lambda: driver.link.losses == k)  # noqa: B023
+            await eventually(lambda: driver.link.losses == k)  # noqa: B023
             vcan.up()
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         after = held()
     assert after == before
     assert driver.streams["s"][0].samples_received == 3 * sent
@@ -151,15 +155,15 @@ async def test_an_adapter_that_is_unplugged_is_opened_again(vcan: VcanLink) -> N
     device = CountingDevice(3000.0, 3)
     async with running(driver):
         for k in range(1, 6):
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             with vcan.sender() as sender:
                 counter = 3 * device.frame() % 2**16
                 sender.send(frame_bytes(0x101, counter.to_bytes(2, "big") + bytes(6)))
-            await until(lambda: driver.streams["s"][0].frames_received == k)  # noqa: B023
+            await eventually(lambda: driver.streams["s"][0].frames_received == k)  # noqa: B023
             await asyncio.to_thread(vcan.remove)
-            await until(lambda: driver.link.losses == k and "No such device" in driver.link.reason)  # noqa: B023
+            await eventually(lambda: driver.link.losses == k and "No such device" in driver.link.reason)  # noqa: B023
             await asyncio.to_thread(vcan.add)
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
     counters, _ = driver.streams["s"]
     assert (counters.samples_received, counters.frames_rejected) == (15, 0)
     assert counters.samples_lost == device.samples_since_first - 15
@@ -170,15 +174,15 @@ async def test_bus_off_takes_the_link_down_until_the_controller_restarts(vcan: V
     async with running(driver):
         with vcan.sender() as sender:
             sender.send(frame_bytes(ERROR | 0x204, b"\0\x20\0\0\0\0\x80\x07"))
-            await until(lambda: driver.counters.controller_state == "error-passive")
+            await eventually(lambda: driver.counters.controller_state == "error-passive")
             assert driver.link.state == "up"
             sender.send(frame_bytes(ERROR | 0x40, bytes(8)))
-            await until(lambda: driver.link.state == "down")
+            await eventually(lambda: driver.link.state == "down")
             assert "restart-ms" in driver.link.reason
             sender.send(frame_bytes(ERROR | 0x100, bytes(8)))
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             sender.send(frame_bytes(0x101, bytes(8)))
-            await until(lambda: driver.streams["s"][0].frames_received == 1)
+            await eventually(lambda: driver.streams["s"][0].frames_received == 1)
     assert (driver.counters.bus_off, driver.counters.restarts, driver.link.losses) == (1, 1, 1)
     assert (driver.counters.tx_errors, driver.counters.rx_errors) == (128, 7)
     assert driver.counters.frames_error == 3

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from support.can_recordings import STREAMS, books, only_file, replayed
 from support.can_standin import frame_bytes
-from support.running_drivers import running, until
+from support.running_drivers import running
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort
@@ -87,7 +88,7 @@ async def recorded(vcan: VcanLink, folder: Path, log_format: str) -> tuple[CanDr
         await send_of_every_kind(vcan)
         async with asyncio.timeout(20):
             output, _ = await dump.communicate()
-        await until(lambda: driver.counters.frames_recorded == SENT)
+        await eventually(lambda: driver.counters.frames_recorded == SENT)
     return driver, output.decode()
 
 
@@ -156,7 +157,7 @@ async def test_the_whole_bus_is_recorded_unless_it_is_filtered(vcan: VcanLink, t
             with vcan.sender() as sender:
                 sender.send(frame_bytes(0x7FF, b"of no stream"[:8]))
                 sender.send(frame_bytes(0x101, bytes(8)))
-            await until(lambda: driver.streams["classic"][0].frames_received == 1)  # noqa: B023
+            await eventually(lambda: driver.streams["classic"][0].frames_received == 1)  # noqa: B023
         counts.append(driver.counters.frames_recorded)
     assert counts == [2, 1]
 
@@ -170,5 +171,5 @@ async def test_fd_frames_are_recorded_whatever_the_machine_file_says_of_fd(
         with vcan.sender() as sender:
             sender.send(frame_bytes(0x7FF, bytes(64), fd=True))
             sender.send(frame_bytes(0x101, bytes(8)))
-        await until(lambda: driver.streams["classic"][0].frames_received == 1)
+        await eventually(lambda: driver.streams["classic"][0].frames_received == 1)
     assert driver.counters.frames_recorded == 2

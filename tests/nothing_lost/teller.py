@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
 from nothing_lost.script import RULES, SENSORS, Script
+from support.clocks import SteppedClock
 from support.mqtt_publishing import mqtt, outputs
 
-from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.alarm_service import AlarmService
 from daqsvc.outbox.messages import event_id
@@ -38,15 +39,6 @@ if TYPE_CHECKING:
 
 QUICK_RETRY = Backoff(NS_PER_S // 20, NS_PER_S // 5)
 """Waits between connections that are short enough to see many outages in a minute."""
-
-
-class SteppedClock(SystemClock):
-    """The system's clocks, of which somebody sets the wall clock."""
-
-    wall_offset_s = 0
-
-    def wall_ns(self) -> int:
-        return super().wall_ns() + self.wall_offset_s * NS_PER_S
 
 
 @dataclass
@@ -123,7 +115,7 @@ class Teller:
         for step in steps:
             if step.pause_s:
                 await asyncio.sleep(step.pause_s)
-            self._clock.wall_offset_s = step.wall_offset_s
+            self._clock.ahead_ns = step.wall_offset_s * NS_PER_S
             self._under_way = []
             self._desk.take(step.diagnosis(self._desk.identity.machine, self._clock.monotonic_ns()))
             self._desk.outbox.telemetry(f"{self._desk.topics.base}/status", b'{"step": %d}' % step.number)
@@ -203,7 +195,7 @@ async def run(arguments: argparse.Namespace) -> None:
     untold = await first_untold(Witness.read(arguments.witness), desk.outbox)
     teller = Teller(desk, clock, arguments.witness)
     teller.write("started")
-    clock.wall_offset_s = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s
+    clock.ahead_ns = script.steps[min(untold, len(script.steps) - 1)].wall_offset_s * NS_PER_S
     await desk.resume(SENSORS)
     running = [asyncio.create_task(each.run()) for each in desk.outputs.values()]
     timekeeper = asyncio.create_task(desk.keep_time())

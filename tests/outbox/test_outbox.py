@@ -11,7 +11,8 @@ import sys
 import textwrap
 
 import pytest
-from support.brokers import eventually
+from support.clocks import SettableClock
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
@@ -235,16 +236,12 @@ async def test_a_file_that_cannot_be_read_is_replaced_by_what_can_be_saved(outbo
 
 
 async def test_numbers_go_on_though_everything_is_lost_and_the_wall_clock_was_set_back(tmp_path):
-    class SlowClock(SystemClock):
-        def wall_ns(self):
-            return 1
-
     path = tmp_path / "outbox.sqlite"
     first = await opened(path)
     last = await first.append(TOPIC, payload, retain=True)
     await first.close()
     path.unlink()
-    second = Outbox(path, SlowClock())
+    second = Outbox(path, SettableClock(wall_ns=1))
     await second.open()
     assert await second.append(TOPIC, payload, retain=True) > last
     await second.close()

@@ -9,7 +9,7 @@ import os
 import subprocess
 
 import pytest
-from support.brokers import eventually
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox import telemetry_file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.machine_files import LAVAL, changed, only_problem
+from support.machine_files import LAVAL, only_problem, parsed
 
 from daqsvc.assembly_store import outbox_limits
 from daqsvc.outbox.limits import MIB, NS_PER_DAY, OutboxLimits
@@ -13,8 +13,7 @@ DIRECTORY = 'directory = "/var/lib/daqsvc"'
 
 
 def limits_with(*lines):
-    text, _ = changed(LAVAL, (DIRECTORY, "\n".join([DIRECTORY, *lines, ""])))
-    return outbox_limits(parse_machine_file(text, LAVAL))
+    return outbox_limits(parsed(LAVAL, (DIRECTORY, "\n".join([DIRECTORY, *lines, ""]))))
 
 
 def test_what_is_not_said_has_the_limits_of_an_outbox_that_was_told_nothing():

@@ -8,9 +8,9 @@ import logging
 
 import numpy as np
 import pytest
-from support.brokers import eventually
 from support.live_service import play, running
 from support.small_disks import mounted
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService

@@ -10,9 +10,10 @@ import textwrap
 from collections import Counter
 
 import pytest
-from support.brokers import Consumer, eventually, free_port, running_mosquitto
+from support.brokers import Consumer, free_port, running_mosquitto
 from support.mqtt_publishing import mqtt, outputs
 from support.small_disks import failing, mounted
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService

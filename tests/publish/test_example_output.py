@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import eventually
 from support.example_packages import DOCS, OUTPUT, installed
 from support.live_service import play, running
 from support.machine_files import LAVAL, MOTOR, problems_of
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService

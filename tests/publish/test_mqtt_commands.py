@@ -11,8 +11,9 @@ import paho.mqtt.client as paho
 import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
-from support.brokers import PATIENCE_S, Consumer, TcpProxy, eventually, running_mosquitto
+from support.brokers import Consumer, TcpProxy, running_mosquitto
 from support.mqtt_publishing import Desk, commands, publishing, say
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
 from daqsvc.publish.mqtt.command_payloads import ResponsePayload

@@ -10,9 +10,10 @@ from collections import Counter
 
 import paho.mqtt.client as paho
 import pytest
-from support.brokers import PATIENCE_S, Consumer, TcpProxy, eventually, running_mosquitto
-from support.deaf_broker import DeafBroker
+from support.brokers import Consumer, TcpProxy, running_mosquitto
 from support.mqtt_publishing import CLOCK, publishing
+from support.picky_broker import PickyBroker, only_availability
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.delivery import IN_FLIGHT
@@ -154,7 +155,10 @@ async def test_a_connected_broker_without_traffic_is_reconnected_to_in_a_storm(o
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.05)
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)
     await append(outbox, 1)
-    async with DeafBroker() as broker, publishing(outbox, broker.port, "3.1.1") as publisher:
+    async with (
+        PickyBroker(only_availability) as broker,
+        publishing(outbox, broker.port, "3.1.1") as publisher,
+    ):
         await eventually(lambda: broker.connections >= 5, "it keeps trying")
         assert publisher._backoff.ceiling_ns >= 10_000_000 * 2**4, "each time after a longer wait"
     assert outbox.counters.sent == 0

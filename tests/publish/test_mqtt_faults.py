@@ -6,9 +6,9 @@ import asyncio
 import json
 
 import pytest
-from support.brokers import eventually
 from support.mqtt_publishing import publishing
 from support.picky_broker import PickyBroker, length_of
+from support.waiting import eventually
 
 from daqsvc.publish.mqtt import session
 from daqsvc.publish.mqtt.publisher import MqttPublisher

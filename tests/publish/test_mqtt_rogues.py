@@ -15,12 +15,13 @@ from types import SimpleNamespace
 import numpy as np
 import paho.mqtt.client as paho
 import pytest
-from support.brokers import Consumer, eventually
+from support.brokers import Consumer
 from support.live_service import play, running
 from support.mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
 from support.mqtt_publishing import commands, publishing
 from support.rogue_broker import CONSENT, RogueBroker
 from support.sparkplug_edge import Machine, edge_node
+from support.waiting import eventually
 from test_mqtt_schemas import rig
 
 from daqsvc.alarms.commands import CommandOutcome, Verb

@@ -9,11 +9,12 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
-from support.brokers import Consumer, eventually, running_mosquitto
+from support.brokers import Consumer, running_mosquitto
 from support.live_service import play, running
 from support.machine_files import MACHINES
 from support.mqtt_publishing import say
 from support.paths import ROOT
+from support.waiting import eventually
 
 from daqsvc.publish.schemas import PAYLOADS, schema_files
 from daqsvc.settings import parse_machine_file

@@ -8,9 +8,10 @@ import shutil
 import subprocess
 
 import pytest
-from support.brokers import Consumer, TcpProxy, eventually, free_port, listens, running_mosquitto
+from support.brokers import Consumer, TcpProxy, free_port, listens, running_mosquitto
 from support.mqtt_publishing import mqtt, output_port, running_output
 from support.tls_files import authority, self_signed, signed
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.publish.mqtt.certificates import CertificateError

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
-from support.machine_files import LAVAL, changed, only_problem
+from support.machine_files import LAVAL, only_problem, parsed
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.publish.home_assistant.settings import HomeAssistant
@@ -23,9 +24,7 @@ ROOT = 'topic_root = "daqsvc"'
 ALLOWED = 'allow = ["acknowledge", "shelve", "unshelve"]'
 
 
-def machine(*replacements):
-    text, _ = changed(LAVAL, *replacements)
-    return parse_machine_file(text, LAVAL)
+machine = partial(parsed, LAVAL)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import can
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from support.brokers import eventually
 from support.machine_files import MACHINES
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.service import Service

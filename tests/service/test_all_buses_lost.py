@@ -13,6 +13,7 @@ from conformance.rig import numbers_of, samples_of
 from conformance.serial_transport import CableDevice
 from conformance.transport import STREAM
 from conformance.virtual_can_transport import PER_FRAME, CanDevice
+from support.clocks import QuickClock
 from support.live_service import running
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
@@ -124,13 +125,6 @@ class ModbusDevice:
         self._server.stop()
 
 
-class QuickClock(SystemClock):
-    """Waits a tenth of what it is asked to: back-off is not what is tested here."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(duration_ns / NS_PER_S / 10)
-
-
 @pytest.mark.long
 async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) -> None:
     rng = np.random.default_rng(20)
@@ -149,7 +143,7 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
         "modbus": modbus,
     }
     sent = dict.fromkeys(devices, 0)
-    async with running(machine, tmp_path / "store", QuickClock()) as service:
+    async with running(machine, tmp_path / "store", QuickClock(10)) as service:
         modbus.serve(service)
 
         async def sample(seconds: float) -> None:

@@ -12,9 +12,9 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support import brokers
-from support.brokers import Consumer, eventually
+from support.brokers import Consumer
 from support.busy_service import Devices, busy_machine
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc import supervision
 from daqsvc.control import ControlError, ControlRequest, ask
@@ -36,7 +36,6 @@ WRITER = "outbox-writer"
 def _one_accident_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waits grow with each failure of a part that comes soon after another; these have nothing in common."""
     monkeypatch.setattr(supervision, "WELL_S", 0.1)
-    monkeypatch.setattr(brokers, "PATIENCE_S", 60.0)
 
 
 class KilledError(Exception):
@@ -103,7 +102,7 @@ class Victim:
             await eventually_async(lambda verb=verb: self._obeyed(verb), f"a command is obeyed after {what}")
         # A publisher that was killed again and again waits up to half a minute before each new connection.
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(4 * brokers.PATIENCE_S):
+            async with asyncio.timeout(4 * PATIENCE_S):
                 while len(self._consumer.on("/alarms/never")) < told + 2:
                     await asyncio.sleep(0.05)
         assert len(self._consumer.on("/alarms/never")) >= told + 2, f"both are told after {what}"
@@ -128,7 +127,7 @@ def _name(task: asyncio.Task[Any]) -> str:
 
 
 async def eventually_async(condition: Callable[[], Any], what: str) -> None:
-    for _ in range(100):
+    for _ in range(round(PATIENCE_S / 0.1)):
         if await condition():
             return
         await asyncio.sleep(0.1)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import can
 import numpy as np
 import pytest
-from support.brokers import eventually
 from support.live_service import running
 from support.machine_files import MACHINES
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.brokers import free_port
 from support.machine_files import LAVAL
+from support.waiting import PATIENCE_S
 
 from daqsvc.commands import process_guard
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from _pytest.mark import ParameterSet
 
 pytestmark = pytest.mark.integration
-PATIENCE_S = 60.0
 PATIENT_TURNS = 200
 """In place of two seconds, where a stop in order is looked for: this machine may have much else to do."""
 HANGS_S = 60.0

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, eventually, free_port
+from support.brokers import Consumer, free_port
 from support.live_service import play, running
+from support.waiting import eventually
 
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service

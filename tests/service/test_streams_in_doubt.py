@@ -9,11 +9,11 @@ import re
 from typing import TYPE_CHECKING
 
 import pytest
-from support.brokers import eventually
 from support.live_service import running
 from support.machine_files import LAVAL
 from support.rogue_buses import machine_text
 from support.rogue_devices import NOMINAL_HZ, Phase, RogueDevices
+from support.waiting import eventually
 
 from daqsvc.settings import parse_machine_file
 
@@ -65,8 +65,7 @@ async def test_streams_in_doubt_are_quality_alarms_and_no_others(tmp_path: Path)
 
 
 @pytest.mark.long
-async def test_streams_in_doubt_are_judged_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("support.brokers.PATIENCE_S", 60.0)
+async def test_streams_in_doubt_are_judged_again(tmp_path: Path) -> None:
     await be_in_doubt(tmp_path, and_recover=True)
 
 

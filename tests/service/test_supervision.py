@@ -9,7 +9,7 @@ import threading
 from typing import TYPE_CHECKING
 
 import pytest
-from support.brokers import eventually
+from support.waiting import eventually
 
 from daqsvc import supervision
 from daqsvc.acquisition.link import Backoff

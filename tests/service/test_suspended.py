@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, eventually, free_port
+from support.brokers import Consumer, free_port
 from support.can_gateway import MACHINE, SAMPLES_PER_FRAME, CanGateway, daqsvc_run
+from support.clocks import SteppedClock
 from support.live_service import play
+from support.waiting import eventually
 
-from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
+from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.states import AlarmState
@@ -45,16 +47,6 @@ latching = true
 """
 
 
-class SteppingClock(SystemClock):
-    """The system's clocks, with a wall clock that somebody sets."""
-
-    def __init__(self) -> None:
-        self.ahead_ns = 0
-
-    def wall_ns(self) -> int:
-        return super().wall_ns() + self.ahead_ns
-
-
 @contextlib.asynccontextmanager
 async def running(service: Service) -> AsyncIterator[None]:
     stop = asyncio.Event()
@@ -78,7 +70,7 @@ async def shake(service: Service, rms: float) -> None:
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
 async def test_a_wall_clock_that_steps_moves_no_alarm(step_ns: int, tmp_path: Path) -> None:
     recording = Recording(("accel",), noise(1.0), RATE_HZ, __file__, 0)  # type: ignore[arg-type]
-    clock = SteppingClock()
+    clock = SteppedClock()
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
         machine = for_recording(recording, "g", Setpoints(accel=(0.5, 5.0)), broker.url)
         service = Service(machine, tmp_path, clock)

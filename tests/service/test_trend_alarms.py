@@ -10,9 +10,9 @@ import sys
 
 import numpy as np
 import pytest
-from support.brokers import PATIENCE_S, eventually
 from support.live_service import running
 from support.machine_files import MACHINES, changed
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.alarms.status import AlarmStatus

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.machine_files import LAVAL, MACHINES, changed, only_problem
+from support.machine_files import LAVAL, MACHINES, changed, only_problem, parsed
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.assembly_alignment import alignment
@@ -31,8 +31,11 @@ def test_an_alignment_of_one_stream_is_of_no_effect() -> None:
 
 
 def test_an_error_that_is_a_fault_s_worth_of_phase_is_warned_of() -> None:
-    text, _ = changed(TWO_BUSES, ("max_error_us = 200.0", "max_error_us = 2000.0"))
-    (warning,) = [w for w in parse_machine_file(text, TWO_BUSES).warnings if "max_error_us" in w.key]
+    (warning,) = [
+        w
+        for w in parsed(TWO_BUSES, ("max_error_us = 200.0", "max_error_us = 2000.0")).warnings
+        if "max_error_us" in w.key
+    ]
     assert "2000 us are 18 deg of a revolution at 1500 rpm" in warning.message
     assert warning.remedy.startswith("write max_error_us = 1.11e+03 or less")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
-from support.machine_files import LAVAL, MOTOR, changed, only_problem, problems_of
+from support.machine_files import LAVAL, MOTOR, changed, only_problem, parsed, problems_of
 
 from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.flood import FloodLimit
@@ -13,7 +15,6 @@ from daqsvc.alarms.voting import VotingRule
 from daqsvc.assembly_alarms import alarm_handling, alarm_rules
 from daqsvc.detectors.levels import plugin as levels_plugin
 from daqsvc.detectors.levels.statements import Limits
-from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
 
 VOTING = """[[alarms]]
@@ -36,13 +37,11 @@ VOTES = ("[mqtt]", VOTING.replace("trip_multiply = 2.0\n", ""))
 STARTS = ("[mqtt]", START_UP.replace("[mqtt]", VOTING))
 
 
-def parsed(*replacements):
-    text, _ = changed(LAVAL, *replacements)
-    return parse_machine_file(text, LAVAL)
+machine_with = partial(parsed, LAVAL)
 
 
 def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
-    machine = parsed(STARTS)
+    machine = machine_with(STARTS)
     assert machine.warnings == ()
     rule = alarm_rules(machine)[-1]
     assert isinstance(rule, VotingRule)
@@ -54,12 +53,12 @@ def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
 
 
 def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():
-    handling = alarm_handling(parsed())
+    handling = alarm_handling(machine_with())
     assert handling.chatter == ChatterLimit(5, 60_000_000_000, 60_000_000_000)
     assert handling.flood == FloodLimit(10, 600_000_000_000)
     assert handling.start_up is None
     assert handling.shelve_at_most_s == 28_800.0
-    switched_off = parsed(
+    switched_off = machine_with(
         ("chatter_raises = 5", "chatter_raises = 0"),
         ("flood_alarms = 10", "flood_alarms = 0"),
         ("28_800.0", "60.0"),
@@ -69,7 +68,7 @@ def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():
 
 
 def test_a_start_up_is_recognised_by_what_the_file_says():
-    assert alarm_handling(parsed(STARTS)).start_up == StartUp(
+    assert alarm_handling(machine_with(STARTS)).start_up == StartUp(
         detector="rotor-bank",
         measure="speed",
         between=(100.0, 500.0),
@@ -79,7 +78,7 @@ def test_a_start_up_is_recognised_by_what_the_file_says():
 
 
 def test_evidence_and_group_reach_the_rules():
-    machine = parsed(('detector = "rotor-bank"', 'detector = "rotor-bank"\nevidence_nats = 18.0'))
+    machine = machine_with(('detector = "rotor-bank"', 'detector = "rotor-bank"\nevidence_nats = 18.0'))
     rule = alarm_rules(machine)[-1]
     assert rule == DiagnosisRule("rotor-fault", "rotor-bank", latching=rule.latching, evidence_nats=18.0)
     assert "18 nats at least" in describe(machine)
@@ -176,6 +175,6 @@ def test_a_machine_without_a_speed_has_no_start_up():
 
 
 def test_a_start_up_without_effect_is_a_warning():
-    (warning,) = parsed(("[mqtt]", START_UP)).warnings
+    (warning,) = machine_with(("[mqtt]", START_UP)).warnings
     assert warning.key == "alarm_handling.start_up"
     assert "no alarm has a trip_multiply" in warning.message

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, problems_of
+from support.machine_files import LAVAL, MACHINES, MOTOR, TRIAXIAL, changed, parsed, problems_of
 
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
@@ -227,8 +227,7 @@ def test_secrets_and_options_are_not_described():
 
 
 def test_warnings_come_last_in_the_description():
-    text, _ = changed(LAVAL, ("zero_v = -10.0 ", ""))
-    described = describe(parse_machine_file(text, LAVAL))
+    described = describe(parsed(LAVAL, ("zero_v = -10.0 ", "")))
     assert described.split("\n\n")[-1].startswith("Warnings: 1\n")
     assert "add the gap voltage with the shaft centred" in described.replace("\n    ", " ")
 

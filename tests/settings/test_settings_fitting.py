@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.machine_files import LAVAL, MOTOR, TRIAXIAL, changed, only_problem, problems_of
-
-from daqsvc.settings import parse_machine_file
+from support.machine_files import LAVAL, MOTOR, TRIAXIAL, only_problem, parsed, problems_of
 
 MOTOR_PEAK_ALARM = """[[alarms]]
 name = "drive-end-peak"
@@ -311,8 +309,7 @@ WARNINGS = [
 
 @pytest.mark.parametrize(("path", "replacements", "key", "words"), WARNINGS)
 def test_what_is_doubtful_is_a_warning(path, replacements, key, words):
-    text, _ = changed(path, *replacements)
-    (warning,) = parse_machine_file(text, path).warnings
+    (warning,) = parsed(path, *replacements).warnings
     assert warning.key == key
     assert words in warning.message
     assert warning.remedy

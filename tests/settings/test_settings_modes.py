@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
+from support.machine_files import LAVAL, MACHINES, changed, only_problem, parsed, problems_of
 
 from daqsvc.detectors.make import detectors
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
@@ -43,8 +43,12 @@ def test_twelve_modes_become_the_models_they_describe():
 
 
 def test_static_load_has_two_directions():
-    text, _ = changed(TWELVE, ("static_load_um = [0.0, -5.0]", "static_load_um = [7.0, 3.0]"))
-    modes = {mode.name: mode.rotor for mode in bank_of(parse_machine_file(text, TWELVE)).bank_modes}
+    modes = {
+        mode.name: mode.rotor
+        for mode in bank_of(
+            parsed(TWELVE, ("static_load_um = [0.0, -5.0]", "static_load_um = [7.0, 3.0]"))
+        ).bank_modes
+    }
     assert modes["L1"].rest == pytest.approx(0.07 - 0.07j)
 
 
@@ -179,8 +183,7 @@ def test_static_load_is_not_looked_for_with_ac_coupled_probes():
 
 
 def test_ac_coupled_probes_are_described_and_their_models_have_no_static_position():
-    text, _ = changed(LAVAL, ("angle_deg = 90.0", "angle_deg = 90.0\nac_coupled = true"))
-    machine = parse_machine_file(text, LAVAL)
+    machine = parsed(LAVAL, ("angle_deg = 90.0", "angle_deg = 90.0\nac_coupled = true"))
     assert "AC-coupled" in describe(machine)
     assert {mode.rotor.rest for mode in bank_of(machine).bank_modes} == {0.0}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.machine_files import LAVAL, MACHINES, MOTOR, changed, only_problem, problems_of
+from support.machine_files import LAVAL, MACHINES, MOTOR, changed, only_problem, parsed, problems_of
 
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
@@ -61,8 +61,7 @@ def starting_up(*more):
 
 
 def test_a_pump_becomes_detectors_rules_and_readings():
-    text, _ = changed(PUMP, ("[pipeline]", MQTT))
-    machine = parse_machine_file(text, PUMP)
+    machine = parsed(PUMP, ("[pipeline]", MQTT))
     assert machine.warnings == ()
     made = detectors(machine)
     assert [(type(one), one.name, one.block) for one in made] == [
@@ -107,14 +106,14 @@ def test_the_levels_of_a_window_are_described_as_one():
 
 
 def test_a_gap_voltage_of_a_proximity_probe_has_a_window_too():
-    machine = parse_machine_file(changed(LAVAL, ("[mqtt]", GAP_ALARM))[0], LAVAL)
+    machine = parsed(LAVAL, ("[mqtt]", GAP_ALARM))
     rule = alarm_rules(machine)[-1]
     assert rule.setpoint == Setpoint(alert=-8.0, deadband=0.2, alert_low=-12.0)
     assert "-12..-8 V" in describe(machine)
 
 
 def test_a_speed_that_is_polled_tells_of_a_start_up():
-    machine = parse_machine_file(changed(PUMP, *starting_up())[0], PUMP)
+    machine = parsed(PUMP, *starting_up())
     assert machine.warnings == ()
     assert alarm_handling(machine).start_up == StartUp(
         detector="levels/shaft-speed", measure="value", between=(100.0, 2700.0)
@@ -256,8 +255,9 @@ def test_a_waveform_that_is_polled_once_a_second_is_said_to_be_a_trend_value():
 
 
 def test_a_band_has_no_effect_on_trend_values():
-    text, _ = changed(PUMP, ("[pipeline.levels]", "[pipeline.levels]\nvelocity_band_hz = [2.0, 1000.0]\n#"))
-    (warning,) = parse_machine_file(text, PUMP).warnings
+    (warning,) = parsed(
+        PUMP, ("[pipeline.levels]", "[pipeline.levels]\nvelocity_band_hz = [2.0, 1000.0]\n#")
+    ).warnings
     assert warning.key == "pipeline.levels.velocity_band_hz"
     assert "a trend value has the band of its device" in warning.message
 

@@ -17,7 +17,8 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.unix_buses import PATIENCE_S, eventually, frame, numbers, running
+from support.unix_buses import frame, numbers, running
+from support.waiting import PATIENCE_S, eventually_blocking
 
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub, HubError, HubTakenError
@@ -52,7 +53,7 @@ def test_when_the_hub_ends_the_bus_is_lost_for_all_and_can_be_opened_again(bus_p
 def test_a_bus_that_all_have_left_is_gone_without_a_trace(bus_path: str, tmp_path: Path) -> None:
     with UnixBus(bus_path), UnixBus(bus_path):
         assert sorted(p.name for p in tmp_path.iterdir()) == ["can0", "can0.lock"]
-    eventually(lambda: not list(tmp_path.iterdir()), "socket and lock are removed")
+    eventually_blocking(lambda: not list(tmp_path.iterdir()), "socket and lock are removed")
 
 
 def test_many_may_come_first_at_once(bus_path: str) -> None:
@@ -123,7 +124,7 @@ def test_what_is_no_frame_is_counted_and_goes_no_further(bus_path: str, packets:
             os.write(one.fileno(), packet)
         one.send(frame(1))
         assert numbers(other, until=1) == [1]
-        eventually(lambda: hub.counters.frames == 1, "the hub has counted it")
+        eventually_blocking(lambda: hub.counters.frames == 1, "the hub has counted it")
         assert hub.counters.malformed == len(packets)
         stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         stranger.connect(bus_path)
@@ -212,7 +213,7 @@ def test_nothing_piles_up_for_an_end_that_only_sends(bus_path: str) -> None:
             for number in range(1000):
                 (one, other)[number % 2].send(frame(number), PATIENCE_S)
             assert other.recv(0.0) is None
-        eventually(lambda: hub.counters.frames == 1000, "all frames are taken")
+        eventually_blocking(lambda: hub.counters.frames == 1000, "all frames are taken")
         assert (hub.counters.delivered, hub.counters.lost) == (0, 0)
 
 
@@ -228,7 +229,7 @@ def test_each_frame_that_counts_as_sent_is_carried_even_by_a_bus_that_ends(bus_p
 
     with ThreadPoolExecutor(len(sent)) as pool, running(bus_path) as hub:
         done = [pool.submit(send, sender) for sender in range(len(sent))]
-        eventually(lambda: min(sent) > 100, "all are sending")
+        eventually_blocking(lambda: min(sent) > 100, "all are sending")
         hub.stop()
         for each in done:
             each.result()

@@ -11,7 +11,8 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.unix_buses import PATIENCE_S, eventually, frame, numbers, running
+from support.unix_buses import frame, numbers, running
+from support.waiting import PATIENCE_S, eventually_blocking
 
 from sim_hw.bus_socket import UnixBus
 
@@ -206,7 +207,7 @@ def test_the_notice_stands_where_frames_are_missing(bus_path: str) -> None:
             for _ in range(600):
                 node.send(can.Message(arbitration_id=sent, is_extended_id=True))
                 sent += 1
-            eventually(lambda: hub.counters.frames == sent, "the hub has it")  # noqa: B023 - called at once
+            eventually_blocking(lambda: hub.counters.frames == sent, "the hub has it")  # noqa: B023 - called at once
             expected = received
             for _ in range(300):
                 before = slow.frames_lost

@@ -13,18 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import Consumer, eventually
+from support.brokers import Consumer
 from support.live_service import running
 from support.machine_files import MACHINES, MOTOR
-from support.sim_processes import (
-    DOCUMENTATION,
-    PATIENCE_S,
-    PER_FRAME,
-    SCENARIOS,
-    VIRTUAL_RIG,
-    process,
-    summary_of,
-)
+from support.sim_processes import DOCUMENTATION, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process, summary_of
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.machine_files import MACHINES, MOTOR
-from support.sim_processes import DOCUMENTATION, PATIENCE_S, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process
+from support.sim_processes import DOCUMENTATION, PER_FRAME, SCENARIOS, VIRTUAL_RIG, process
+from support.waiting import PATIENCE_S
 
 from daqsvc.recording.recording import Recording
 from daqsvc.settings import load_machine_file

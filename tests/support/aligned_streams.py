@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,26 +13,30 @@ from daqsvc.acquisition.assembler import StreamAssembler
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from numpy.typing import NDArray
+
     from daqsvc.acquisition.alignment import AlignedBlock
     from daqsvc.acquisition.clock import DrivenClock
     from daqsvc.acquisition.samples import SampleBlock
+
+    Signal = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 START_NS = 5_000_000_000
 BLOCKS_PER_S = 100
 LATEST_NS = 5e6
 
 
-def uniform(n, rng):
+def uniform(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Anything from 0 to 5 ms."""
     return rng.uniform(0.0, LATEST_NS, n)
 
 
-def exponential(n, rng):
+def exponential(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """1.2 ms on average, without a limit."""
     return rng.exponential(1.2e6, n)
 
 
-def bursts(n, rng):
+def bursts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Every now and then some 25 blocks in a row are 1 to 4 ms later still: the host is busy."""
     late, at = uniform(n, rng), 0
     while at < n:
@@ -42,7 +46,7 @@ def bursts(n, rng):
     return late
 
 
-def busy(n, rng):
+def busy(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Uniform, but for two spells of 1 to 4 s in which all are 5 ms later still."""
     late = uniform(n, rng)
     for _ in range(2):
@@ -51,12 +55,12 @@ def busy(n, rng):
     return late
 
 
-def rarely_small(n, rng):
+def rarely_small(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """99 of 100 blocks are 2 to 5 ms late, the others 0 to 5."""
     return np.where(rng.random(n) < 0.01, rng.uniform(0.0, LATEST_NS, n), rng.uniform(2e6, LATEST_NS, n))
 
 
-def soft(n, rng):
+def soft(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """0 to 5 ms, with a probability that begins at nothing."""
     return LATEST_NS * np.sqrt(rng.random(n))
 
@@ -79,7 +83,7 @@ class Device:
     stream: str
     rate_hz: float = 6400.0
     ppm: float = 0.0
-    delays: Callable[[int, np.random.Generator], np.ndarray] = uniform
+    delays: Callable[[int, np.random.Generator], NDArray[np.float64]] = uniform
     latency_ns: float = 0.0
     begins_ns: float = START_NS
     silent_s: tuple[float, float] = (np.inf, np.inf)
@@ -94,12 +98,12 @@ class Device:
     def period_ns(self) -> float:
         return 1e9 / self.rate_hz / (1.0 + self.ppm * 1e-6)
 
-    def taken_ns(self, index: np.ndarray) -> np.ndarray:
+    def taken_ns(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
         """When samples are taken, in ns after `START_NS`."""
-        return self.begins_ns - START_NS + index * self.period_ns
+        return np.asarray(self.begins_ns - START_NS + index * self.period_ns, np.float64)
 
 
-def arrivals(device, duration_s, rng):
+def arrivals(device: Device, duration_s: float, rng: np.random.Generator) -> list[tuple[int, int]]:
     """Pairs of arrival time and block number, in order of arrival."""
     n = int(duration_s * BLOCKS_PER_S)
     taken_ns = device.taken_ns((np.arange(n) + 1) * device.per_block - 1)
@@ -108,12 +112,12 @@ def arrivals(device, duration_s, rng):
     come = rng.random(n) >= device.lost
     come &= (taken_ns < device.silent_s[0] * 1e9) | (taken_ns >= device.silent_s[1] * 1e9)
     device.blocks = int(come.sum())
-    return [(int(arrival_ns[k]), k) for k in np.flatnonzero(come)]
+    return [(int(arrival_ns[k]), int(k)) for k in np.flatnonzero(come)]
 
 
 def play(
     devices: Sequence[Device],
-    signal: Callable[[np.ndarray], np.ndarray],
+    signal: Signal,
     duration_s: float,
     seed: int,
     deliver: Callable[[SampleBlock], None],
@@ -161,12 +165,18 @@ class Rows:
     """
 
     first_index: int
-    samples: np.ndarray
-    error_ns: np.ndarray
+    samples: NDArray[np.float32]
+    error_ns: NDArray[np.float64]
 
 
 def aligned(
-    devices, signal, duration_s, seed, *, stalled_s=(np.inf, np.inf), **options
+    devices: Sequence[Device],
+    signal: Signal,
+    duration_s: float,
+    seed: int,
+    *,
+    stalled_s: tuple[float, float] = (np.inf, np.inf),
+    **options: Any,
 ) -> tuple[Aligner, Rows]:
     """The rows of a grid over devices, the reference first; checks that none is left out or doubled."""
     blocks: list[AlignedBlock] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -102,5 +102,6 @@ class Housing:
 
     def save(self, path: Path, name: str = "de") -> Path:
         """Write it as a file that states no rate."""
-        np.savez(path, **{name: self.samples})
+        arrays: dict[str, Any] = {name: self.samples}
+        np.savez(path, **arrays)
         return path

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import paho.mqtt.client as paho
 import pytest
+from paho.mqtt.enums import CallbackAPIVersion
+from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 LOOPBACK = "127.0.0.1"
-PATIENCE_S = 20.0
-"""How long to wait for what must happen before the test is given up; nothing is timed by it."""
 
 
 def mosquitto_program() -> str:
@@ -41,7 +41,8 @@ def mosquitto_program() -> str:
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
-        return probe.getsockname()[1]
+        port: int = probe.getsockname()[1]
+        return port
 
 
 class Mosquitto:
@@ -122,7 +123,7 @@ class Consumer:
         self._topic = topic
         self._subscribed = threading.Event()
         self._client = paho.Client(
-            paho.CallbackAPIVersion.VERSION2,
+            CallbackAPIVersion.VERSION2,
             client_id=f"consumer-{time.monotonic_ns()}",
             reconnect_on_failure=False,
         )
@@ -159,15 +160,6 @@ def listens(port: int) -> bool:
     return True
 
 
-async def eventually(condition: Callable[[], object], what: str) -> None:
-    """Wait until ``condition`` holds; the event loop goes on."""
-    until = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > until:
-            pytest.fail(f"waited {PATIENCE_S:g} s in vain until {what}")
-        await asyncio.sleep(0.01)
-
-
 class TcpProxy:
     """Stands between a client and a broker.
 
@@ -193,7 +185,8 @@ class TcpProxy:
 
     @property
     def port(self) -> int:
-        return self._server.sockets[0].getsockname()[1]
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
 
     def cut(self) -> None:
         """End every connection without a word."""

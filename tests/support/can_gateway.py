@@ -108,7 +108,8 @@ class CanGateway:
 
     @property
     def port(self) -> int:
-        return self._server.sockets[0].getsockname()[1]
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
 
     @contextlib.asynccontextmanager
     async def losing(self) -> AsyncIterator[None]:

@@ -5,45 +5,53 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-def double(numbers):
+    from numpy.typing import NDArray
+
+    Answer = tuple[Any, Sequence[NDArray[Any]]]
+
+
+def double(numbers: Sequence[float]) -> Answer:
     return {"pid": os.getpid()}, [2.0 * np.asarray(numbers), np.empty((0, 3))]
 
 
-def chatter():
+def chatter() -> Answer:
     sys.stdout.write("x" * 10_000)
     sys.stderr.write("y" * 10_000)
     return "said", []
 
 
-def take_memory(count):
+def take_memory(count: int) -> Answer:
     return float(np.ones(count).sum()), []
 
 
-def spin():
+def spin() -> NoReturn:
     while True:
         pass
 
 
-def crash():
+def crash() -> None:
     ctypes.string_at(0)
 
 
-def leave():
+def leave() -> NoReturn:
     os._exit(7)
 
 
-def fail():
+def fail() -> NoReturn:
     raise KeyError("no such thing")
 
 
-def grow(rows):
+def grow(rows: int) -> Answer:
     # What JSON says is little, what is announced is much.
     return None, [np.zeros(1)] * rows
 
 
-def spin_with(**_):
+def spin_with(**_: object) -> NoReturn:
     spin()

@@ -8,7 +8,7 @@ import pickle
 import struct
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import can
 import numpy as np
@@ -24,7 +24,7 @@ RATE_HZ = 1000
 SAMPLES = np.random.default_rng(5).normal(size=(60, 2))
 
 
-def _npz(**arrays: object) -> bytes:
+def _npz(**arrays: Any) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     return stream.getvalue()
@@ -32,7 +32,7 @@ def _npz(**arrays: object) -> bytes:
 
 def _mat(content: dict[str, object], *, packed: bool = True) -> bytes:
     stream = io.BytesIO()
-    savemat(stream, content, do_compression=packed)
+    savemat(cast("Any", stream), content, do_compression=packed)
     return stream.getvalue()
 
 

@@ -44,7 +44,7 @@ class FaultyBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         raise NotImplementedError
 
-    @property
+    @property  # type: ignore[misc]  # nobody sets it
     def state(self) -> can.BusState:
         return can.BusState.ERROR if self.dead else can.BusState.ACTIVE
 
@@ -55,4 +55,4 @@ class FaultyBus(can.BusABC):
 
 can.interfaces.BACKENDS["faulty"] = ("support.fake_can", "FaultyBus")
 # python-can froze the names when it was imported.
-can.util.VALID_INTERFACES = frozenset(can.interfaces.BACKENDS)
+can.util.VALID_INTERFACES = frozenset(can.interfaces.BACKENDS)  # type: ignore[attr-defined]

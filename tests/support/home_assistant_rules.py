@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 ROOT = {
     "device",
@@ -47,11 +48,11 @@ TEMPLATE = re.compile(
 )
 
 
-def rendered(template, payload):
+def rendered(template: str, payload: dict[str, Any]) -> str:
     """What Jinja makes of the templates that are used; any other template fails."""
     found = TEMPLATE.fullmatch(template)
     assert found, f"a template beyond what these rules know: {template}"
-    value = payload
+    value: Any = payload
     for dotted, bracketed in re.findall(r"\.([a-z]\w*)|\['([^'\\]+)'\]", found["path"]):
         value = value[dotted or bracketed]
     if found["given"] and not value.get(found["given"]):
@@ -61,7 +62,7 @@ def rendered(template, payload):
     return json.dumps(value) if found["json"] else str(value)
 
 
-def check_discovery(topic, payload):
+def check_discovery(topic: str, payload: dict[str, Any]) -> None:
     """Fail unless Home Assistant would take the message."""
     prefix, kind, object_id, last = topic.rsplit("/", 3)
     assert prefix
@@ -81,7 +82,7 @@ def check_discovery(topic, payload):
         _check_entity(entity)
 
 
-def _check_entity(entity):
+def _check_entity(entity: dict[str, Any]) -> None:
     assert set(entity) <= PLATFORMS[entity["platform"]], entity
     if entity["platform"] == "button":
         assert not set(entity["command_topic"]) & set("+#")

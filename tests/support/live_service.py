@@ -7,7 +7,7 @@ import contextlib
 from typing import TYPE_CHECKING, Any
 
 import can
-from support.brokers import eventually
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.service import Service

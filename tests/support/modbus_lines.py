@@ -6,12 +6,13 @@ import asyncio
 import contextlib
 import itertools
 import selectors
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pymodbus.transport import CommParams, CommType, ModbusProtocol
+from support.clocks import LoopClock
 
-from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
 from sim_hw.nodes.modbus_node import UnitConnection
@@ -35,7 +36,7 @@ class Rig:
         options: Mapping[str, Any],
         streams: Mapping[str, tuple[ModbusLayout, float]],
         *,
-        start: str = "retry",
+        start: Literal["error", "retry", "ignore"] = "retry",
         clock: Any = None,
     ) -> None:
         specs = [StreamSpec(name, layout, rate_hz) for name, (layout, rate_hz) in streams.items()]
@@ -113,19 +114,6 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         self._now_s += seconds
 
 
-class LoopClock:
-    """The event loop's own time as a `Clock`."""
-
-    def monotonic_ns(self) -> int:
-        return round(asyncio.get_running_loop().time() * NS_PER_S)
-
-    def wall_ns(self) -> int:
-        return self.monotonic_ns()
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(max(duration_ns, 0) / NS_PER_S)
-
-
 def simulate(main: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Run a coroutine in simulated time."""
     with asyncio.Runner(loop_factory=SimulatedLoop) as runner:
@@ -183,7 +171,7 @@ class Responder(ModbusProtocol):
         elif self._cable.end is self:
             self._cable.end = None
 
-    def callback_data(self, data: bytes, addr: tuple | None = None) -> int:
+    def callback_data(self, data: bytes, addr: tuple[Any, ...] | None = None) -> int:
         self._wire.feed(data)
         return len(data)
 
@@ -191,7 +179,10 @@ class Responder(ModbusProtocol):
 def options_of(*, serial: bool, **more: Any) -> dict[str, Any]:
     """Options of a bus at the near end of the null modem of a `Responder`."""
     if serial:
-        where = {"transport": "rtu", "serial_port": f"socket://__pymodbus_nullmodem:{Responder.PORT}"}
+        where: dict[str, Any] = {
+            "transport": "rtu",
+            "serial_port": f"socket://__pymodbus_nullmodem:{Responder.PORT}",
+        }
     else:
         where = {"transport": "tcp", "host": "__pymodbus_nullmodem", "tcp_port": Responder.PORT}
     return where | more

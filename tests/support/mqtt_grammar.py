@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import random
@@ -66,7 +66,7 @@ COMMAND = {
 }
 """A command in every respect, but far too old."""
 
-VALUES = (
+VALUES: tuple[Any, ...] = (
     None,
     True,
     -1,
@@ -117,7 +117,7 @@ def payload(dice: random.Random) -> bytes:
 def _command(dice: random.Random) -> bytes:
     """What is nearly a command."""
     kind = dice.randrange(4)
-    told = dict(COMMAND)
+    told: dict[str, Any] = dict(COMMAND)
     for _ in range(dice.randrange(3)):
         key = dice.choice((*COMMAND, "reason", "occurrence", "duration_s", "expires_s", "\ud800", "x"))
         told[key] = dice.choice(VALUES)

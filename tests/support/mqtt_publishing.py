@@ -8,7 +8,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import paho.mqtt.client as paho
-from support.brokers import PATIENCE_S
+from paho.mqtt.enums import CallbackAPIVersion
+from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import CommandOutcome
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.commands import AlarmCommand, CommandHandler
     from daqsvc.outbox.store import Outbox
     from daqsvc.publish.home_assistant.settings import HomeAssistant
     from daqsvc.publish.mqtt.link import MqttLink
@@ -124,17 +125,17 @@ def publishing(
 class Desk:
     """Accepts every command and keeps it."""
 
-    def __init__(self):
-        self.asked = []
+    def __init__(self) -> None:
+        self.asked: list[AlarmCommand] = []
 
-    async def __call__(self, command, source):
+    async def __call__(self, command: AlarmCommand, source: str) -> CommandOutcome:
         self.asked.append(command)
         return CommandOutcome(accepted=True, events=("edge-1-7",))
 
 
-def say(port, topic, payload, *, retain=False):
+def say(port: int, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
     """Publish once, from a client that goes away again."""
-    client = paho.Client(paho.CallbackAPIVersion.VERSION2, f"sayer-{time.monotonic_ns()}")
+    client = paho.Client(CallbackAPIVersion.VERSION2, f"sayer-{time.monotonic_ns()}")
     client.connect("127.0.0.1", port)
     client.loop_start()
     client.publish(topic, payload, qos=1, retain=retain).wait_for_publish(PATIENCE_S)

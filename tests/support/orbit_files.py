@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class Orbit:
         self.y: NDArray[np.float64] = z.imag + NOISE_UM * rng.standard_normal(len(z))
         self.keyphasor = np.where((angle / (2.0 * np.pi)) % 1.0 < 0.1, -2.0, -10.0)
 
-    def save(self, path: Path, **more: object) -> Path:
+    def save(self, path: Path, **more: Any) -> Path:
         """Write an ``.npz`` with x, y in um, the keyphasor in V, and the rate."""
         np.savez(path, x=self.x, y=self.y, keyphasor=self.keyphasor, fs=RATE_HZ, **more)
         return path

@@ -5,57 +5,65 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+Outcome = bool | None
+"""True to acknowledge a message, False to end the connection, None to answer nothing."""
 
 
 class PickyBroker:
     """Keeps what it takes.
 
     Args:
-        takes: from topic and size of the payload: True to acknowledge, False to end the connection, None to
-        say
-            nothing.
+        takes: from topic and size of the payload what becomes of a message.
         refuse: topics that are refused with reason code 0x87 (MQTT 5).
         refuse_once: whether the first alarm is refused as beyond the quota, 0x97 (MQTT 5).
     """
 
-    def __init__(self, takes, *, refuse=(), refuse_once=False):
+    def __init__(
+        self, takes: Callable[[str, int], Outcome], *, refuse: Iterable[str] = (), refuse_once: bool = False
+    ) -> None:
         self.takes = takes
         self.refuse = set(refuse)
         self.connections = 0
-        self.messages = []
-        self.retained = {}
+        self.messages: list[tuple[str, dict[str, Any]]] = []
+        self.retained: dict[str, dict[str, Any]] = {}
         self._refuse_once = refuse_once
-        self._server = None
-        self._writers = set()
+        self._server: Any = None
+        self._writers: set[asyncio.StreamWriter] = set()
 
-    async def __aenter__(self):
+    async def __aenter__(self) -> Self:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
         return self
 
-    async def __aexit__(self, *_):
+    async def __aexit__(self, *_: object) -> None:
         self._server.close()
         for writer in self._writers:
             writer.transport.abort()
 
     @property
-    def port(self):
-        return self._server.sockets[0].getsockname()[1]
+    def port(self) -> int:
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
 
-    def sequences(self, topic):
+    def sequences(self, topic: str) -> list[int]:
         return [told["sequence"] for of, told in self.messages if of == topic]
 
-    async def _serve(self, reader, writer):
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         await self._rest(reader, writer)
 
-    async def _rest(self, reader, writer):
+    async def _rest(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(asyncio.IncompleteReadError, OSError):
             while await self._packet(reader, writer):
                 pass
         self._writers.discard(writer)
         writer.close()
 
-    async def _packet(self, reader, writer):
+    async def _packet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         first = (await reader.readexactly(1))[0]
         body = await reader.readexactly(await length_of(reader))
         kind = first >> 4
@@ -73,7 +81,7 @@ class PickyBroker:
             writer.write(b"\xd0\x00")
         return kind != 14
 
-    def _publish(self, writer, first, body):
+    def _publish(self, writer: asyncio.StreamWriter, first: int, body: bytes) -> bool:
         end = 2 + int.from_bytes(body[:2], "big")
         topic, mid, rest = body[2:end].decode(), body[end : end + 2], body[end + 2 :]
         if self._mqtt5:
@@ -93,7 +101,12 @@ class PickyBroker:
         return taken is not False
 
 
-async def length_of(reader):
+def only_availability(topic: str, _size: int) -> Outcome:
+    """What a broker takes that looks healthy, and is deaf to everything else."""
+    return True if topic.endswith("/availability") else None
+
+
+async def length_of(reader: asyncio.StreamReader) -> int:
     """A remaining length (MQTT 5, section 1.5.5)."""
     value, shift = 0, 0
     while True:

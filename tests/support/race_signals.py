@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.signal import lfilter
 
 from daqsvc.bearing.catalogue import bearing_orders
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 RATE_HZ = 12_000.0
 SPEED_RPM = 1797.0
@@ -20,14 +25,14 @@ def strikes(
     seed: int = 0,
     rate_hz: float = RATE_HZ,
     speed_rpm: float = SPEED_RPM,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """A bearing with damage of one part, or none: slip, load zone, ringing at 3 kHz, noise, harmonics."""
     random = np.random.default_rng(seed)
     n = int(seconds * rate_hz)
     turn = speed_rpm / 60.0 / rate_hz * np.arange(n)
     x = random.standard_normal(n)
-    for harmonic, height in ((1, 0.5), (2, 0.3), (3, 0.2)):
-        x += height * np.cos(2 * np.pi * harmonic * turn + harmonic)
+    for harmonic, share in ((1, 0.5), (2, 0.3), (3, 0.2)):
+        x += share * np.cos(2 * np.pi * harmonic * turn + harmonic)
     if part is not None:
         order = {"inner": BEARING.inner, "outer": BEARING.outer, "ball": BEARING.ball_pass}[part]
         count = int(order * turn[-1]) + 2

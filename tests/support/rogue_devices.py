@@ -7,7 +7,7 @@ import contextlib
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import can
 import numpy as np
@@ -146,9 +146,8 @@ class ModbusRogue:
         spoilt = self._phase.damage or float(self._phase.values == "noise")
         if self._rng.random() >= spoilt:
             return PlannedReply()
-        return PlannedReply(
-            FAULTS[int(self._rng.integers(len(FAULTS)))], int(self._rng.integers(0, 20_000_000))
-        )  # type: ignore[arg-type]
+        fault: Any = FAULTS[int(self._rng.integers(len(FAULTS)))]
+        return PlannedReply(fault, int(self._rng.integers(0, 20_000_000)))
 
     def _counter(self) -> bytes:
         count = {
@@ -326,7 +325,9 @@ class RogueDevices(threading.Thread):
                     )
                 ]
                 found = (
-                    frame_id if phase.values != "noise" else int(rng.choice([frame_id, rng.integers(2048)]))
+                    frame_id
+                    if phase.values != "noise"
+                    else int(rng.choice(np.array([frame_id, rng.integers(2048)])))
                 )
                 self._send("can", found, data)
 

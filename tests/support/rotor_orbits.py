@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.vectors import HARMONICS
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
 
 RATE_HZ = 640.0
 PER_REV = 64
@@ -18,14 +22,20 @@ SPEED_RAD_S = 2.0 * math.pi * 10.0
 HEALTHY = np.array([-10.0j, 10.0 * complex(unbalance_response(1.0, 0.18)), 0.0, 0.0, 0.0])
 
 
-def orbits(vectors, noise_um=0.0, seed=0, per_rev=PER_REV, deviation=None):
+def orbits(
+    vectors: ArrayLike,
+    noise_um: float = 0.0,
+    seed: int = 0,
+    per_rev: int = PER_REV,
+    deviation: NDArray[np.float64] | None = None,
+) -> Revolutions:
     """Revolutions with the given synchronous vectors, ``[R, 5]``, in white noise on each probe."""
-    vectors = np.atleast_2d(vectors)
+    rows: NDArray[Any] = np.atleast_2d(vectors)
     theta = 2.0 * math.pi * np.arange(per_rev) / per_rev
-    z = vectors @ np.exp(1j * np.outer(HARMONICS, theta))
+    z = rows @ np.exp(1j * np.outer(HARMONICS, theta))
     rng = np.random.default_rng(seed)
     z = z.ravel() + noise_um * (rng.standard_normal(z.size) + 1j * rng.standard_normal(z.size))
-    count = len(vectors)
+    count = len(rows)
     period = np.full(count, float(per_rev)) / (1.0 + (0.0 if deviation is None else deviation))
     return Revolutions(
         first_index=0,

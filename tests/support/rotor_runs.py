@@ -12,6 +12,7 @@ import itertools
 import math
 import os
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +22,14 @@ from daqsvc.rotor.discretise import discretise
 from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant
 from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Models = Any
 
 PER_REV = 64
 DURATION = 2.0 * math.pi / PER_REV
@@ -60,7 +69,7 @@ TWELVE_MODES = (
     RotorMode("K1", stiffness_ratio=0.95),
     RotorMode("K2", stiffness_ratio=0.90),
 )
-TWELVE_PLANTS = {
+TWELVE_PLANTS: dict[str, dict[str, float]] = {
     "N": {},
     "U1": {"eccentricity": 0.13},
     "U2": {"eccentricity": 0.18},
@@ -81,18 +90,22 @@ def seeds(default: int) -> int:
     return int(os.environ.get("DAQSVC_SEEDS", default))
 
 
-def models(modes=TWELVE_MODES):
+def models(modes: Sequence[RotorMode] = TWELVE_MODES) -> Models:
     """Normalised models of modes at resonance."""
     return bank_modes(modes, ROTOR, 600.0)
 
 
-def true_models(modes=PAPER_MODES):
+def true_models(modes: Sequence[RotorMode] = PAPER_MODES) -> Models:
     """The same with the contact of the plant, which no bank knows; its observer needs little slack."""
-    contact = {"hertz_exponent": 1.5, "friction": 0.3, "contact_radius_um": 500.0 * CLEARANCE_UM}
+    contact: dict[str, Any] = {
+        "hertz_exponent": 1.5,
+        "friction": 0.3,
+        "contact_radius_um": 500.0 * CLEARANCE_UM,
+    }
     return bank_modes(modes, replace(ROTOR, **contact), 600.0, rub_process_noise=1e-3)
 
 
-def sigma(snr_db, healthy=HEALTHY):
+def sigma(snr_db: float, healthy: plant.PlantParameters = HEALTHY) -> float:
     """Standard deviation of the sensor noise in clearances, against the AC power of the healthy orbit."""
     return noise_sigma(abs(healthy.orbit_1x), snr_db)
 
@@ -110,26 +123,32 @@ class Run:
     begins: tuple[float, ...]
 
     @property
-    def angle(self):
+    def angle(self) -> Floats:
         return 2.0 * math.pi * self.motion.revolution
 
-    def xy(self, snr_db, seed):
+    def xy(self, snr_db: float, seed: int) -> Floats:
         """Measured positions in clearances, float64 ``[n, 2]``."""
         clean = np.column_stack((self.motion.x, self.motion.y))
         return clean + sigma(snr_db) * np.random.default_rng([seed, 7]).standard_normal(clean.shape)
 
-    def channels(self, snr_db, seed):
+    def channels(self, snr_db: float, seed: int) -> NDArray[np.float32]:
         """Float32 ``[n, 3]``: probes in micrometres and the keyphasor's voltage."""
         voltage = keyphasor_voltage(self.motion.revolution)
         voltage += 0.02 * np.random.default_rng([seed, 8]).standard_normal(len(voltage))
         return np.column_stack((CLEARANCE_UM * self.xy(snr_db, seed), voltage)).astype(np.float32)
 
 
-def run(changes, revolutions, seed, healthy=HEALTHY, process_noise=0.0):
+def run(
+    changes: Sequence[tuple[float, Mapping[str, float]]],
+    revolutions: float,
+    seed: int,
+    healthy: plant.PlantParameters = HEALTHY,
+    process_noise: float = 0.0,
+) -> Run:
     """Simulate; ``changes`` are pairs of revolution and altered parameters, dithered by up to half a turn."""
     rng = np.random.default_rng([seed, 1])
     begins = [at + rng.uniform(-0.5, 0.5) for at, _ in changes]
-    base = {name: getattr(healthy, name) for name in plant.PlantParameters.__slots__}
+    base: dict[str, Any] = {name: getattr(healthy, name) for name in plant.PlantParameters.__slots__}
     steps = [
         plant.Change(at, plant.PlantParameters(**{**base, **change}))
         for at, (_, change) in zip(begins, changes, strict=True)
@@ -141,13 +160,19 @@ def run(changes, revolutions, seed, healthy=HEALTHY, process_noise=0.0):
 
 
 @functools.cache
-def paper_run(seed, process_noise=0.0):
+def paper_run(seed: int, process_noise: float = 0.0) -> Run:
     """The paper's schedule: 170 s of normalised time in every mode, the last one longer."""
     changes = list(zip((27.06, 54.11, 81.17), PAPER_PLANTS.values(), strict=True))
     return run(changes, 161.17, seed, process_noise=process_noise)
 
 
-def genie_delays(observed, begins, modes, threshold_nats, snr_db):
+def genie_delays(
+    observed: tuple[Floats, Floats],
+    begins: Sequence[float],
+    modes: Models,
+    threshold_nats: float,
+    snr_db: float,
+) -> list[float]:
     """Delays of a detector that is told when each change happens, and to which mode.
 
     At the change the new mode's observer takes over the old one's estimate; the delay is over when the
@@ -170,7 +195,7 @@ def genie_delays(observed, begins, modes, threshold_nats, snr_db):
     states = np.zeros((len(modes), 4))
     # The observers of all modes run along; only the pair in question is looked at.
     edges = [0, *(math.ceil(at * PER_REV) for at in begins), len(xy)]
-    delays = []
+    delays: list[float] = []
     for old, (begin, end) in enumerate(itertools.pairwise(edges)):
         if old:
             handed = states[[old - 1]].copy()

@@ -7,21 +7,12 @@ import contextlib
 import time
 from typing import TYPE_CHECKING
 
-from daqsvc.acquisition.clock import SystemClock
+from support.waiting import eventually
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
 
     from drivers.can.driver import CanDriver
-
-PATIENCE_S = 20.0
-
-
-class QuickClock(SystemClock):
-    """Back-off at a hundredth of its length."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(duration_ns / 1e11)
 
 
 class CountingDevice:
@@ -56,7 +47,7 @@ class CountingDevice:
 async def running(driver: CanDriver) -> AsyncIterator[None]:
     """A driver that is up, and has been stopped afterwards."""
     async with begun(driver):
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         yield
 
 
@@ -70,10 +61,3 @@ async def begun(driver: CanDriver) -> AsyncIterator[None]:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-
-
-async def until(true: Callable[[], bool]) -> None:
-    """Wait until something is true."""
-    async with asyncio.timeout(PATIENCE_S):
-        while not true():
-            await asyncio.sleep(0.005)

@@ -11,7 +11,9 @@ from daqsvc.diagnosis.detector import Window
 from sim_hw.plants.sensors import keyphasor_voltage
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
@@ -22,7 +24,9 @@ FIRST = 10_000_000_000
 """Index of the first sample: the device has been running for long."""
 
 
-def channels_of(motion: Motion, noise_um: float, seed: int = 0, angles=(0.0, 90.0)) -> np.ndarray:
+def channels_of(
+    motion: Motion, noise_um: float, seed: int = 0, angles: Sequence[float] = (0.0, 90.0)
+) -> NDArray[np.float32]:
     """Float32 ``[n, 3]``: probes in um that point at ``angles``, in white noise, and the keyphasor in V."""
     rng = np.random.default_rng(seed)
     x, y = motion.in_um(CLEARANCE_UM)
@@ -32,7 +36,9 @@ def channels_of(motion: Motion, noise_um: float, seed: int = 0, angles=(0.0, 90.
     return np.column_stack((*noisy, voltage)).astype(np.float32)
 
 
-def windows(samples: np.ndarray, rate_hz: float, *, block: int, first_index: int = FIRST) -> Iterator[Window]:
+def windows(
+    samples: NDArray[np.float32], rate_hz: float, *, block: int, first_index: int = FIRST
+) -> Iterator[Window]:
     """Samples as a pipeline hands them on; the clock began with index 0."""
     period_ns = 1e9 / rate_hz
     for begin in range(0, len(samples), block):
@@ -42,7 +48,7 @@ def windows(samples: np.ndarray, rate_hz: float, *, block: int, first_index: int
 
 
 def feed(
-    detector: Detector, samples: np.ndarray, rate_hz: float, *, block: int, first_index: int = FIRST
+    detector: Detector, samples: NDArray[np.float32], rate_hz: float, *, block: int, first_index: int = FIRST
 ) -> list[Diagnosis]:
     """All that a detector says of samples."""
     taken = windows(samples, rate_hz, block=block, first_index=first_index)
@@ -52,21 +58,21 @@ def feed(
 # Ways to spoil channels in place.
 
 
-def dead(part):
+def dead(part: NDArray[np.float32]) -> None:
     part[:, 0] = 12.5
 
 
-def gone(part):
+def gone(part: NDArray[np.float32]) -> None:
     part[:, 0] = np.nan
 
 
-def infinite(part):
+def infinite(part: NDArray[np.float32]) -> None:
     part[:, 1] = -np.inf
 
 
-def half_gone(part):
+def half_gone(part: NDArray[np.float32]) -> None:
     part[np.arange(len(part)) % 3 > 0, :2] = np.nan
 
 
-def no_keyphasor(part):
+def no_keyphasor(part: NDArray[np.float32]) -> None:
     part[:, 2] = -10.0

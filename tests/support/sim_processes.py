@@ -10,6 +10,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from support.paths import ROOT
+from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 VIRTUAL_RIG = ROOT / "config" / "machines" / "virtual-rig.toml"
 DOCUMENTATION = ROOT / "docs" / "virtual-bus.md"
 SCENARIOS = ROOT / "config" / "scenarios"
-PATIENCE_S = 60.0
 PER_FRAME = 10
 """Samples in a frame of the virtual rig."""
 
@@ -76,4 +76,5 @@ async def summary_of(sim: subprocess.Popen[str]) -> dict[str, Any]:
     """What a simulator says at its end."""
     output, errors = await asyncio.to_thread(sim.communicate, timeout=PATIENCE_S)
     assert sim.returncode == 0, errors
-    return json.loads(output)
+    told: dict[str, Any] = json.loads(output)
+    return told

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from support.brokers import LOOPBACK, eventually
+from support.brokers import LOOPBACK
 from support.mqtt_publishing import mqtt, output_port
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -24,8 +26,13 @@ from daqsvc.publish.sparkplug.settings import Sparkplug
 from daqsvc.publish.topics import Topics
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable
+    from pathlib import Path
+
     from support.sparkplug_host import Host
 
+    from daqsvc.alarms.events import AlarmEvent
+    from daqsvc.diagnosis.record import Severity
     from daqsvc.outbox.store import Outbox
 
 CLOCK = SystemClock()
@@ -41,7 +48,7 @@ READINGS = (
 )
 
 
-def said(decision: str, severity: str = "alert", speed: float = 600.0) -> Diagnosis:
+def said(decision: str, severity: Severity = "alert", speed: float = 600.0) -> Diagnosis:
     return Diagnosis(
         machine="rig",
         detector="bank",
@@ -59,6 +66,10 @@ def said(decision: str, severity: str = "alert", speed: float = 600.0) -> Diagno
     )
 
 
+def _payload(event: AlarmEvent, sequence: int) -> bytes:
+    return alarm_payload(event, sequence, "series").to_json()
+
+
 class Machine:
     """Alarms into the outbox, as the service puts them there."""
 
@@ -68,19 +79,19 @@ class Machine:
             Identity("lab", "edge-1", "rig"), [DiagnosisRule(name, "bank") for name in alarms], CLOCK
         )
 
-    async def says(self, decision: str, severity: str = "alert") -> None:
+    async def says(self, decision: str, severity: Severity = "alert") -> None:
         await self._tell(self._manager.take(said(decision, severity)))
 
     async def shelves(self) -> None:
         command = AlarmCommand(verb=Verb.SHELVE, alarm="rotor-fault", by="me", duration_s=60.0)
         await self._tell(self._manager.execute(command))
 
-    async def _tell(self, events) -> None:
+    async def _tell(self, events: Iterable[AlarmEvent]) -> None:
         for event in events:
             topic = TOPICS.alarm("rig", event.alarm)
             await self._outbox.append(
                 topic,
-                lambda sequence, event=event: alarm_payload(event, sequence, "series").to_json(),
+                partial(_payload, event),
                 retain=True,
             )
 
@@ -92,7 +103,9 @@ class Machine:
 
 
 @contextlib.asynccontextmanager
-async def edge_node(outbox, tmp_path, *ports, primary_host=None, protocol="5"):
+async def edge_node(
+    outbox: Outbox, tmp_path: Path, *ports: int, primary_host: str | None = None, protocol: str = "5"
+) -> AsyncIterator[SparkplugEdge]:
     settings = Sparkplug(
         servers=tuple(f"mqtt://{LOOPBACK}:{port}" for port in ports),
         client_id="edge-1-sparkplug",
@@ -109,7 +122,7 @@ async def edge_node(outbox, tmp_path, *ports, primary_host=None, protocol="5"):
         await running
 
 
-def rebirth(*, value: object = True, name: str = REBIRTH, datatype: DataType = DataType.BOOLEAN) -> bytes:
+def rebirth(*, value: Any = True, name: str = REBIRTH, datatype: DataType = DataType.BOOLEAN) -> bytes:
     return encode(Payload(1, None, (Metric(name=name, timestamp_ms=1, datatype=datatype, value=value),)))
 
 

@@ -15,12 +15,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 import paho.mqtt.client as paho
+from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
-from support.brokers import LOOPBACK, PATIENCE_S
+from support.brokers import LOOPBACK
+from support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 def fields_of(raw: bytes) -> Iterator[tuple[int, Any]]:
@@ -84,7 +86,7 @@ class Seen:
 
 def metric_of(raw: bytes) -> SeenMetric:
     told = dict(fields_of(raw))
-    readers = {
+    readers: dict[int, Callable[[Any], Any]] = {
         10: lambda number: number,
         11: lambda number: number,
         12: lambda four: struct.unpack("<f", four)[0],
@@ -142,7 +144,7 @@ class Host:
         self._port = port
         self._subscribed = threading.Event()
         self._client = paho.Client(
-            paho.CallbackAPIVersion.VERSION2,
+            CallbackAPIVersion.VERSION2,
             client_id=f"host-{time.monotonic_ns()}",
             protocol=paho.MQTTv5,
             reconnect_on_failure=False,
@@ -155,7 +157,9 @@ class Host:
 
     def _take(self, _client: object, _userdata: object, message: paho.MQTTMessage) -> None:
         if "/STATE/" not in message.topic:
-            self.messages.append(seen(message.topic, message.payload, message.qos, retain=message.retain))
+            self.messages.append(
+                seen(message.topic, bytes(message.payload), message.qos, retain=message.retain)
+            )
 
     async def __aenter__(self) -> Self:
         await asyncio.to_thread(self._client.connect, LOOPBACK, self._port)
@@ -173,7 +177,7 @@ class Host:
     def names(self) -> dict[int, str]:
         """Names by alias, from all births so far."""
         births = [metric for message in self.of("NBIRTH", "DBIRTH") for metric in message.metrics]
-        return {metric.alias: metric.name for metric in births if metric.alias is not None}
+        return {metric.alias: str(metric.name) for metric in births if metric.alias is not None}
 
     def told(self, name: str, *, historical: bool) -> list[Any]:
         """Values of a metric in data messages, in order."""
@@ -194,4 +198,5 @@ class Host:
         self._client.publish(f"STATE/{self._host_id}", word, 1, retain=True).wait_for_publish(5.0)
 
     def ask(self, topic: str, payload: bytes) -> None:
-        self._client.publish(topic, payload, 0, properties=Properties(3)).wait_for_publish(5.0)
+        plain = Properties(3)  # type: ignore[no-untyped-call]
+        self._client.publish(topic, payload, 0, properties=plain).wait_for_publish(PATIENCE_S)

@@ -15,6 +15,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -91,7 +93,7 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.DNSName(host)
 
 
-def _pem(key: serialization.PrivateKeyTypes, encryption: serialization.KeySerializationEncryption) -> bytes:
+def _pem(key: PrivateKeyTypes, encryption: serialization.KeySerializationEncryption) -> bytes:
     return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
 
 

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import can
+from support.waiting import PATIENCE_S
 
 from sim_hw.bus_socket_hub import Hub
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PATIENCE_S = 20.0
-
 
 @contextlib.contextmanager
-def running(path: str, **options: int) -> Iterator[Hub]:
+def running(path: str, **options: Any) -> Iterator[Hub]:
     hub = Hub(path, **options)
     hub.start()
     try:
@@ -26,7 +24,7 @@ def running(path: str, **options: int) -> Iterator[Hub]:
         hub.stop()
 
 
-def frame(number: int, **fields: object) -> can.Message:
+def frame(number: int, **fields: Any) -> can.Message:
     return can.Message(arbitration_id=number, is_extended_id=False, data=number.to_bytes(4, "big"), **fields)
 
 
@@ -38,10 +36,3 @@ def numbers(bus: can.BusABC, wait_s: float = PATIENCE_S, until: int | None = Non
         if found[-1] == until:
             break
     return found
-
-
-def eventually(true, what: str) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.001)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from support.bearing_signals import healthy
-from support.machine_files import MACHINES, changed, only_problem, problems_of
+from support.machine_files import MACHINES, changed, only_problem, parsed, problems_of
 
 from daqsvc.bearing.catalogue import bearing_orders
 from daqsvc.bearing.identify_baseline import learn_baseline
@@ -32,8 +33,7 @@ MODEL = (
 )
 
 
-def machine(*replacements):
-    return parse_machine_file(changed(EXAMPLE, *replacements)[0], EXAMPLE)
+machine = partial(parsed, EXAMPLE)
 
 
 def detector(given, store=None):

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 from support.alarm_rig import RIG
-from support.modbus_lines import LoopClock, options_of, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import options_of, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing

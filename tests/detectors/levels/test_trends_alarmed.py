@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.alarm_rig import RIG, AlarmRig, SettableClock, kinds
+from support.alarm_rig import RIG, AlarmRig, kinds
+from support.clocks import SettableClock
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.alarms.handling import AlarmHandling

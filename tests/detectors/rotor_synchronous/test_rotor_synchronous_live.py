@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.brokers import eventually
 from support.live_service import play, running
 from support.machine_files import MACHINES
+from support.waiting import eventually
 
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file

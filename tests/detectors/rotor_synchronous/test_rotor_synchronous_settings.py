@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
-from support.machine_files import LAVAL, MACHINES, changed, only_problem, problems_of
+from support.machine_files import LAVAL, MACHINES, changed, only_problem, parsed, problems_of
 from support.run_ups import RATE_HZ, record
 
 from daqsvc.assembly_alarms import alarm_rules
@@ -24,8 +25,7 @@ TABLE = "[pipeline.rotor_synchronous]"
 KEYPHASOR = 'keyphasor = "keyphasor"          #'
 
 
-def machine(*replacements):
-    return parse_machine_file(changed(EXAMPLE, *replacements)[0], EXAMPLE)
+machine = partial(parsed, EXAMPLE)
 
 
 def detector(given):

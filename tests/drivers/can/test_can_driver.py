@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
+from support.clocks import QuickClock
 from support.fake_can import FaultyBus
-from support.running_drivers import QuickClock, begun, until
+from support.running_drivers import begun
+from support.waiting import eventually
 
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can.driver import CanDriver
@@ -71,13 +73,13 @@ async def test_frames_of_a_virtual_bus_become_blocks() -> None:
     options = {"interface": "virtual", "channel": "test_frames_become_blocks", "fd": True}
     driver = CanDriver(port(blocks, options=options))
     async with begun(driver):
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         with can.Bus(
             interface="virtual", channel=options["channel"], protocol=can.CanProtocol.CAN_FD
         ) as sender:
             for frame in range(100):
                 sender.send(message(frame))
-            await until(lambda: driver.streams["shaft"][0].samples_received == 100 * PER_FRAME)
+            await eventually(lambda: driver.streams["shaft"][0].samples_received == 100 * PER_FRAME)
     got = np.concatenate([b.samples for b in blocks])
     assert (got[:, 0] == np.repeat(np.arange(100), PER_FRAME)).all()
     assert blocks[0].first_index == 0
@@ -102,7 +104,7 @@ async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCapt
             for k, stray in enumerate(strays):
                 FaultyBus.inbox.put(stray)
                 FaultyBus.inbox.put(message(k))
-            await until(lambda: driver.streams["shaft"][0].frames_received == len(strays) + 1)
+            await eventually(lambda: driver.streams["shaft"][0].frames_received == len(strays) + 1)
     counters = driver.streams["shaft"][0]
     assert driver.counters.frames_unknown == 5
     assert driver.counters.unknown_ids == {"0x7ff (11 bit)": 3, "0x101 (29 bit)": 2}
@@ -135,14 +137,14 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
         async with begun(driver):
             for frame in range(5):
                 FaultyBus.inbox.put(message(frame))
-            await until(lambda: driver.streams["shaft"][0].frames_received == 5)
+            await eventually(lambda: driver.streams["shaft"][0].frames_received == 5)
             FaultyBus.open_errors += [can.CanInitializationError("still away")] * 3
             FaultyBus.inbox.put(failure)
-            await until(lambda: driver.link.losses == 1)
-            await until(lambda: FaultyBus.opened == 2)
+            await eventually(lambda: driver.link.losses == 1)
+            await eventually(lambda: FaultyBus.opened == 2)
             for frame in range(7, 12):
                 FaultyBus.inbox.put(message(frame))
-            await until(lambda: driver.streams["shaft"][0].samples_received >= 10 * PER_FRAME)
+            await eventually(lambda: driver.streams["shaft"][0].samples_received >= 10 * PER_FRAME)
     assert driver.streams["shaft"][0].samples_lost == 2 * PER_FRAME
     assert driver.streams["shaft"][0].samples_received == 10 * PER_FRAME
     said = [r.message for r in caplog.records]
@@ -156,11 +158,11 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
 async def test_an_adapter_that_reports_bus_off_by_its_state_is_opened_again() -> None:
     driver = CanDriver(port([]))
     async with begun(driver):
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         FaultyBus.dead = True
-        await until(lambda: driver.counters.bus_off >= 1)
+        await eventually(lambda: driver.counters.bus_off >= 1)
         FaultyBus.dead = False
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
 
 
 async def test_a_hundred_losses_leave_no_thread_behind() -> None:
@@ -171,11 +173,11 @@ async def test_a_hundred_losses_leave_no_thread_behind() -> None:
     before = threading.active_count()
     async with begun(driver):
         for k in range(100):
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             FaultyBus.inbox.put(message(k))
             FaultyBus.inbox.put(can.CanOperationError("down"))
-            await until(lambda k=k: driver.link.losses == k + 1)
-        await until(lambda: driver.link.state == "up")
+            await eventually(lambda k=k: driver.link.losses == k + 1)
+        await eventually(lambda: driver.link.state == "up")
         assert sum(t.name.startswith("can-reader") for t in threading.enumerate()) == 1
     assert FaultyBus.closed == FaultyBus.opened
     assert driver.streams["shaft"][0].samples_received == 100 * PER_FRAME
@@ -194,7 +196,7 @@ async def test_absent_at_start_follows_the_policy() -> None:
     FaultyBus.open_errors = [OSError("no"), can.CanInitializationError("no"), ValueError("no")]
     retrying = CanDriver(port([]))
     async with begun(retrying):
-        await until(lambda: retrying.link.state == "up")
+        await eventually(lambda: retrying.link.state == "up")
     assert retrying.counters.open_failures == 3
 
 
@@ -204,7 +206,7 @@ async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
     async with begun(driver):
         for frame in (0, 1, 3):
             FaultyBus.inbox.put(message(frame))
-        await until(lambda: driver.streams["shaft"][0].frames_received == 3)
+        await eventually(lambda: driver.streams["shaft"][0].frames_received == 3)
         assert not blocks
     assert [b.first_index for b in blocks] == [0, 3 * PER_FRAME]
     assert blocks[1].lost_before == PER_FRAME
@@ -215,8 +217,8 @@ async def test_the_virtual_bus_tells_of_its_overflows_as_a_controller_does(tmp_p
     blocks: list[SampleBlock] = []
     driver = CanDriver(port(blocks, options={"interface": "unixbus", "channel": path, "fd": True}))
     async with begun(driver):
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         with can.Bus(interface="unixbus", channel=path, fd=True, hub="join") as peer:
             peer.send(overflow_message(0.0, path))
-            await until(lambda: driver.counters.frames_error == 1)
+            await eventually(lambda: driver.counters.frames_error == 1)
     assert (driver.counters.rx_overflows, driver.counters.overruns) == (1, 1)

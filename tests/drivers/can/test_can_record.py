@@ -27,7 +27,9 @@ from support.can_recordings import (
     traffic,
 )
 from support.can_standin import StandInBus, frame_bytes
-from support.running_drivers import running, until
+from support.clocks import SettableClock
+from support.running_drivers import running
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from drivers.base import BusPort
@@ -77,7 +79,7 @@ async def test_a_recording_replays_as_the_bus_was_received(
         for at in range(0, len(sent), 50):
             assert bus.send(sent[at : at + 50]) == len(sent[at : at + 50])
             await asyncio.sleep(0.002)
-        await until(lambda: driver.streams["dbc"][0].frames_received == 120)
+        await eventually(lambda: driver.streams["dbc"][0].frames_received == 120)
     assert (driver.counters.frames_recorded, driver.counters.frames_unrecorded) == (len(sent), 0)
     path = only_file(tmp_path)
     assert re.fullmatch(rf"can0-\d{{8}}T\d{{6}}\.\d{{6}}Z\{ENDINGS[log_format]}", path.name)
@@ -142,19 +144,13 @@ def test_a_candump_log_says_what_error_and_remote_frames_say(tmp_path: Path) -> 
 
 
 def test_a_step_of_the_wall_clock_is_no_step_between_frames(tmp_path: Path) -> None:
-    class Stepped(DrivenClock):
-        step_ns = 0
-
-        def wall_ns(self) -> int:
-            return super().wall_ns() + self.step_ns
-
-    clock = Stepped(wall_start_ns=1_790_000_000 * NS_PER_S)
+    clock = SettableClock(NS_PER_S, 1_790_000_000 * NS_PER_S)
     logs = LogFolder(tmp_path, "can0", "candump", file_bytes=2000.0, keep_bytes=1e9)
     made, counters = recorder(logs, clock)
     made.take(batch(0, 10))
     while counters.frames_recorded < 10:
         os.sched_yield()
-    clock.step_ns = -3600 * NS_PER_S
+    clock.set_wall(-3600)
     made.take(batch(10, 100))  # in the same file, which is full with it
     while counters.frames_recorded < 110:
         os.sched_yield()
@@ -272,10 +268,10 @@ async def test_files_that_the_system_limits_go_on_in_others(bus: StandInBus, tmp
             for at in range(0, 3000, 100):
                 bus.send(sent[at : at + 100])
                 counters = driver.counters
-                await until(lambda: counters.frames_recorded + counters.frames_unrecorded == at + 100)  # noqa: B023
+                await eventually(lambda: counters.frames_recorded + counters.frames_unrecorded == at + 100)  # noqa: B023
             await asyncio.sleep(1.1)  # until it is tried again
             bus.send(sent[:1])
-            await until(lambda: counters.frames_recorded + counters.frames_unrecorded == 3001)
+            await eventually(lambda: counters.frames_recorded + counters.frames_unrecorded == 3001)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert driver.counters.frames_unrecorded > 0
@@ -329,7 +325,7 @@ async def test_a_folder_that_cannot_be_written_stops_nothing(
     sent = traffic(20)
     async with running(driver):
         bus.send(sent)
-        await until(lambda: driver.counters.frames_unrecorded == len(sent))
+        await eventually(lambda: driver.counters.frames_unrecorded == len(sent))
     assert driver.streams["fd"][0].frames_received == 20
     assert driver.counters.frames_recorded == 0
     said = [r.getMessage() for r in caplog.records if "recorded" in r.getMessage()]
@@ -362,7 +358,7 @@ async def test_a_slow_disk_costs_its_own_frames_only(
         for at in range(0, len(sent), 100):
             bus.send(sent[at : at + 100])
             await asyncio.sleep(0.001)
-        await until(lambda: driver.streams["dbc"][0].frames_received == 1000)
+        await eventually(lambda: driver.streams["dbc"][0].frames_received == 1000)
         assert driver.counters.frames_recorded == 0
         assert driver.counters.frames_unrecorded >= len(sent) - 500
         go_on.set()
@@ -384,7 +380,7 @@ async def test_a_disk_that_hangs_does_not_keep_the_service_from_stopping(
     driver = recorded_driver(bus, folder(tmp_path, "blf"))
     async with running(driver):
         bus.send(sent)
-        await until(lambda: driver.streams["dbc"][0].frames_received == 10)
+        await eventually(lambda: driver.streams["dbc"][0].frames_received == 10)
     assert driver.counters.frames_unrecorded == len(sent)
     assert any("within 0.05 s and are given up" in record.getMessage() for record in caplog.records)
     go_on.set()
@@ -425,12 +421,12 @@ async def test_a_file_that_somebody_deletes_is_begun_anew(bus: StandInBus, tmp_p
     driver = recorded_driver(bus, folder(tmp_path, "candump"))
     async with running(driver):
         bus.send(traffic(1))
-        await until(lambda: driver.counters.frames_recorded == 4)
+        await eventually(lambda: driver.counters.frames_recorded == 4)
         path = only_file(tmp_path)
         path.unlink()
         for k in (1, 2):  # what is written to the deleted file is gone with it
             bus.send([frame_bytes(0x300, bytes([k]))])
-            await until(lambda: driver.counters.frames_recorded == 4 + k)  # noqa: B023
+            await eventually(lambda: driver.counters.frames_recorded == 4 + k)  # noqa: B023
     path = only_file(tmp_path)
     assert path.read_text().endswith(" 300#02\n")
 
@@ -439,11 +435,11 @@ async def test_the_recording_outlives_the_link(bus: StandInBus, tmp_path: Path) 
     driver = recorded_driver(bus, folder(tmp_path, "blf"))
     async with running(driver):
         for k in range(3):
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             bus.send([frame_bytes(0x101, bytes([0, 3 * k, *bytes(6)]))])
-            await until(lambda: driver.streams["classic"][0].frames_received == k + 1)  # noqa: B023
+            await eventually(lambda: driver.streams["classic"][0].frames_received == k + 1)  # noqa: B023
             bus.unplug()
-            await until(lambda: driver.link.losses == k + 1)  # noqa: B023
+            await eventually(lambda: driver.link.losses == k + 1)  # noqa: B023
             bus.plug_in()
     path = only_file(tmp_path)
     assert len(numbers(path)) == driver.counters.frames_recorded == 3

@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import can
@@ -15,6 +14,7 @@ import pytest
 from support.brokers import free_port
 from support.can_recordings import numbers
 from support.paths import ROOT
+from support.waiting import PATIENCE_S, eventually_blocking
 
 from daqsvc.commands.record import ENDINGS
 from daqsvc.commands.signals import signals_to_end
@@ -22,20 +22,12 @@ from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
 pytestmark = pytest.mark.integration
 RIG = ROOT / "config" / "machines" / "virtual-rig.toml"
-PATIENCE_S = 60.0
 FRAMES = 300
-
-
-def eventually(true: Callable[[], bool], what: str) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < until_s, what
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -91,7 +83,7 @@ def send_until_it_is_recorded(bus: UnixBus, log: Path) -> int:
         sent += 1
         return log.exists() and log.stat().st_size > 0
 
-    eventually(arrived, "nothing is recorded")
+    eventually_blocking(arrived, "nothing is recorded")
     return sent
 
 
@@ -103,7 +95,7 @@ def test_what_is_recorded_is_printed_when_it_is_stopped(
     with recording(machine, "--out", log) as process:
         sent = send_until_it_is_recorded(bus, log)
         send(bus, 1, FRAMES)
-        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        eventually_blocking(lambda: _last(log) == FRAMES, "the frames do not come into the file")
         # All of them end it alike; SIGHUP comes when its terminal goes.
         process.send_signal(signals_to_end()[ENDINGS.index(ending) % len(signals_to_end())])
         output, said = process.communicate(timeout=PATIENCE_S)
@@ -127,7 +119,7 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_written(
     with recording(machine, "--bus", "can0", "--out", log) as process:
         send_until_it_is_recorded(bus, log)
         send(bus, 1, FRAMES)
-        eventually(lambda: _last(log) == FRAMES, "the frames do not come into the file")
+        eventually_blocking(lambda: _last(log) == FRAMES, "the frames do not come into the file")
         process.kill()
     with can.LogReader(log) as reader:
         times = [message.timestamp for message in reader]
@@ -180,11 +172,11 @@ def test_the_service_records_while_it_watches(machine: Path, tmp_path: Path) -> 
     daqsvc = [sys.executable, "-m", "daqsvc"]
     with subprocess.Popen([*daqsvc, "run", str(machine), "--store", str(tmp_path / "store")]) as service:
         try:
-            eventually((tmp_path / "bus").exists, "the service does not open its bus")
+            eventually_blocking((tmp_path / "bus").exists, "the service does not open its bus")
             command = [*daqsvc, "sim", str(machine), "--scenario", "healthy", "--duration", "2"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
             sent = json.loads(done.stdout)["streams"]["shaft"]["samples_sent"]
-            eventually(lambda: _last_count(folder) == sent - 10, "the last frame is not recorded")
+            eventually_blocking(lambda: _last_count(folder) == sent - 10, "the last frame is not recorded")
             service.send_signal(signal.SIGTERM)
             assert service.wait(PATIENCE_S) == 0
         finally:

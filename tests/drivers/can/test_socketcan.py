@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.can_standin import frame_bytes
+from support.clocks import SettableClock
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from drivers.base import StreamSpec
@@ -170,56 +171,44 @@ def test_an_interface_that_cannot_be_opened_says_why() -> None:
         open_socketcan({"channel": "can0", "options": {"bitrat": 1}}, [], SystemClock())
 
 
-class SteppingClock(SystemClock):
-    """Both clocks are set by the test."""
-
-    def __init__(self) -> None:
-        self.now_ns = 100 * NS_PER_S
-        self.wall_offset_ns = 1_700_000_000 * NS_PER_S
-
-    def monotonic_ns(self) -> int:
-        return self.now_ns
-
-    def wall_ns(self) -> int:
-        return self.now_ns + self.wall_offset_ns
-
-
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.5, -0.5])
 def test_a_step_of_the_wall_clock_moves_no_arrival(step_s: float) -> None:
-    clock = SteppingClock()
+    clock = SettableClock(100 * NS_PER_S, 1_700_000_100 * NS_PER_S)
     time = KernelTime(clock)
     none = np.zeros(4, np.int64)
-    true_ns = clock.now_ns + np.array([1, 2, 3, 4]) * 1_000_000_000
-    stamps = true_ns + clock.wall_offset_ns
-    clock.now_ns += 5 * NS_PER_S
-    clock.wall_offset_ns += round(step_s * NS_PER_S)
+    true_ns = clock.t_ns + np.array([1, 2, 3, 4]) * 1_000_000_000
+    stamps = true_ns + (clock.wall - clock.t_ns)
+    clock.advance(5)
+    clock.set_wall(step_s)
     stamps[3] += round(step_s * NS_PER_S)  # came after the step
     got = time.monotonic(stamps, none, drained=True)
     if abs(step_s) > 10:
         assert (got == true_ns).all()
     else:  # which side of the step a stamp lies on cannot be told: late by the step at most, never early
         assert ((got - true_ns >= 0) & (got - true_ns <= abs(step_s) * NS_PER_S)).all()
-    later = clock.now_ns + np.array([1, 2, 3, 4], np.int64)
-    clock.now_ns += NS_PER_S
-    assert (time.monotonic(later + clock.wall_offset_ns, none, drained=True) == later).all()
+    later = clock.t_ns + np.array([1, 2, 3, 4], np.int64)
+    clock.advance(1)
+    assert (time.monotonic(later + (clock.wall - clock.t_ns), none, drained=True) == later).all()
 
 
 def test_a_frame_without_a_stamp_came_when_it_was_read() -> None:
-    clock = SteppingClock()
+    clock = SettableClock(100 * NS_PER_S, 1_700_000_100 * NS_PER_S)
     got = KernelTime(clock).monotonic(np.zeros(2, np.int64), np.zeros(2, np.int64), drained=True)
-    assert got.tolist() == [clock.now_ns] * 2
+    assert got.tolist() == [clock.t_ns] * 2
 
 
 def test_hardware_stamps_take_the_jitter_of_the_interrupt_off() -> None:
-    clock = SteppingClock()
+    clock = SettableClock(100 * NS_PER_S, 1_700_000_100 * NS_PER_S)
     time = KernelTime(clock)
     rng = np.random.default_rng(0)
     worst = []
     for _ in range(50):
-        true_ns = clock.now_ns + np.sort(rng.integers(0, 100_000_000, 100))
+        true_ns = clock.t_ns + np.sort(rng.integers(0, 100_000_000, 100))
         hardware = (true_ns * (1 + 20e-6)).astype(np.int64) - 5 * NS_PER_S
-        software = true_ns + 10_000 + rng.exponential(300_000, 100).astype(np.int64) + clock.wall_offset_ns
-        clock.now_ns += 110_000_000
+        software = (
+            true_ns + 10_000 + rng.exponential(300_000, 100).astype(np.int64) + (clock.wall - clock.t_ns)
+        )
+        clock.advance(0.11)
         got = time.monotonic(software, hardware, drained=True)
         worst.append(np.abs(got - true_ns).max())
     assert max(worst[5:]) < 60_000

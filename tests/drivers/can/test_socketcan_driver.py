@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support.can_standin import StandInBus, frame_bytes
-from support.running_drivers import CountingDevice, running, until
+from support.running_drivers import CountingDevice, running
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -58,7 +59,7 @@ async def test_frames_become_blocks_and_strays_are_counted(bus: StandInBus) -> N
         bus.send([sample_frame(k) for k in range(50)])
         bus.send([frame_bytes(0x7FF, b""), b"no frame", frame_bytes(0x101, b"short")])
         bus.send([sample_frame(k) for k in range(50, 100)])
-        await until(lambda: driver.streams["s"][0].frames_received == 100)
+        await eventually(lambda: driver.streams["s"][0].frames_received == 100)
     got = np.concatenate([block.samples for block in blocks])[:, 0]
     assert got.tolist() == np.repeat(np.arange(100), 3).tolist()
     assert (driver.counters.frames_unknown, driver.counters.frames_malformed) == (1, 1)
@@ -74,13 +75,13 @@ async def test_bus_off_takes_the_link_down_until_the_controller_is_back(
     with caplog.at_level(logging.WARNING):
         async with running(driver):
             bus.send([frame_bytes(ERROR | 0x204, b"\0\x20\0\0\0\0\x80\x07")] * 2)
-            await until(lambda: driver.counters.controller_state == "error-passive")
+            await eventually(lambda: driver.counters.controller_state == "error-passive")
             assert driver.link.state == "up"
             bus.send([frame_bytes(ERROR | 0x40, bytes(8))])
-            await until(lambda: driver.link.state == "down")
+            await eventually(lambda: driver.link.state == "down")
             assert "`ip link set can7 type can restart`" in driver.link.reason
             bus.send([restart])
-            await until(lambda: driver.link.state == "up")
+            await eventually(lambda: driver.link.state == "up")
             assert driver.counters.controller_state == "error-active"
     assert bus.opened == 1, "the socket lives through bus-off"
     assert (driver.counters.bus_off, driver.counters.error_passives, driver.link.losses) == (1, 2, 1)
@@ -105,16 +106,16 @@ async def test_a_bus_that_is_opened_again_keeps_its_state_until_something_comes(
     passive = frame_bytes(ERROR | 0x4, bytes([0, 0x30, 0, 0, 0, 0, 0, 0]))
     async with running(driver):
         bus.send([sample_frame(device.frame()), passive])
-        await until(lambda: driver.counters.controller_state == "error-passive")
+        await eventually(lambda: driver.counters.controller_state == "error-passive")
         bus.unplug()
-        await until(lambda: driver.link.state == "down")
+        await eventually(lambda: driver.link.state == "down")
         bus.plug_in()
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         assert driver.counters.controller_state == "error-passive", "an adapter that is silent says nothing"
         bus.send([sample_frame(device.frame())])
-        await until(lambda: driver.counters.controller_state == "error-active")
+        await eventually(lambda: driver.counters.controller_state == "error-active")
         bus.send([passive, sample_frame(device.frame())])
-        await until(lambda: driver.streams["s"][0].frames_received == 3)
+        await eventually(lambda: driver.streams["s"][0].frames_received == 3)
         assert driver.counters.controller_state == "error-passive", "frames alone do not make it active again"
 
 
@@ -136,13 +137,13 @@ async def test_an_adapter_that_is_unplugged_is_opened_again(bus: StandInBus) -> 
     device = CountingDevice(3000.0, 3)
     async with running(driver):
         bus.send([sample_frame(device.frame())])
-        await until(lambda: driver.streams["s"][0].frames_received == 1)
+        await eventually(lambda: driver.streams["s"][0].frames_received == 1)
         bus.unplug()
-        await until(lambda: driver.link.state == "down")
+        await eventually(lambda: driver.link.state == "down")
         bus.plug_in()
-        await until(lambda: driver.link.state == "up")
+        await eventually(lambda: driver.link.state == "up")
         bus.send([sample_frame(device.frame())])
-        await until(lambda: driver.streams["s"][0].frames_received == 2)
+        await eventually(lambda: driver.streams["s"][0].frames_received == 2)
     counters, _ = driver.streams["s"]
     assert (counters.samples_received, counters.frames_rejected) == (6, 0)
     assert counters.samples_lost == device.samples_since_first - 6

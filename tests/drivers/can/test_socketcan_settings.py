@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from support.machine_files import LAVAL, changed, only_problem
-
-from daqsvc.settings import parse_machine_file
+from support.machine_files import LAVAL, only_problem, parsed
 
 
 def test_buffer_and_filter_are_settings_of_the_bus() -> None:
-    text, _ = changed(LAVAL, ("fd = true", "fd = true\nreceive_buffer_bytes = 1_000_000\nfilter = false"))
-    bus = parse_machine_file(text, LAVAL).buses["can0"].model_dump()
+    bus = (
+        parsed(LAVAL, ("fd = true", "fd = true\nreceive_buffer_bytes = 1_000_000\nfilter = false"))
+        .buses["can0"]
+        .model_dump()
+    )
     assert (bus["receive_buffer_bytes"], bus["filter"]) == (1_000_000, False)
 
 

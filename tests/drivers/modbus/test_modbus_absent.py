@@ -10,7 +10,8 @@ import struct
 
 import numpy as np
 import pytest
-from support.modbus_lines import LoopClock, Rig, options_of, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, responding, simulate
 
 from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.modbus_lines import LoopClock, Rig, options_of, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import link as supervision
 from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record

@@ -6,7 +6,8 @@ import asyncio
 
 import numpy as np
 import pytest
-from support.modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
 from drivers.modbus.registers import RegisterField

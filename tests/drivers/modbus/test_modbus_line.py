@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.client import LineOptions, ModbusClient
@@ -414,15 +415,8 @@ def test_a_ring_that_begins_again_is_followed_without_what_is_left_from_before()
     assert values[-1] >= 397
 
 
-class DrowsyClock(LoopClock):
-    """Wakes up later than it should, as an event loop does that waits in whole milliseconds."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await super().sleep_ns(duration_ns + 1_100_000)
-
-
 def test_a_schedule_finer_than_the_event_loop_sleeps_is_kept_without_loss():
-    rig = Rig(options_of(serial=False), {"s": (trend_of(1), 1500.0)}, clock=DrowsyClock())
+    rig = Rig(options_of(serial=False), {"s": (trend_of(1), 1500.0)}, clock=LoopClock(late_ns=1_100_000))
 
     async def main():
         async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=False), rig.running():

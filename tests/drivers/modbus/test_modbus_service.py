@@ -7,9 +7,9 @@ import struct
 
 import numpy as np
 import pytest
-from support.brokers import eventually
 from support.live_service import running
 from support.machine_files import MACHINES, problems_of
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import describe, load_machine_file, parse_machine_file

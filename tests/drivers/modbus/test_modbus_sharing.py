@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.modbus_lines import LoopClock, Rig, options_of, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, responding, simulate
 
 from drivers.modbus.layouts import TrendLayout, shared_runs
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs

@@ -8,7 +8,8 @@ import random
 
 import numpy as np
 import pytest
-from support.modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
 from daqsvc.acquisition.clock import NS_PER_S

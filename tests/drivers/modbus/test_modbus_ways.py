@@ -7,7 +7,8 @@ import contextlib
 
 import numpy as np
 import pytest
-from support.modbus_lines import LoopClock, Rig, options_of, ramp, responding, simulate, until
+from support.clocks import LoopClock
+from support.modbus_lines import Rig, options_of, ramp, responding, simulate, until
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support.can_standin import StandInBus, frame_bytes
 from support.paths import ROOT
-from support.running_drivers import running, until
+from support.running_drivers import running
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.settings import load_machine_file
@@ -41,7 +42,7 @@ async def test_a_recording_of_the_fan_plays_through_its_dbc_file(tmp_path: Path)
     async with running(recorded):
         for at in range(0, FRAMES, 100):
             bus.send([frame_bytes(layout.frame_id, row.tobytes()) for row in payloads[at : at + 100]])
-            await until(lambda: recorded.streams["housing"][0].frames_received == at + 100)  # noqa: B023
+            await eventually(lambda: recorded.streams["housing"][0].frames_received == at + 100)  # noqa: B023
     bus.close()
 
     text = (MACHINES / "replay-fan.toml").read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.running_drivers import until
+from support.waiting import eventually
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.base import BusPort, StreamSpec
@@ -45,7 +45,7 @@ async def play(path: Path, pace: str = "recorded") -> ReplayDriver:
 
     passing = asyncio.create_task(pass_time())
     try:
-        await until(lambda: bool(driver.link.reason))
+        await eventually(lambda: bool(driver.link.reason))
     finally:
         for one in (task, passing):
             one.cancel()

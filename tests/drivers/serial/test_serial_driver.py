@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from support.brokers import eventually
+from support.clocks import QuickClock
 from support.machine_files import MACHINES
+from support.waiting import eventually
 
-from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.make import bus_drivers, stream_layout
@@ -30,7 +31,7 @@ from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
@@ -39,13 +40,6 @@ pytestmark = pytest.mark.integration
 PROBES = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"
 CASING = "/dev/serial/by-id/usb-Raspberry_Pi_Pico_E66118604B826C2A-if00"
 LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
-
-
-class QuickClock(SystemClock):
-    """Back-off at a hundredth of its length."""
-
-    async def sleep_ns(self, duration_ns: int) -> None:
-        await asyncio.sleep(duration_ns / 1e11)
 
 
 def lines_driver(path: Path, blocks: list[SampleBlock], **options: Any) -> SerialDriver:
@@ -63,10 +57,6 @@ async def running(*drivers: SerialDriver) -> AsyncIterator[None]:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def until(true: Callable[[], bool], what: str) -> None:
-    await eventually(true, what)
 
 
 async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) -> None:
@@ -88,7 +78,9 @@ async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) ->
             sent[stream] = rng.normal(0, 5, (int(seconds * rate_hz), len(layout.channels)))
             nodes[stream] = SerialNode(cable, framing, stream, layout, sent[stream], rate_hz, faults=faults)
         async with running(*drivers):
-            await until(lambda: all(driver.link.state == "up" for driver in drivers), "both ports are open")
+            await eventually(
+                lambda: all(driver.link.state == "up" for driver in drivers), "both ports are open"
+            )
 
             def behind() -> int:
                 done = [node.injected for node in nodes.values()]
@@ -97,7 +89,7 @@ async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) ->
 
             pacer = DrivenPacer(clock, behind, 64)
             await asyncio.gather(*(node.play(pacer) for node in nodes.values()))
-            await until(lambda: behind() <= 0, "all frames are in")
+            await eventually(lambda: behind() <= 0, "all frames are in")
     for driver in drivers:
         for stream, (counters, _) in driver.streams.items():
             done = nodes[stream].injected
@@ -117,11 +109,13 @@ async def test_a_port_that_another_program_has_is_waited_for(tmp_path: Path) -> 
         fcntl.flock(other, fcntl.LOCK_EX)
         first, second = (lines_driver(cable.path, []) for _ in range(2))
         async with running(first):
-            await until(lambda: "another program has it open" in first.link.reason, "the port is refused")
+            await eventually(
+                lambda: "another program has it open" in first.link.reason, "the port is refused"
+            )
             os.close(other)
-            await until(lambda: first.link.state == "up", "the port is free")
+            await eventually(lambda: first.link.state == "up", "the port is free")
             async with running(second):
-                await until(lambda: second.counters.open_failures > 1, "a second reader is refused")
+                await eventually(lambda: second.counters.open_failures > 1, "a second reader is refused")
                 assert first.link.state == "up"
             assert "stop that program" in second.link.reason
 
@@ -131,12 +125,12 @@ async def test_what_is_wrong_is_said_once_with_its_remedy(tmp_path: Path, caplog
     driver = lines_driver(tmp_path / "port", blocks)
     with caplog.at_level(logging.INFO):
         async with running(driver):
-            await until(lambda: driver.counters.open_failures > 2, "there is no port")
+            await eventually(lambda: driver.counters.open_failures > 2, "there is no port")
             with PseudoTerminal(tmp_path / "port") as cable:
-                await until(lambda: driver.link.state == "up", "the port is there")
+                await eventually(lambda: driver.link.state == "up", "the port is there")
                 os.write(cable.fd, b"half a line\n1,1\n#\n2,2\nwhat?\n3,3\n")
-                await until(lambda: driver.counters.frames_malformed == 2, "all is read")
-            await until(lambda: driver.link.state == "down", "the plug is pulled")
+                await eventually(lambda: driver.counters.frames_malformed == 2, "all is read")
+            await eventually(lambda: driver.link.state == "down", "the plug is pulled")
     said = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(said) == 4
     assert f"there is no {tmp_path / 'port'}; plug the device in, or correct port" in said[0]
@@ -157,7 +151,7 @@ async def test_errors_of_the_uart_are_counted(tmp_path: Path, monkeypatch: pytes
     driver = lines_driver(tmp_path / "port", [])
     with PseudoTerminal(tmp_path / "port"):
         async with running(driver):
-            await until(lambda: driver.counters.overruns == 7, "the errors are counted")
+            await eventually(lambda: driver.counters.overruns == 7, "the errors are counted")
     counters = driver.counters
     assert (counters.framing_errors, counters.parity_errors, counters.breaks) == (1, 0, 2**31 + 1)
 
@@ -167,7 +161,7 @@ async def test_the_settings_reach_the_port(tmp_path: Path) -> None:
     driver = lines_driver(tmp_path / "port", [], **options)
     with PseudoTerminal(tmp_path / "port") as cable:
         async with running(driver):
-            await until(lambda: driver.link.state == "up", "the port is open")
+            await eventually(lambda: driver.link.state == "up", "the port is open")
             spare = os.open(cable.path, os.O_RDWR | os.O_NOCTTY)
             try:
                 flags, _, control, local, _, speed, _ = termios.tcgetattr(spare)
@@ -193,7 +187,7 @@ async def test_a_port_that_takes_its_time_to_close_does_not_hold_the_loop(
     driver = lines_driver(tmp_path / "port", [])
     with PseudoTerminal(tmp_path / "port") as cable:
         task = asyncio.create_task(driver.run())
-        await until(lambda: driver.link.state == "up", "the port is open")
+        await eventually(lambda: driver.link.state == "up", "the port is open")
         cable.unplug()
         turns = 0
         for _ in range(50):
@@ -217,14 +211,14 @@ async def test_a_framing_that_fails_costs_the_link_and_not_the_service(
     with PseudoTerminal(tmp_path / "port") as cable, monkeypatch.context() as patch:
         patch.setattr(driver._framing, "cut", fail)
         async with running(driver):
-            await until(lambda: driver.link.state == "up", "the port is open")
+            await eventually(lambda: driver.link.state == "up", "the port is open")
             os.write(cable.fd, b"1,1\n")
-            await until(lambda: driver.counters.reader_failures == 1, "the failure is counted")
+            await eventually(lambda: driver.counters.reader_failures == 1, "the failure is counted")
             patch.undo()
-            await until(lambda: driver.link.losses == 1, "the link is given up")
-            await until(lambda: driver.link.state == "up", "the port is open again")
+            await eventually(lambda: driver.link.losses == 1, "the link is given up")
+            await eventually(lambda: driver.link.state == "up", "the port is open again")
             os.write(cable.fd, b"1,1\n2,2\n3,3\n")
-            await until(lambda: driver.streams["x"][0].frames_received > 1, "samples arrive")
+            await eventually(lambda: driver.streams["x"][0].frames_received > 1, "samples arrive")
     assert "as if by mistake" in caplog.text
 
 
@@ -246,22 +240,22 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
     lines = driver._framing.encode("x", np.arange(2), np.ones((2, 1, 1)))
     with PseudoTerminal(tmp_path / "port") as cable:
         async with running(driver):
-            await until(lambda: driver.link.state == "up", "the port is open")
+            await eventually(lambda: driver.link.state == "up", "the port is open")
             reader = next(t for t in threading.enumerate() if isinstance(t, serial_reader.SerialReader))
             os.write(cable.fd, lines[0])
-            await until(begun.is_set, "the first batch is being cut")
+            await eventually(begun.is_set, "the first batch is being cut")
             await asyncio.sleep(0)
             told.clear()
             waiting = reader._jobs.qsize()
             os.write(cable.fd, lines[1])
             # Two more: one may still say that nothing had come by then.
-            await until(lambda: reader._jobs.qsize() > waiting + 1, "reading goes on")
+            await eventually(lambda: reader._jobs.qsize() > waiting + 1, "reading goes on")
             assert told == []
             cable.unplug()
-            await until(lambda: not reader.is_alive(), "the port has been found gone")
+            await eventually(lambda: not reader.is_alive(), "the port has been found gone")
             assert driver.link.state == "up"
             released.set()
-            await until(lambda: driver.link.losses == 1, "the link is lost")
+            await eventually(lambda: driver.link.losses == 1, "the link is lost")
     assert [what for what in told if what != "quiet"] == [f"{len(line)} bytes" for line in lines]
     assert told[0] != "quiet"
     assert "quiet" in told[1:]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.machine_files import MACHINES, changed, problems_of
+from support.machine_files import MACHINES, changed, parsed, problems_of
 
 from daqsvc.settings import load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
@@ -139,8 +139,7 @@ def test_each_mistake_is_named_once_with_its_remedy(old, new, key, message, reme
 
 
 def test_a_port_with_a_number_is_a_warning():
-    text, _ = changed(SERIAL, (PORT, '"/dev/ttyUSB0"'))
-    (warning,) = parse_machine_file(text, SERIAL).warnings
+    (warning,) = parsed(SERIAL, (PORT, '"/dev/ttyUSB0"')).warnings
     assert "may be another device once a port has been re-plugged" in str(warning)
     assert "/dev/serial/by-id" in str(warning)
 

@@ -7,9 +7,10 @@ import json
 from dataclasses import replace
 
 import pytest
-from support.brokers import Consumer, TcpProxy, eventually, running_mosquitto
+from support.brokers import Consumer, TcpProxy, running_mosquitto
 from support.home_assistant_rules import check_discovery, rendered
 from support.mqtt_publishing import commands, publishing, say
+from support.waiting import eventually
 
 from daqsvc.alarms.commands import Verb
 from daqsvc.diagnosis.reading import Reading

@@ -10,7 +10,6 @@ import time
 from dataclasses import replace
 
 import pytest
-from support.brokers import eventually
 from support.sparkplug_edge import (
     BOOLEAN,
     DOUBLE,
@@ -25,6 +24,7 @@ from support.sparkplug_edge import (
     said,
 )
 from support.sparkplug_host import Host, seen
+from support.waiting import eventually
 
 from daqsvc.publish.sparkplug.codec import DataType, Metric, Payload, encode
 

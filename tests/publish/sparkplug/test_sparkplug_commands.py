@@ -9,10 +9,10 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from support.brokers import eventually
 from support.mqtt_publishing import commands, mqtt, outputs
 from support.sparkplug_edge import BOOLEAN, CLOCK, NODE, born, rebirth, said
 from support.sparkplug_host import Host
+from support.waiting import eventually
 
 from daqsvc.alarm_service import AlarmService
 from daqsvc.alarms.commands import Verb

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.brokers import Mosquitto, eventually
+from support.brokers import Mosquitto
 from support.sparkplug_edge import (
     EVENT,
     STATE,
@@ -12,6 +12,7 @@ from support.sparkplug_edge import (
     edge_node,
 )
 from support.sparkplug_host import Host
+from support.waiting import eventually
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.brokers import eventually, running_mosquitto
+from support.brokers import running_mosquitto
 from support.live_service import play, running
 from support.machine_files import LAVAL, changed, only_problem
 from support.mqtt_publishing import CLOCK, output_port
 from support.sparkplug_host import Host
+from support.waiting import eventually
 
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.make import output_set

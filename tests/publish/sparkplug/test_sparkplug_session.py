@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from support.brokers import LOOPBACK, TcpProxy, eventually, free_port, running_mosquitto
+from support.brokers import LOOPBACK, TcpProxy, free_port, running_mosquitto
 from support.sparkplug_edge import (
     INT64,
     NODE,
@@ -17,6 +17,7 @@ from support.sparkplug_edge import (
     edge_node,
 )
 from support.sparkplug_host import Host
+from support.waiting import eventually
 
 from daqsvc.publish.sparkplug import session
 
