@@ -20,6 +20,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarm_log import AlarmLog
 from daqsvc.alarms.commands import CommandOutcome
 from daqsvc.alarms.conditions import Condition
+from daqsvc.alarms.handling import CALM
 from daqsvc.alarms.manager import AlarmManager
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.audit import AuditError, AuditLog, Refusals
@@ -40,12 +41,12 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand
     from daqsvc.alarms.events import AlarmEvent, Identity
-    from daqsvc.alarms.handling import AlarmHandling
     from daqsvc.alarms.rules import Rule
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.publish.output import Output
     from daqsvc.self_check import BusHealth
+    from daqsvc.settings.alarms import AlarmHandling
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +110,7 @@ class AlarmService:
         clock: Clock,
         outputs: OutputSet | None,
         *,
-        handling: AlarmHandling | None = None,
+        handling: AlarmHandling = CALM,
         limits: OutboxLimits | None = None,
         buses: Mapping[str, Collection[str]] | None = None,
         bus_health: Callable[[], Mapping[str, BusHealth]] = dict,

@@ -16,13 +16,13 @@ from daqsvc.acquisition.clock import NS_PER_S, SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.alarm_service import AlarmService
-from daqsvc.assembly_alarms import alarm_handling, alarm_rules, identity
-from daqsvc.assembly_alignment import alignment
-from daqsvc.assembly_store import outbox_limits
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.control import ControlError, ControlServer
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.pipeline import Pipeline
-from daqsvc.diagnosis.snapshots import at_once, patience
+from daqsvc.diagnosis.snapshots import alignment, at_once, patience
+from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.publish.make import output_plugins, output_set
 from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
@@ -130,7 +130,7 @@ class Service:
         self.ready = asyncio.Event()
         self.supervisor = Supervisor()
         self._on_ending = on_ending
-        self._identity = identity(machine)
+        self._identity = Identity(machine.site, machine.box, machine.machine.name)
         watching = detectors(machine, store)
         grids = [*(Grid({name: stream}) for name, stream in machine.streams.items()), *machine.grids]
         self._grids = grids
@@ -151,12 +151,12 @@ class Service:
         )
         self.alarms = AlarmService(
             self._identity,
-            alarm_rules(machine),
+            [alarm_rule(alarm) for alarm in machine.alarms],
             store,
             self.clock,
             output_set(machine, conditions(bus_self_checks(machine))),
-            handling=alarm_handling(machine),
-            limits=outbox_limits(machine),
+            handling=machine.alarm_handling,
+            limits=OutboxLimits.of(machine.store),
             buses=bus_self_checks(machine),
             bus_health=self._bus_health,
             supervisor=self.supervisor,

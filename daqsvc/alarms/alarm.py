@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.chatter import ChatterWatch
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind
+from daqsvc.alarms.handling import CALM
 from daqsvc.alarms.states import (
     AlarmState,
     CommandNotAllowedError,
@@ -23,11 +24,11 @@ from daqsvc.alarms.status import AlarmStatus, HandlingRequest
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daqsvc.alarms.chatter import ChatterLimit
     from daqsvc.alarms.events import Identity
     from daqsvc.alarms.rules import RuleFinding
     from daqsvc.alarms.status import ClockReading
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings.alarms import AlarmHandling
 
 CHANGES_NS = 5 * NS_PER_S
 """Whoever doubts a sensor may have another reason each time: that is told no more often than this."""
@@ -46,7 +47,7 @@ class Alarm:
         name: name of the alarm.
         latching: whether it outlives its condition until it is reset.
         new_occurrence: gives an id that was never used before.
-        chatter: from when on it chatters; None never.
+        handling: says from when on it chatters.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Alarm:
         *,
         latching: bool,
         new_occurrence: Callable[[], str],
-        chatter: ChatterLimit | None = None,
+        handling: AlarmHandling = CALM,
     ) -> None:
         self.name = name
         self.doubts: tuple[Doubt, ...] = ()
@@ -68,7 +69,7 @@ class Alarm:
         self._identity = identity
         self._latching = latching
         self._new_occurrence = new_occurrence
-        self._chatter = ChatterWatch(chatter)
+        self._chatter = ChatterWatch(handling)
         self._state = AlarmState.NORMAL
         self._level = Level.NORMAL
         self._found = ""

@@ -10,7 +10,7 @@ from daqsvc.alarms.quality import quality_alarm
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from daqsvc.alarms.handling import AlarmHandling
+    from daqsvc.settings.alarms import AlarmHandling
 
 
 class Expected:
@@ -21,7 +21,7 @@ class Expected:
     """
 
     def __init__(self, handling: AlarmHandling) -> None:
-        self.conditions = set(handling_conditions(flood=handling.flood, start_up=handling.start_up))
+        self.conditions = set(handling_conditions(handling))
         """Those of the service itself."""
         self.quality: dict[str, dict[str, Sequence[str]]] = {}
         """Those that say whether a sensor can be judged: their detectors, with the sensors these rest on."""
@@ -43,11 +43,7 @@ class Expected:
         return self.quality.keys() | self.conditions
 
 
-def handling_conditions(*, flood: object | None, start_up: object | None) -> list[str]:
-    """The conditions that the alarms themselves may bring.
-
-    Args:
-        flood: from when on alarms are a flood; None never.
-        start_up: how a start-up is recognised; None: never.
-    """
-    return [name for name, of in ((ALARM_FLOOD, flood), (TRIP_MULTIPLY, start_up)) if of is not None]
+def handling_conditions(handling: AlarmHandling) -> list[str]:
+    """The conditions that the alarms themselves may bring: a flood, and a start-up that lasts too long."""
+    there = ((ALARM_FLOOD, handling.flood_alarms > 0), (TRIP_MULTIPLY, handling.start_up is not None))
+    return [name for name, is_there in there if is_there]

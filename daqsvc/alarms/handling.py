@@ -1,54 +1,43 @@
-"""What holds for all alarms of a machine, and what they count."""
+"""For how long an alarm may be shelved, and what all alarms count."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from daqsvc.alarms.states import CommandNotAllowedError
+from daqsvc.settings.alarms import AlarmHandling
 
 if TYPE_CHECKING:
-    from daqsvc.alarms.chatter import ChatterLimit
     from daqsvc.alarms.commands import AlarmCommand
-    from daqsvc.alarms.flood import FloodLimit
-    from daqsvc.alarms.start_up import StartUp
 
 _UNITS = ((86_400, "d"), (3600, "h"), (60, "m"))
+CALM: Final = AlarmHandling(chatter_raises=0, flood_alarms=0, shelve_at_most_s=86_400.0)
+"""Where nothing is said of it: no alarm chatters, and no number of them is a flood."""
+
 _LONGEST_S = 1e9
 """Longer times are no more of use in days than in seconds."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmHandling:
-    """What holds for all alarms of a machine.
+def shelving_ns(command: AlarmCommand, longest_s: float) -> int:
+    """How long a command shelves, in ns.
 
-    Attributes:
-        chatter: from when on an alarm chatters; None never.
-        flood: from when on alarms are a flood; None never.
-        start_up: how a start-up is recognised; None: limits are never multiplied.
-        shelve_at_most_s: the longest time that an alarm may be shelved for.
+    Args:
+        command: what is asked.
+        longest_s: the longest time that an alarm may be shelved for.
+
+    Raises:
+        CommandNotAllowedError: it states no time, or a longer one than is allowed.
     """
-
-    chatter: ChatterLimit | None = None
-    flood: FloodLimit | None = None
-    start_up: StartUp | None = None
-    shelve_at_most_s: float = 86_400.0
-
-    def shelving_ns(self, command: AlarmCommand) -> int:
-        """How long a command shelves, in ns.
-
-        Raises:
-            CommandNotAllowedError: it states no time, or a longer one than is allowed.
-        """
-        longest_s, duration_s = self.shelve_at_most_s, command.duration_s
-        if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
-            stated = "no time" if duration_s is None else in_units(duration_s)
-            raise CommandNotAllowedError(
-                f"cannot shelve {command.alarm} for {stated}; "
-                f"state a time above 0 and up to {in_units(longest_s)}"
-            )
-        return round(duration_s * 1e9)
+    duration_s = command.duration_s
+    if duration_s is None or not math.isfinite(duration_s) or not 0 < duration_s <= longest_s:
+        stated = "no time" if duration_s is None else in_units(duration_s)
+        raise CommandNotAllowedError(
+            f"cannot shelve {command.alarm} for {stated}; "
+            f"state a time above 0 and up to {in_units(longest_s)}"
+        )
+    return round(duration_s * 1e9)
 
 
 def in_units(duration_s: float) -> str:

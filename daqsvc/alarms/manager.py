@@ -24,7 +24,7 @@ from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
 from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
-from daqsvc.alarms.handling import AlarmCounters, AlarmHandling
+from daqsvc.alarms.handling import CALM, AlarmCounters, shelving_ns
 from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
@@ -41,8 +41,9 @@ if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings.alarms import AlarmHandling
 
-__all__ = ["AlarmHandling", "AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
+__all__ = ["AlarmManager", "DiagnosisRule", "Identity", "LevelRule"]
 
 MOST_NAMED = 20
 """Alarms that a refusal still lists by name."""
@@ -80,13 +81,13 @@ class AlarmManager:
         rules: Sequence[Rule],
         clock: Clock,
         new_occurrence: Callable[[], str] = lambda: str(uuid.uuid4()),
-        handling: AlarmHandling | None = None,
+        handling: AlarmHandling = CALM,
     ) -> None:
         self.counters = AlarmCounters()
         self._identity = identity
         self._clock = clock
         self._new_occurrence = new_occurrence
-        self._handling = handling or AlarmHandling()
+        self._handling = handling
         self._expected = Expected(self._handling)
         self._ruled = RuledAlarms()
         self._alarms: dict[str, Alarm] = {}
@@ -99,7 +100,7 @@ class AlarmManager:
         self._waiting: dict[str, Diagnosis] = {}
         """By quality alarm, the statement whose reason is still to be told: see `Alarm.waits`."""
         self._start_up = StartUpSignal(self._handling.start_up)
-        self._flood = FloodWatch(self._handling.flood)
+        self._flood = FloodWatch(self._handling)
         self._first_out = FirstOut({rule.alarm: rule.group for rule in rules})
         for rule in rules:
             if rule.alarm in self._alarms:
@@ -378,7 +379,9 @@ class AlarmManager:
             case Verb.RESET:
                 return alarm.reset(request)
             case Verb.SHELVE:
-                return alarm.shelve(now.t_ns + self._handling.shelving_ns(command), request, nothing)
+                return alarm.shelve(
+                    now.t_ns + shelving_ns(command, self._handling.shelve_at_most_s), request, nothing
+                )
             case Verb.UNSHELVE:
                 return alarm.unshelve(request, nothing)
             case Verb.BYPASS:
@@ -416,7 +419,7 @@ class AlarmManager:
             t_ns = self._clock.monotonic_ns()
             self._doubts.resume(doubts, t_ns, event.found)
             self._doubts.expect(name, self._expected.quality[name], t_ns)
-        elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood is not None):
+        elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood_alarms):
             self._resume_unruled(event)
             self._conditions.add(name)
             if name == ALARM_FLOOD and event.own_state.is_active:
@@ -452,9 +455,12 @@ class AlarmManager:
         return alarm
 
     def _made(self, name: str, *, latching: bool) -> Alarm:
-        chatter = self._handling.chatter
         return Alarm(
-            self._identity, name, latching=latching, new_occurrence=self._new_occurrence, chatter=chatter
+            self._identity,
+            name,
+            latching=latching,
+            new_occurrence=self._new_occurrence,
+            handling=self._handling,
         )
 
     def _now(self) -> ClockReading:

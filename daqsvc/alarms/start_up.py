@@ -7,55 +7,24 @@ does so is a measure of a detector, as a rule the speed by the keyphasor, in a r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.settings.alarms import StartUp
 
 _RATE_OVER_NS = 1_000_000_000
 """A rate is taken over at least so long: from edge to edge a keyphasor's speed jitters."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartUp:
-    """How a start-up is recognised.
-
-    Attributes:
-        detector: the detector whose diagnoses hold the signal.
-        measure: key in `Diagnosis.statistics`, e.g. ``"speed"``.
-        between: the machine starts up while the measure lies in this range, in its unit; None: no such range.
-        change_per_s: it starts up while the measure changes at least so fast; None: no such rate.
-        at_most_ns: after so long limits are no longer multiplied, until the signal has been gone.
-
-    Raises:
-        ValueError: neither a range nor a rate is given, or one that cannot be.
-    """
-
-    detector: str
-    measure: str = "speed"
-    between: tuple[float, float] | None = None
-    change_per_s: float | None = None
-    at_most_ns: int = 120_000_000_000
-
-    def __post_init__(self) -> None:
-        if self.between is None and self.change_per_s is None:
-            raise ValueError("a start-up needs a range or a rate of its signal; it has neither")
-        if self.between is not None and not self.between[0] < self.between[1]:
-            raise ValueError(f"a start-up between {self.between[0]} and {self.between[1]} has no range")
-        if self.change_per_s is not None and not self.change_per_s > 0:
-            raise ValueError(f"a start-up at a change of {self.change_per_s} a second is always; state more")
-        if self.at_most_ns <= 0:
-            raise ValueError(f"a start-up of at most {self.at_most_ns} ns is none; state a positive time")
 
 
 class StartUpSignal:
     """Follows the signal, by the time of the data.
 
     Args:
-        start_up: how a start-up is recognised; None: this machine has none.
+        start_up: how a start-up is recognised: by a range or a rate of its signal; None: there is none.
     """
 
     def __init__(self, start_up: StartUp | None) -> None:
@@ -70,7 +39,7 @@ class StartUpSignal:
         return (
             start_up is not None
             and self._since_ns is not None
-            and t_ns - self._since_ns <= start_up.at_most_ns
+            and t_ns - self._since_ns <= start_up.at_most_s * NS_PER_S
         )
 
     def take(self, diagnosis: Diagnosis) -> None:
@@ -97,7 +66,7 @@ class StartUpSignal:
             return Level.NORMAL, "the machine starts up"
         return Level.ALERT, (
             f"by {start_up.measure} of {start_up.detector} the machine has been starting up for more than "
-            f"{start_up.at_most_ns / 1e9:g} s; limits are no longer multiplied"
+            f"{start_up.at_most_s:g} s; limits are no longer multiplied"
         )
 
     def _moves(self, value: float, t_ns: int, change_per_s: float | None) -> bool:

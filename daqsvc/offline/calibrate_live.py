@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import SampleRing
-from daqsvc.assembly_alignment import alignment
 from daqsvc.detectors.make import detectors
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.snapshots import alignment
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 from daqsvc.settings.plugins import configured
 from drivers.make import bus_drivers

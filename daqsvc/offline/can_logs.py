@@ -11,7 +11,7 @@ import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.assembly_alignment import alignment
+from daqsvc.diagnosis.snapshots import alignment
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED, SAME_RATE

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daqsvc.acquisition.clock import NS_PER_S
+
+if TYPE_CHECKING:
+    from daqsvc.settings.store import Store
 
 MIB = 1024 * 1024
-NS_PER_DAY = 86_400 * 1_000_000_000
+NS_PER_DAY = 86_400 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,3 +42,17 @@ class OutboxLimits:
     reserve_bytes: int = 64 * MIB
     ballast_bytes: int = 16 * MIB
     audit_max_bytes: int = 32 * MIB
+
+    @classmethod
+    def of(cls, store: Store | None) -> OutboxLimits:
+        """As the machine file says; what it leaves out has the usual limits."""
+        if store is None:
+            return cls()
+        return cls(
+            alarms_max_bytes=store.alarms_max_mb * MIB,
+            alarms_keep_ns=round(store.alarms_keep_days * NS_PER_DAY),
+            telemetry_max_bytes=store.telemetry_max_mb * MIB,
+            telemetry_max_age_ns=round(store.telemetry_max_age_s * NS_PER_S),
+            reserve_bytes=store.reserve_mb * MIB,
+            audit_max_bytes=store.audit_max_mb * MIB,
+        )

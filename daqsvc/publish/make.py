@@ -94,6 +94,5 @@ def _services(machine: MachineFile, conditions: Iterable[str]) -> Iterator[str]:
     """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
     for plugin, given in plugins(machine):
         yield from plugin.quality_alarms(machine, given)
-    handling = machine.alarm_handling
-    yield from handling_conditions(flood=handling.flood_alarms or None, start_up=handling.start_up)
+    yield from handling_conditions(machine.alarm_handling)
     yield from conditions

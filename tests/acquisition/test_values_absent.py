@@ -13,7 +13,7 @@ from support.alarm_rig import AlarmRig
 from support.machine_files import MACHINES, TRIAXIAL, only_problem, parsed
 
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.diagnosis.detector import Window
@@ -151,7 +151,7 @@ def test_absent_values_are_counted_beside_the_samples_and_said_once(caplog: pyte
 
 def test_a_sensor_without_values_neither_raises_nor_clears_an_alarm() -> None:
     machine = load_machine_file(MACHINES / "j1939-accelerometer.toml")
-    (rule,) = [rule for rule in alarm_rules(machine) if rule.alarm == "vibration-horizontal"]
+    (rule,) = [rule for rule in map(alarm_rule, machine.alarms) if rule.alarm == "vibration-horizontal"]
     channel = LevelChannel("accel-y", 0, "g", [Limits("velocity_rms", 4.5, 7.1)])
     levels = LevelDetector("rig", "housing", 100.0, [channel], window_s=2.0, velocity_band_hz=(10.0, 45.0))
     rig = AlarmRig(rule)

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from support.alarm_rig import SECOND_NS, AlarmRig, kinds
+from support.alarm_rig import SECOND_NS, AlarmRig, alarm_handling, kinds
 
-from daqsvc.alarms.chatter import ChatterLimit
-from daqsvc.alarms.flood import FloodLimit
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState
@@ -24,7 +21,7 @@ SPEAKERS = {"levels/probe-x": ("probe-x",)}
 
 def test_flap_a_value_at_its_limit_is_one_alarm():
     """alertmanager 204, 3048, 1546: alerts that flap around their threshold notify every time."""
-    handling = AlarmHandling(chatter=ChatterLimit(5, 60 * SECOND_NS, 60 * SECOND_NS))
+    handling = alarm_handling(chatter=(5, 60, 60))
     rig = AlarmRig(PLAIN, handling=handling)
     for second in range(600):
         rig.rms(39.9 if second % 2 else 40.1)
@@ -48,7 +45,7 @@ def test_flap_a_spike_or_a_dip_shorter_than_its_delay_is_nothing():
 def test_flood_is_seen_and_counted_and_every_alarm_of_it_is_told():
     """alerta 344: nobody sees that there are more alarms than he can read, or some are swallowed."""
     rules = [LevelRule(f"v{i}", f"p{i}", "rms", Setpoint(alert=40.0)) for i in range(40)]
-    rig = AlarmRig(*rules, handling=AlarmHandling(flood=FloodLimit()))
+    rig = AlarmRig(*rules, handling=alarm_handling(flood=(10, 600)))
     for i in range(40):
         rig.rms(50.0, sensor=f"p{i}", seconds=0.1)
     raised = {event.alarm for event in rig.events if event.kind.value == "raised"}

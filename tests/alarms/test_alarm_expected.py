@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import pytest
-from support.alarm_rig import AlarmRig
+from support.alarm_rig import AlarmRig, alarm_handling
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
-from daqsvc.alarms.flood import FloodLimit
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import DiagnosisRule
-from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
+from daqsvc.settings.alarms import StartUp
 
 SPEAKERS = {"levels/probe-x": ("probe-x",), "rotor-bank": ("probe-x", "probe-y")}
 CONDITIONS = ("store/disk", "certificate/broker")
-HANDLING = AlarmHandling(
-    flood=FloodLimit(10, 600 * 10**9),
+HANDLING = alarm_handling(
+    flood=(10, 600),
     start_up=StartUp(
-        detector="rotor-bank", measure="speed", between=(300.0, 2700.0), change_per_s=None, at_most_ns=10**11
+        detector="rotor-bank", measure="speed", between=(300.0, 2700.0), change_per_s=None, at_most_s=100.0
     ),
 )
 NAMES = ("sensor-ok/probe-x", "detector-ok/rotor-bank", "alarm-flood", "trip-multiply", *CONDITIONS)

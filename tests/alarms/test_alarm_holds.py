@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from support.alarm_rig import AlarmRig, kinds
+from support.alarm_rig import AlarmRig, alarm_handling, kinds
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
@@ -64,7 +63,7 @@ def test_shelving_again_sets_the_time_anew():
 
 @pytest.mark.parametrize("seconds", [None, 0.0, -1.0, math.nan, math.inf, 100.5])
 def test_shelving_needs_a_time_that_is_allowed(seconds):
-    rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=100.0))
+    rig = AlarmRig(LEVEL, handling=alarm_handling(shelve_at_most_s=100.0))
     with pytest.raises(CommandNotAllowedError, match="state a time above 0 and up to 1m40s"):
         rig.shelve("vibration-x", seconds)
     assert rig.status("vibration-x").state is S.NORMAL
@@ -84,7 +83,7 @@ def test_shelving_needs_a_time_that_is_allowed(seconds):
     ],
 )
 def test_a_refusal_says_times_as_people_write_them(asked_s, longest_s, words):
-    rig = AlarmRig(LEVEL, handling=AlarmHandling(shelve_at_most_s=longest_s))
+    rig = AlarmRig(LEVEL, handling=alarm_handling(shelve_at_most_s=longest_s))
     with pytest.raises(CommandNotAllowedError) as refused:
         rig.shelve("vibration-x", asked_s)
     assert f"{refused.value}" == f"cannot shelve vibration-x {words}"

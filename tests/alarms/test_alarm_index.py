@@ -12,13 +12,11 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.alarm_rig import alarm_handling
 from support.clocks import SettableClock
 
-from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Doubt, Identity
-from daqsvc.alarms.flood import FloodLimit
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.quality import UNHEARD_NS, SensorHealth, Touched, quality_alarm
 from daqsvc.alarms.rules import Circumstances
@@ -48,9 +46,9 @@ SPEAKERS = {
     "bank": ("x", "y"),
     "race": ("z",),
 }
-HANDLING = AlarmHandling(
-    chatter=ChatterLimit(2, 20 * SECOND_NS, 4 * SECOND_NS),
-    flood=FloodLimit(5, 15 * SECOND_NS),
+HANDLING = alarm_handling(
+    chatter=(2, 20, 4),
+    flood=(5, 15),
     shelve_at_most_s=100.0,
 )
 

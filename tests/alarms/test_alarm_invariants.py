@@ -13,21 +13,19 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from support.alarm_rig import alarm_handling
 from support.clocks import SettableClock
 
 from daqsvc.alarms.alarm import FINDINGS
-from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import ANNUNCIATIONS, EventKind, Identity
-from daqsvc.alarms.flood import FloodLimit
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Level
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_event, alarm_payload
+from daqsvc.settings.alarms import StartUp
 
 pytestmark = pytest.mark.property
 SECOND_NS = 1_000_000_000
@@ -49,10 +47,10 @@ SPEAKERS = {
     "bearing": ("x",),
     "bearing-fe": ("x",),
 }
-HANDLING = AlarmHandling(
-    chatter=ChatterLimit(1, 20 * SECOND_NS, 4 * SECOND_NS),
-    flood=FloodLimit(6, 30 * SECOND_NS),
-    start_up=StartUp(detector="bank", between=(100.0, 500.0), at_most_ns=10 * SECOND_NS),
+HANDLING = alarm_handling(
+    chatter=(1, 20, 4),
+    flood=(6, 30),
+    start_up=StartUp(detector="bank", between=(100.0, 500.0), at_most_s=10.0),
     shelve_at_most_s=100.0,
 )
 MODES = {"N": "normal", "F1": "alert", "F2": "alert", "F3": "danger", "undetermined": "normal"}

@@ -6,11 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.alarm_rig import SECOND_NS, AlarmRig, kinds
+from support.alarm_rig import SECOND_NS, AlarmRig, alarm_handling, kinds
 
-from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.commands import Verb
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.quality import UNHEARD_NS
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
@@ -124,8 +122,8 @@ def test_an_acknowledged_quality_alarm_still_knows_after_a_restart_that_the_sens
 
 
 def test_a_chattering_quality_alarm_tells_who_doubts_although_its_returns_are_held_back():
-    chatter = ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)
-    rig = AlarmRig(LEVEL, handling=AlarmHandling(chatter=chatter))
+    chatter = (1, 60, 10)
+    rig = AlarmRig(LEVEL, handling=alarm_handling(chatter=chatter))
     for quality in ["not_ok", "good", "not_ok"]:
         rig.rms(50.0, quality)
     assert rig.status("sensor-ok/probe-x").chattering
@@ -159,7 +157,7 @@ def revolution(rig, frames_there, quality="good"):
 @pytest.mark.parametrize("lost", [0.15, 0.3, 0.45])
 def test_frames_lost_at_random_are_one_quality_alarm_while_they_last(lost):
     rng = np.random.default_rng(3)
-    rig = AlarmRig(BEARING, handling=AlarmHandling(chatter=ChatterLimit(5, 60 * SECOND_NS, 60 * SECOND_NS)))
+    rig = AlarmRig(BEARING, handling=alarm_handling(chatter=(5, 60, 60)))
     lacking = [rng.random(6) >= lost for _ in range(600)]
     assert sum((there.mean() < 0.5) != (then.mean() < 0.5) for there, then in pairwise(lacking)) > 4
     for there in lacking:
@@ -217,7 +215,7 @@ def test_lost_frames_do_not_keep_a_sensor_not_ok_that_samples_show_to_be_ok():
 
 
 def test_a_chattering_quality_alarm_is_no_event_each_time_samples_are_missing():
-    rig = AlarmRig(BEARING, handling=AlarmHandling(chatter=ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)))
+    rig = AlarmRig(BEARING, handling=alarm_handling(chatter=(1, 60, 10)))
     for quality in ["missing", "good"] * 20:
         bearing(rig, quality, ("accel-de", "accel-fe"))
     assert [kind for _, kind in kinds(rig.events)] == ["raised", "returned", "raised", "chattering"]
@@ -227,7 +225,7 @@ def test_a_chattering_quality_alarm_is_no_event_each_time_samples_are_missing():
 
 
 def test_a_sensor_that_flickers_is_an_event_every_few_seconds_at_most():
-    rig = AlarmRig(LEVEL, handling=AlarmHandling(chatter=ChatterLimit(1, 60 * SECOND_NS, 10 * SECOND_NS)))
+    rig = AlarmRig(LEVEL, handling=alarm_handling(chatter=(1, 60, 10)))
     for quality in ["not_ok", "good"] * 60:
         rig.rms(0.0, quality, seconds=0.25)
     told = [event for event in rig.events if event.kind.value == "changed"]

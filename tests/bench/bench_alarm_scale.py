@@ -21,15 +21,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nothing_lost.broker import Broker, mosquitto_program
+from support.alarm_rig import alarm_handling
 from support.mqtt_publishing import mqtt, outputs
 from targets import Targets
 
-from daqsvc.acquisition.clock import NS_PER_S, SystemClock
+from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarm_service import AlarmService
-from daqsvc.alarms.chatter import ChatterLimit
 from daqsvc.alarms.events import Identity
-from daqsvc.alarms.flood import FloodLimit
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.manager import AlarmManager, LevelRule
 from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.voting import VotingRule
@@ -45,9 +43,7 @@ if TYPE_CHECKING:
 
 CLOCK = SystemClock()
 RIG = Identity("lab", "edge-1", "rig")
-HANDLING = AlarmHandling(
-    chatter=ChatterLimit(5, 60 * NS_PER_S, 60 * NS_PER_S), flood=FloodLimit(10, 600 * NS_PER_S)
-)
+HANDLING = alarm_handling(chatter=(5, 60, 60), flood=(10, 600))
 SETPOINT = Setpoint(alert=4.0, danger=8.0, deadband=1.0)
 COUNTS = (10, 100, 1000, 10_000)
 LEAST_DIAGNOSES = 20_000

@@ -10,7 +10,7 @@ import pytest
 from support.example_packages import DETECTOR, DOCS, installed
 from support.machine_files import MOTOR, problems_of
 
-from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.cli import main
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
@@ -52,7 +52,7 @@ def window(made: Any, signal: NDArray[Any], first: int = 0) -> Window:
 
 def test_its_alarm_follows_it() -> None:
     assert "crest" in machine().detectors
-    assert "knocks" in [rule.alarm for rule in alarm_rules(machine())]
+    assert "knocks" in [rule.alarm for rule in map(alarm_rule, machine().alarms)]
     assert "sensor accel-de, alert 5.0" in " ".join(describe(machine()).split())
 
 

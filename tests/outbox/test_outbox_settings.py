@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from support.machine_files import LAVAL, only_problem, parsed
 
-from daqsvc.assembly_store import outbox_limits
 from daqsvc.outbox.limits import MIB, NS_PER_DAY, OutboxLimits
 from daqsvc.settings import parse_machine_file
 
@@ -13,13 +12,13 @@ DIRECTORY = 'directory = "/var/lib/daqsvc"'
 
 
 def limits_with(*lines):
-    return outbox_limits(parsed(LAVAL, (DIRECTORY, "\n".join([DIRECTORY, *lines, ""]))))
+    return OutboxLimits.of(parsed(LAVAL, (DIRECTORY, "\n".join([DIRECTORY, *lines, ""]))).store)
 
 
 def test_what_is_not_said_has_the_limits_of_an_outbox_that_was_told_nothing():
     assert limits_with() == OutboxLimits()
     without = LAVAL.read_text(encoding="utf-8").split("[store]")[0]
-    assert outbox_limits(parse_machine_file(without, LAVAL)) == OutboxLimits()
+    assert OutboxLimits.of(parse_machine_file(without, LAVAL).store) == OutboxLimits()
 
 
 def test_every_limit_reaches_the_outbox_in_its_unit():

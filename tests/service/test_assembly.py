@@ -12,7 +12,7 @@ from support.paths import ROOT
 
 from daqsvc import cli
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
 from daqsvc.detectors.make import detectors
@@ -50,7 +50,9 @@ def test_every_example_becomes_drivers_detectors_and_rules(file: Path) -> None:
     watching = detectors(machine)
     watched = any(isinstance(detector, LevelDetector | TrendDetector) for detector in watching)
     assert watched == (machine.pipeline.levels is not None)
-    assert [rule.alarm for rule in alarm_rules(machine)] == [alarm.name for alarm in machine.alarms]
+    assert [rule.alarm for rule in map(alarm_rule, machine.alarms)] == [
+        alarm.name for alarm in machine.alarms
+    ]
     for detector in watching:
         detector.warm()
 

@@ -6,8 +6,8 @@ import pytest
 from support.machine_files import LAVAL, MACHINES, changed, only_problem, parsed
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.assembly_alignment import alignment
 from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.snapshots import alignment
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
 
 TWO_BUSES = MACHINES / "rotor-two-buses.toml"

@@ -7,14 +7,12 @@ from functools import partial
 import pytest
 from support.machine_files import LAVAL, MOTOR, changed, only_problem, parsed, problems_of
 
-from daqsvc.alarms.chatter import ChatterLimit
-from daqsvc.alarms.flood import FloodLimit
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.rules import DiagnosisRule, LevelRule
-from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
-from daqsvc.assembly_alarms import alarm_handling, alarm_rules
 from daqsvc.detectors.levels import plugin as levels_plugin
 from daqsvc.detectors.levels.statements import Limits
+from daqsvc.settings.alarms import StartUp
 from daqsvc.settings.describe import describe
 
 VOTING = """[[alarms]]
@@ -43,7 +41,7 @@ machine_with = partial(parsed, LAVAL)
 def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
     machine = machine_with(STARTS)
     assert machine.warnings == ()
-    rule = alarm_rules(machine)[-1]
+    rule = alarm_rule(machine.alarms[-1])
     assert isinstance(rule, VotingRule)
     assert (rule.sensors, rule.vote, rule.trip_multiply) == (("probe-x", "probe-y"), 2, 2.0)
     assert (rule.group, rule.setpoint.alert, rule.latching) == ("shaft", 45.0, False)
@@ -53,9 +51,9 @@ def test_a_voting_alarm_becomes_a_rule_that_is_judged_and_described():
 
 
 def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():
-    handling = alarm_handling(machine_with())
-    assert handling.chatter == ChatterLimit(5, 60_000_000_000, 60_000_000_000)
-    assert handling.flood == FloodLimit(10, 600_000_000_000)
+    handling = machine_with().alarm_handling
+    assert (handling.chatter_raises, handling.chatter_window_s, handling.chatter_quiet_s) == (5, 60.0, 60.0)
+    assert (handling.flood_alarms, handling.flood_window_s) == (10, 600.0)
     assert handling.start_up is None
     assert handling.shelve_at_most_s == 28_800.0
     switched_off = machine_with(
@@ -63,26 +61,26 @@ def test_what_holds_for_all_alarms_has_defaults_and_can_be_switched_off():
         ("flood_alarms = 10", "flood_alarms = 0"),
         ("28_800.0", "60.0"),
     )
-    handling = alarm_handling(switched_off)
-    assert (handling.chatter, handling.flood, handling.shelve_at_most_s) == (None, None, 60.0)
+    handling = switched_off.alarm_handling
+    assert (handling.chatter_raises, handling.flood_alarms, handling.shelve_at_most_s) == (0, 0, 60.0)
 
 
 def test_a_start_up_is_recognised_by_what_the_file_says():
-    assert alarm_handling(machine_with(STARTS)).start_up == StartUp(
+    assert machine_with(STARTS).alarm_handling.start_up == StartUp(
         detector="rotor-bank",
         measure="speed",
         between=(100.0, 500.0),
         change_per_s=20.0,
-        at_most_ns=120_000_000_000,
+        at_most_s=120.0,
     )
 
 
 def test_evidence_and_group_reach_the_rules():
     machine = machine_with(('detector = "rotor-bank"', 'detector = "rotor-bank"\nevidence_nats = 18.0'))
-    rule = alarm_rules(machine)[-1]
+    rule = alarm_rule(machine.alarms[-1])
     assert rule == DiagnosisRule("rotor-fault", "rotor-bank", latching=rule.latching, evidence_nats=18.0)
     assert "18 nats at least" in describe(machine)
-    first = alarm_rules(machine)[0]
+    first = alarm_rule(machine.alarms[0])
     assert isinstance(first, LevelRule)
     assert (first.group, first.trip_multiply) == ("machine", 1.0)
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 from support.machine_files import LAVAL, MACHINES, MOTOR, changed, only_problem, parsed, problems_of
 
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.voting import VotingRule
-from daqsvc.assembly_alarms import alarm_handling, alarm_rules
 from daqsvc.detectors.levels.detector import LevelDetector
 from daqsvc.detectors.levels.trends import TrendDetector
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.publish.make import watched
 from daqsvc.settings import load_machine_file, parse_machine_file
+from daqsvc.settings.alarms import StartUp
 from daqsvc.settings.describe import describe
 
 PUMP = MACHINES / "modbus-vibration-temperature.toml"
@@ -68,7 +68,7 @@ def test_a_pump_becomes_detectors_rules_and_readings():
         (TrendDetector, "trends/drive-end", 1),
         (TrendDetector, "trends/other-end", 1),
     ]
-    vibration, _, temperature, _ = alarm_rules(machine)
+    vibration, _, temperature, _ = map(alarm_rule, machine.alarms)
     assert isinstance(vibration, VotingRule)
     assert (vibration.sensors, vibration.vote, vibration.measure) == (("de-axial", "de-radial"), 1, "value")
     assert isinstance(temperature, LevelRule)
@@ -107,7 +107,7 @@ def test_the_levels_of_a_window_are_described_as_one():
 
 def test_a_gap_voltage_of_a_proximity_probe_has_a_window_too():
     machine = parsed(LAVAL, ("[mqtt]", GAP_ALARM))
-    rule = alarm_rules(machine)[-1]
+    rule = alarm_rule(machine.alarms[-1])
     assert rule.setpoint == Setpoint(alert=-8.0, deadband=0.2, alert_low=-12.0)
     assert "-12..-8 V" in describe(machine)
 
@@ -115,7 +115,7 @@ def test_a_gap_voltage_of_a_proximity_probe_has_a_window_too():
 def test_a_speed_that_is_polled_tells_of_a_start_up():
     machine = parsed(PUMP, *starting_up())
     assert machine.warnings == ()
-    assert alarm_handling(machine).start_up == StartUp(
+    assert machine.alarm_handling.start_up == StartUp(
         detector="levels/shaft-speed", measure="value", between=(100.0, 2700.0)
     )
 

@@ -9,7 +9,7 @@ from support.clocks import SettableClock
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Identity
-from daqsvc.alarms.handling import AlarmHandling
+from daqsvc.alarms.handling import CALM
 from daqsvc.alarms.manager import AlarmManager
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.publish.payloads import alarm_event, alarm_payload
@@ -21,10 +21,32 @@ if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
     from daqsvc.alarms.status import AlarmStatus
     from daqsvc.diagnosis.record import Severity
+    from daqsvc.settings.alarms import AlarmHandling
 
 RIG = Identity("lab", "edge-1", "rig")
 SECOND_NS = 1_000_000_000
 BANK_SENSORS = ("probe-x", "probe-y", "keyphasor")
+
+
+def alarm_handling(
+    *,
+    chatter: tuple[int, float, float] = (0, 60.0, 60.0),
+    flood: tuple[int, float] = (0, 600.0),
+    **given: Any,
+) -> AlarmHandling:
+    """The table [alarm_handling]: raises, window, quiet time of chatter; alarms, window of a flood; in s."""
+    raises, window_s, quiet_s = chatter
+    alarms, flood_window_s = flood
+    return CALM.model_copy(
+        update={
+            "chatter_raises": raises,
+            "chatter_window_s": window_s,
+            "chatter_quiet_s": quiet_s,
+            "flood_alarms": alarms,
+            "flood_window_s": flood_window_s,
+            **given,
+        }
+    )
 
 
 class AlarmRig:
@@ -35,7 +57,7 @@ class AlarmRig:
     ) -> None:
         self.clock = clock or SettableClock()
         self.rules = rules
-        self.handling = handling or AlarmHandling()
+        self.handling = handling or CALM
         self.manager = AlarmManager(RIG, rules, self.clock, handling=self.handling)
         self.events: list[AlarmEvent] = []
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.alarm_rig import RIG, AlarmRig, kinds
+from support.alarm_rig import RIG, AlarmRig, alarm_handling, kinds
 from support.clocks import SettableClock
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.alarms.handling import AlarmHandling
 from daqsvc.alarms.rules import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.alarms.start_up import StartUp
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.alarms.voting import VotingRule
 from daqsvc.detectors.levels.statements import Limits
 from daqsvc.detectors.levels.trends import TrendChannel, TrendDetector
 from daqsvc.diagnosis.detector import Window
+from daqsvc.settings.alarms import StartUp
 
 SECOND_NS = 1_000_000_000
 NAN = float("nan")
@@ -55,7 +54,7 @@ class Trends:
 
 def test_a_speed_among_the_registers_multiplies_limits_at_a_start_up():
     rule = LevelRule("vibration", "vx", "value", ZONES, trip_multiply=2.0)
-    trends = Trends(rule, sensors=("speed", "vx"), handling=AlarmHandling(start_up=STARTS))
+    trends = Trends(rule, sensors=("speed", "vx"), handling=alarm_handling(start_up=STARTS))
     assert trends.read(0.0, 1.0) == []
     assert trends.read(900.0, 5.0) == []  # through the critical speed
     assert trends.read(1800.0, 5.6) == [("vibration", "raised")]

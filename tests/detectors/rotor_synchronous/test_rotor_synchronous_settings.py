@@ -10,7 +10,7 @@ import pytest
 from support.machine_files import LAVAL, MACHINES, changed, only_problem, parsed, problems_of
 from support.run_ups import RATE_HZ, record
 
-from daqsvc.assembly_alarms import alarm_rules
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.detectors.make import detectors
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.rotor.calibration.file import CalibrationRecord, save_calibration, save_record
@@ -92,7 +92,7 @@ def test_ac_coupled_probes_are_known_by_their_sensors():
 def test_an_alarm_may_follow_it():
     given = machine()
     assert given.detectors == ("rotor-synchronous",)
-    assert next(rule.detector for rule in alarm_rules(given)) == "rotor-synchronous"
+    assert next(rule.detector for rule in map(alarm_rule, given.alarms)) == "rotor-synchronous"
 
 
 def test_both_rotor_detectors_watch_one_machine():
