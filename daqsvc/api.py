@@ -17,6 +17,7 @@ from daqsvc.diagnosis.detector import Detector, Window
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.recorded import Evaluated, Recorded, RecordedDetector, RecordingOptions, statements_of
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.outbox.messages import OutboxMessage
 from daqsvc.publish.output import Output, OutputPort, Watched
@@ -47,6 +48,7 @@ __all__ = [
     "Diagnosis",
     "Driver",
     "DriverPlugin",
+    "Evaluated",
     "Finding",
     "FrameLayout",
     "Judgement",
@@ -62,6 +64,9 @@ __all__ = [
     "OutputPort",
     "PackedLayout",
     "Reading",
+    "Recorded",
+    "RecordedDetector",
+    "RecordingOptions",
     "SampleBlock",
     "Section",
     "Sensor",
@@ -78,4 +83,5 @@ __all__ = [
     "choice",
     "in_thread",
     "run_with_reconnect",
+    "statements_of",
 ]

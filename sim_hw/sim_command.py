@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_USAGE, ArgumentParser
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
 from daqsvc.confined.small_toml import TomlFileError, read_toml
 from sim_hw.arguments import add_random, add_recording, add_speed, misplaced, positive, whole
 
@@ -168,7 +168,7 @@ async def _simulate(arguments: argparse.Namespace) -> int:
             summary["buses"][bus] = node.address
             summary["streams"] |= node.figures()
     print(json.dumps(summary), flush=True)  # noqa: T201 - this is the output
-    return 0
+    return EXIT_OK
 
 
 async def _until_played(nodes: Sequence[SimNode], pacer: Pacer, stop: asyncio.Event) -> bool:

@@ -115,7 +115,6 @@ def _by_options(arguments: argparse.Namespace) -> Runner:
         ValueError: they contradict each other.
     """
     from daqsvc.offline import machine_options as options  # noqa: PLC0415
-    from daqsvc.offline.orders import order_detectors  # noqa: PLC0415
     from daqsvc.offline.runner import Runner  # noqa: PLC0415
 
     # Without the verb itself, which does not go to another process.
@@ -131,6 +130,8 @@ def _by_options(arguments: argparse.Namespace) -> Runner:
         )
         return Runner(partial(options.bearing_machine, told), healthy)
     if by_orders(told):
+        from daqsvc.offline.orders import order_detectors  # noqa: PLC0415 - brings SciPy's transforms
+
         healthy = options.recording_options(told, in_memory=True, healthy=told.baseline)
         detectors = partial(order_detectors, told.false_alarm_probability)
         return Runner(partial(options.accelerometer_machine, told), healthy, detectors)

@@ -91,8 +91,6 @@ class CalibrateCommand:
             return _keep(self._calibrated_rotor(machine, recordings, arguments), arguments)
         except (RefusedError, RecordingError, NotCalibratableError, NotIdentifiableError) as error:
             return _refuse(str(error), as_json=arguments.json)
-        except ValueError as error:
-            self._parser.error(str(error))
         except _FailedError as error:
             return _fail(str(error))
 
@@ -159,14 +157,21 @@ class CalibrateCommand:
     def _calibrated_bearings(
         self, machine: MachineFile | None, recording: str, arguments: argparse.Namespace
     ) -> BearingBaseline:
+        from daqsvc.bearing.identify import NotIdentifiableError  # noqa: PLC0415
         from daqsvc.detectors.bearing.calibrating import calibrate_bearings  # noqa: PLC0415
         from daqsvc.detectors.bearing.recorded import RecordedBearings  # noqa: PLC0415
         from daqsvc.offline.machine_options import bearing_machine  # noqa: PLC0415
+        from daqsvc.recording.errors import RefusedError  # noqa: PLC0415
 
         runner = self._runner(bearing_machine, machine, arguments)
         (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
         loaded = runner.load(recording, only=bearings.sensors)
-        return calibrate_bearings(runner.machine, bearings.given, loaded, together=machine is None)
+        try:
+            return calibrate_bearings(runner.machine, bearings.given, loaded, together=machine is None)
+        except (RefusedError, NotIdentifiableError):
+            raise
+        except ValueError as error:
+            self._parser.error(str(error))  # masses and springs that the rate of the stream is too low for
 
 
 def _uncalibrated(machine: MachineFile) -> MachineFile:

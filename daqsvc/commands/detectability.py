@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daqsvc.commands.arguments import EXIT_OK
 from daqsvc.commands.option_types import positive
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class DetectabilityCommand:
             _complain(f"{arguments.file}: {error}")
             return _FAILED
         print(json.dumps(as_json(found, machine)) if arguments.json else as_text(found, machine))  # noqa: T201
-        return 0
+        return EXIT_OK
 
 
 def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
@@ -153,7 +154,7 @@ def _tell_vector(machine: MachineFile, arguments: argparse.Namespace) -> int:
         _complain(f"{arguments.file}: {error}")
         return _FAILED
     print(json.dumps(vector_json(found, machine)) if arguments.json else vector_text(found, machine))  # noqa: T201
-    return 0
+    return EXIT_OK
 
 
 def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability:

@@ -30,7 +30,7 @@ from daqsvc.recording.channels import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 MOST_CHANNELS = 2
 """Accelerometers that a bearing is judged by."""
@@ -40,10 +40,22 @@ FALSE_ALARM_PROBABILITY = 1e-3
 LIVE_REVOLUTIONS = 200
 TOLERANCE_PERCENT = 20.0
 
-_SHARED = ("--speed-rpm",)
-"""Of the options of a rotor, those that accelerometers have too."""
+_DEFAULTS = {
+    "--calibrate-revs": CALIBRATE_REVOLUTIONS,
+    "--false-alarms-per-1000-rev": FALSE_ALARMS_PER_1000_REV,
+    "--natural-frequency-tolerance": TOLERANCE_PERCENT,
+    "--damping-tolerance": TOLERANCE_PERCENT,
+}
+_ROTOR = (
+    *("--keyphasor", "--keyphasor-threshold", "--natural-frequency-hz", "--damping-ratio"),
+    *("--clearance-um", "--static-sag-um"),
+)
+_PROBES_ONLY = (
+    *("--probes", "--follow-orbit", *_ROTOR, "--calibrate-revs", "--false-alarms-per-1000-rev"),
+    *("--ac-coupled", "--natural-frequency-tolerance", "--damping-tolerance"),
+)
+"""Options of `analyze` that accelerometers have not."""
 _ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
-_ROTOR_ONLY = ("probes", "keyphasor", "natural_frequency_hz", "damping_ratio", "clearance_um", "sweep_rpm")
 
 
 def add_analyze_options(parser: argparse.ArgumentParser) -> None:
@@ -129,18 +141,13 @@ def _probe_misuse(arguments: argparse.Namespace, machine: Path | None, recording
         return f"{machines[0]} is not a recording; a machine file comes first, and there is only one"
     if arguments.unit in ACCELERATION_UNITS:
         return f"--unit {arguments.unit}: proximity probes measure in {', '.join(LENGTH_UNITS)}"
-    given = _rotor_options(arguments)
     if machine is not None:
-        extra = [name for name, is_there in given.items() if is_there]
+        extra = _given(arguments, ("--probes", "--speed-rpm", *_PROBES_ONLY[1:]))
         return f"{', '.join(extra)}: the machine file says this; leave it out" if extra else ""
-    known = [
-        name
-        for name in ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um")
-        if given[name] and arguments.calibration is not None
-    ]
-    if known:
+    known = _given(arguments, ("--natural-frequency-hz", "--damping-ratio", "--static-sag-um"))
+    if known and arguments.calibration is not None:
         return f"{', '.join(known)}: the calibration says this; leave it out, or leave out --calibration"
-    return _lacking(arguments, given) or _unknown_channels(arguments)
+    return _lacking(arguments) or _unknown_channels(arguments)
 
 
 def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:
@@ -149,7 +156,8 @@ def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, record
         return _healthy_bearing_misuse(arguments, machine, recordings)
     if arguments.out is None and not arguments.json:
         return "nothing would be kept: give --out FILE, --json or both"
-    if machine is not None and (given := _rotor_given(arguments)):
+    rotor = ("--probes", "--speed-rpm", *_ROTOR, "--ac-coupled")
+    if machine is not None and (given := _given(arguments, rotor)):
         return f"{', '.join(given)}: the machine file says this; leave it out"
     if arguments.live:
         return _live_misuse(arguments, machine, recordings)
@@ -441,27 +449,26 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: st
     add("--ac-coupled", action="store_true", help="the probes have no mean position: do not look at it")
 
 
-def _rotor_options(arguments: argparse.Namespace) -> dict[str, bool]:
-    """Which of the options of `_add_rotor_of_analyze` are given."""
-    return {
-        "--probes": arguments.probes is not None,
-        "--speed-rpm": arguments.speed_rpm is not None,
-        "--follow-orbit": arguments.follow_orbit,
-        "--keyphasor": arguments.keyphasor is not None,
-        "--keyphasor-threshold": arguments.keyphasor_threshold is not None,
-        "--natural-frequency-hz": arguments.natural_frequency_hz is not None,
-        "--damping-ratio": arguments.damping_ratio is not None,
-        "--clearance-um": arguments.clearance_um is not None,
-        "--static-sag-um": arguments.static_sag_um is not None,
-        "--calibrate-revs": arguments.calibrate_revs != CALIBRATE_REVOLUTIONS,
-        "--false-alarms-per-1000-rev": arguments.false_alarms_per_1000_rev != FALSE_ALARMS_PER_1000_REV,
-        "--ac-coupled": arguments.ac_coupled,
-        "--natural-frequency-tolerance": arguments.natural_frequency_tolerance != TOLERANCE_PERCENT,
-        "--damping-tolerance": arguments.damping_tolerance != TOLERANCE_PERCENT,
-    }
+def _given(arguments: argparse.Namespace, options: Iterable[str]) -> list[str]:
+    """Those of the options that say something else than by default."""
+    return [
+        option
+        for option in options
+        if (value := _value(arguments, option)) is not None
+        and value is not False
+        and value != _DEFAULTS.get(option)
+    ]
 
 
-def _lacking(arguments: argparse.Namespace, given: dict[str, bool]) -> str:
+def _missing(arguments: argparse.Namespace, options: Iterable[str]) -> list[str]:
+    return [option for option in options if _value(arguments, option) is None]
+
+
+def _value(arguments: argparse.Namespace, option: str) -> object:
+    return getattr(arguments, option.removeprefix("--").replace("-", "_"))
+
+
+def _lacking(arguments: argparse.Namespace) -> str:
     needed = ["--probes"]
     if arguments.calibration is None:
         needed += ["--natural-frequency-hz", "--damping-ratio"]
@@ -469,7 +476,7 @@ def _lacking(arguments: argparse.Namespace, given: dict[str, bool]) -> str:
         needed.append("--speed-rpm")
         if arguments.keyphasor_threshold is not None:
             return "--keyphasor-threshold without --keyphasor: name the channel of the keyphasor"
-    missing = [name for name in needed if not given[name]]
+    missing = _missing(arguments, needed)
     if not missing:
         return ""
     instead = ", or --keyphasor in place of --speed-rpm" if "--speed-rpm" in missing else ""
@@ -480,26 +487,11 @@ def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
     """What is wrong with the options of accelerometers together; empty if nothing is."""
     if machine is not None:
         return "--channels, --baseline: the machine file says what is measured; leave them out"
-    given = {
-        **_rotor_options(arguments),
-        "--calibration": arguments.calibration is not None,
-        "--plot": arguments.plot is not None,
-    }
-    if extra := [name for name, is_there in given.items() if is_there and name not in _SHARED]:
+    if extra := _given(arguments, (*_PROBES_ONLY, "--calibration", "--plot")):
         return f"{', '.join(extra)}: not with --channels and --baseline; leave it out"
-    missing = [
-        name
-        for name, value in (
-            ("--channels", arguments.channels),
-            ("--baseline", arguments.baseline),
-            ("--speed-rpm", arguments.speed_rpm),
-        )
-        if value is None
-    ]
-    if missing:
+    if missing := ", ".join(_missing(arguments, ("--channels", "--baseline", "--speed-rpm"))):
         bearing = "to judge a bearing, --bearing or --orders; " if arguments.baseline is None else ""
-        told = ", ".join(missing)
-        return f"{bearing}to compare accelerometers with a healthy run, {told} must be given too"
+        return f"{bearing}to compare accelerometers with a healthy run, {missing} must be given too"
     if arguments.speed_rpm.orbit:
         return "--speed-rpm orbit:N needs two probes; with --channels give the nominal speed alone"
     if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
@@ -518,15 +510,9 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
             "--calibration: goes with a machine file, whose bearings it was learnt for; with --bearing or "
             "--orders give the healthy recording itself, --baseline FILE"
         )
-    given = _rotor_options(arguments)
-    if extra := [name for name, is_there in given.items() if is_there and name not in _SHARED]:
+    if extra := _given(arguments, _PROBES_ONLY):
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
-    missing = [
-        name
-        for name, value in (("--channels", arguments.channels), ("--speed-rpm", arguments.speed_rpm))
-        if value is None
-    ]
-    if missing:
+    if missing := _missing(arguments, ("--channels", "--speed-rpm")):
         yield f"to judge a bearing, {', '.join(missing)} must be given too"
     elif len(arguments.channels) > MOST_CHANNELS:
         yield f"--channels names {len(arguments.channels)} accelerometers; a bearing is judged by one or two"
@@ -544,10 +530,10 @@ def _healthy_bearing_misuse(
     """What is wrong with the options of bearings together; empty if nothing is."""
     if machine is not None:
         return "--channels, --bearing, --orders: the machine file says this; leave them out"
-    if extra := [name for name in _ROTOR_ONLY if getattr(arguments, name) is not None]:
-        return f"--{extra[0].replace('_', '-')}: not with --channels; a bearing is calibrated by itself"
-    needed = {"--channels": arguments.channels, "--speed-rpm": arguments.speed_rpm}
-    missing = [name for name, value in needed.items() if value is None]
+    rotor = ("--probes", "--keyphasor", "--natural-frequency-hz", "--damping-ratio", "--clearance-um")
+    if extra := _given(arguments, (*rotor, "--sweep-rpm")):
+        return f"{extra[0]}: not with --channels; a bearing is calibrated by itself"
+    missing = _missing(arguments, ("--channels", "--speed-rpm"))
     if arguments.bearing is None and arguments.orders is None:
         missing.append("--bearing or --orders")
     if missing:
@@ -557,21 +543,6 @@ def _healthy_bearing_misuse(
     if len(arguments.channels) > MOST_CHANNELS:
         return f"--channels names {len(arguments.channels)} accelerometers; give one or two"
     return bearing_recording_misuse(arguments, recordings)
-
-
-def _rotor_given(arguments: argparse.Namespace) -> list[str]:
-    options = {
-        "--probes": arguments.probes,
-        "--speed-rpm": arguments.speed_rpm,
-        "--keyphasor": arguments.keyphasor,
-        "--keyphasor-threshold": arguments.keyphasor_threshold,
-        "--natural-frequency-hz": arguments.natural_frequency_hz,
-        "--damping-ratio": arguments.damping_ratio,
-        "--clearance-um": arguments.clearance_um,
-        "--static-sag-um": arguments.static_sag_um,
-        "--ac-coupled": arguments.ac_coupled or None,
-    }
-    return [option for option, value in options.items() if value is not None]
 
 
 def _live_misuse(arguments: argparse.Namespace, machine: Path | None, recordings: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_FAILED
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK
 from sim_hw import arguments as arguments_of
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class ReproduceCommand:
             )
         _print(rows, as_json=arguments.json)
         _note(f"figures and tables are in {out}")
-        return 0
+        return EXIT_OK
 
 
 def snr_db(text: str) -> float:

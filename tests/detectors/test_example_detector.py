@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from support.example_packages import DETECTOR, DOCS, installed
 from support.machine_files import MOTOR, problems_of
 
+from daqsvc import api
 from daqsvc.alarms.make import alarm_rule
 from daqsvc.cli import main
 from daqsvc.detectors.make import detectors
@@ -18,7 +21,6 @@ from daqsvc.settings import describe, parse_machine_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -89,9 +91,9 @@ def test_missing_samples_and_silence_hold_the_decision() -> None:
     assert (dead.decision, dead.statistics["crest_factor"]) == ("normal", 0.0)
 
 
-def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`analyze` knows no detector: what it shows of one comes with the plugin."""
-    file = tmp_path / "machine.toml"
+def two_sensors(folder: Path) -> Path:
+    """The motor with a second accelerometer, and a knock in a recording of each of the two by itself."""
+    file = folder / "machine.toml"
     sensor = MOTOR.read_text().partition("[[sensors]]")[2].partition("[pipeline]")[0]
     other = "[[sensors]]" + sensor.replace('"accel-de"', '"accel-nde"').replace('"de"', '"nde"')
     text = MOTOR.read_text().replace("samples_per_frame = 30", "samples_per_frame = 15")
@@ -100,7 +102,13 @@ def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[
     knocking = np.sin(np.arange(3 * RATE_HZ) / 9.0)
     knocking[RATE_HZ + 7] = 40.0
     for name in ("accel-de", "accel-nde"):
-        np.savez(tmp_path / f"{name}.npz", **{name: knocking}, fs=RATE_HZ)
+        np.savez(folder / f"{name}.npz", **{name: knocking}, fs=RATE_HZ)
+    return file
+
+
+def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`analyze` knows no detector: what it shows of one comes with the plugin."""
+    file = two_sensors(tmp_path)
     assert main(["analyze", str(file), str(tmp_path / "accel-de.npz"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["detectors"]["crest"]
     assert [step["decision"] for step in found["history"]] == ["normal", "alert", "normal"]
@@ -109,6 +117,26 @@ def test_it_judges_recordings_too(tmp_path: Path, capsys: pytest.CaptureFixture[
     # The other bearing alone has nothing for it.
     assert main(["analyze", str(file), str(tmp_path / "accel-nde.npz"), "--json"]) == 0
     assert set(json.loads(capsys.readouterr().out)["detectors"]) == {"levels/accel-nde"}
+
+
+def test_it_may_say_what_else_is_shown_of_a_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crest = importlib.import_module("crest")
+
+    class Shown(api.RecordedDetector[Any]):
+        def evaluate(self, recorded: api.Recorded, given: Any, progress: Any) -> api.Evaluated:
+            said = api.statements_of(crest.CrestDetector(recorded.machine, given), recorded)
+            return api.Evaluated(said, draw=lambda prefix: Path(f"{prefix}-crest.svg").write_text("<svg/>"))
+
+    def shown(_self: Any, machine: MachineFile, given: Any, options: api.RecordingOptions) -> Shown:
+        return Shown(machine, given, options)
+
+    monkeypatch.setattr(crest.CrestPlugin, "recorded", shown)
+    file = two_sensors(tmp_path)
+    assert main(["analyze", str(file), str(tmp_path / "accel-de.npz"), "--plot", str(tmp_path / "out")]) == 0
+    assert "crest: normal (normal, alert at 1.000 s)" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["accel-de-crest.svg"]
 
 
 def test_what_is_wrong_in_its_table_is_said() -> None:

@@ -13,6 +13,7 @@ NAMES = {
     *("Detector", "DetectorPlugin", "WindowDetector", "Judgement", "Window", "Diagnosis", "Reading"),
     *("Output", "OutputPlugin", "OutputPort", "OutboxMessage", "Watched", "Condition", "Level"),
     *("MachineFile", "Section", "Bus", "Layout", "PackedLayout", "Stream", "Sensor", "Name", "Text"),
+    *("RecordedDetector", "Recorded", "RecordingOptions", "Evaluated", "statements_of"),
     *("AssemblyError", "Finding", "StreamWords", "choice"),
 }
 TYPE_ALIASES = {"Name", "Text", "Sensor"}
