@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import math
 import os
 import socket
 import stat
@@ -21,12 +20,20 @@ import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
-from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.alarms.text_validation import printable, refuse_twice
+from daqsvc.alarms.commands import (
+    CommandMessage,
+    CommandOutcome,
+    DurationS,
+    Line,
+    Person,
+    Reason,
+    Verb,
+    faults_of,
+)
 from daqsvc.outbox.files import is_possessed, is_read_only
 from daqsvc.outbox.reading import JOURNAL_NAME
 
@@ -34,7 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.commands import AlarmCommand, CommandHandler
 
 log = logging.getLogger(__name__)
 
@@ -67,39 +74,19 @@ class UnreachableError(ControlError):
     """A service runs on the store, but has no control socket there."""
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number of seconds")
-    return value
-
-
-_Words = Annotated[str, AfterValidator(printable)]
-
-
-class ControlRequest(BaseModel):
+class ControlRequest(CommandMessage):
     """What a person asks for."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, populate_by_name=True)
+    model_config = ConfigDict(populate_by_name=True)
 
     schema_: Literal["daqsvc.control/1"] = Field(alias="schema")
     verb: Annotated[Verb, Field(strict=False)]
-    alarm: Annotated[_Words, Field(min_length=1, max_length=200)]
-    by: Annotated[_Words, Field(min_length=1, max_length=100)]
-    machine: Annotated[_Words, Field(max_length=200)] | None = None
-    occurrence: Annotated[_Words, Field(min_length=1, max_length=100)] | None = None
-    duration_s: Annotated[float, Field(gt=0), AfterValidator(_finite)] | None = None
-    reason: Annotated[_Words, Field(max_length=500)] = ""
-
-    def command(self) -> AlarmCommand:
-        """The command that it asks for."""
-        return AlarmCommand(
-            verb=self.verb,
-            alarm=self.alarm,
-            by=self.by,
-            occurrence=self.occurrence,
-            duration_s=self.duration_s,
-            reason=self.reason,
-        )
+    alarm: Annotated[Line, Field(min_length=1, max_length=200)]
+    by: Person
+    machine: Annotated[Line, Field(max_length=200)] | None = None
+    occurrence: Annotated[Line, Field(min_length=1, max_length=100)] | None = None
+    duration_s: DurationS | None = None
+    reason: Reason = ""
 
 
 class ControlAnswer(BaseModel):
@@ -312,7 +299,7 @@ class ControlServer:
             self.counters.malformed += 1
             return ControlAnswer(accepted=False, reason=f"{error}")
         self.counters.requests += 1
-        outcome = await self._execute(request.command(), source)
+        outcome = await self._execute(request.command(request.verb), source)
         return ControlAnswer(accepted=outcome.accepted, reason=outcome.reason, events=outcome.events)
 
 
@@ -325,10 +312,9 @@ def parse_request(line: bytes, machine: str) -> ControlRequest:
     if len(line) > LONGEST_LINE:
         raise ValueError(f"the request is longer than {LONGEST_LINE} bytes")
     try:
-        request = ControlRequest.model_validate_json(line)
+        request = ControlRequest.read(line)
     except ValidationError as error:
-        raise ValueError(f"the request is not valid, {_first_problem(error)}") from None
-    refuse_twice(line)
+        raise ValueError(f"the request is not valid, {faults_of(error, 'it')[0]}") from None
     if request.machine not in {None, machine}:
         raise ValueError(f"this service watches {machine!r}, not {request.machine!r}")
     return request
@@ -356,7 +342,7 @@ def request_of(command: AlarmCommand, machine: str | None) -> ControlRequest:
             reason=command.reason,
         )
     except ValidationError as error:
-        raise ControlError(f"that cannot be asked, {_first_problem(error)}") from None
+        raise ControlError(f"that cannot be asked, {faults_of(error, 'it')[0]}") from None
 
 
 def events_waiting(store: Path, timeout_s: float = PATIENCE_S) -> int:
@@ -525,12 +511,6 @@ def _address(path: Path) -> Iterator[str]:
         yield f"/proc/self/fd/{directory}/{path.name}"
     finally:
         os.close(directory)
-
-
-def _first_problem(error: ValidationError) -> str:
-    problem = error.errors(include_url=False)[0]
-    # What checks of our own find pydantic marks by their exception.
-    return f"{'.'.join(map(str, problem['loc'])) or 'it'}: {problem['msg'].removeprefix('Value error, ')}"
 
 
 def _in_short(error: Exception) -> str:

@@ -1,10 +1,16 @@
-"""What a person may ask of an alarm, and what comes of it."""
+"""What a person may ask of an alarm, how that is written whichever way it comes, and what comes of it."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeAlias
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+if TYPE_CHECKING:
+    from typing import Self
 
 
 class Verb(StrEnum):
@@ -46,6 +52,85 @@ class AlarmCommand:
     reason: str = ""
 
 
+def printable(text: str) -> str:
+    """Text that does to a terminal, or to the order of the letters about it, nothing but stand there.
+
+    Control characters (C0 and C1), line and paragraph separators and what turns the direction of writing are
+    none (Unicode categories Other and Separator, but for the space).
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if not text.isprintable():
+        raise ValueError("must be printable, in one line")
+    return text
+
+
+Line: TypeAlias = Annotated[
+    str,
+    AfterValidator(printable),
+    Field(
+        json_schema_extra={
+            "pattern": r"^[^\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]*$"
+        }
+    ),
+]
+"""Printable text in one line; the pattern is what a schema can say of that."""
+Person: TypeAlias = Annotated[Line, Field(min_length=1, max_length=100)]
+Reason: TypeAlias = Annotated[Line, Field(max_length=500)]
+DurationS: TypeAlias = Annotated[float, Field(gt=0)]
+
+
+class CommandMessage(BaseModel):
+    """A command as JSON: what all ways in have in common. The keys in their order are those of each way."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    if TYPE_CHECKING:
+        alarm: str
+        by: str
+        duration_s: float | None
+        occurrence: str | None
+        reason: str
+
+    @classmethod
+    def read(cls, raw: bytes) -> Self:
+        """The command in JSON without deep nesting.
+
+        Raises:
+            ValidationError: it is none.
+            ValueError: a key stands twice: nobody knows which one is meant.
+        """
+        told = cls.model_validate_json(raw)
+        json.loads(raw, object_pairs_hook=_once)
+        return told
+
+    def command(self, verb: Verb) -> AlarmCommand:
+        """What it asks for by ``verb``."""
+        return AlarmCommand(
+            verb=verb,
+            alarm=self.alarm,
+            by=self.by,
+            duration_s=self.duration_s,
+            occurrence=self.occurrence,
+            reason=self.reason,
+        )
+
+
+def faults_of(error: ValidationError, whole: str) -> list[str]:
+    """What is wrong with a command, each with its key.
+
+    Args:
+        error: what `CommandMessage` says.
+        whole: what the command as a whole is called.
+    """
+    return [
+        # What checks of our own find pydantic marks by their exception.
+        f"{'.'.join(map(str, fault['loc'])) or whole}: {fault['msg'].removeprefix('Value error, ')}"
+        for fault in error.errors(include_url=False)
+    ]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandOutcome:
     """What came of a command.
@@ -72,3 +157,12 @@ class CommandHandler(Protocol):
             source: the way it came, for the audit log, e.g. ``"mqtt"``.
         """
         ...
+
+
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in made if keys.count(key) > 1)
+        raise ValueError(f"key {twice!a} stands twice; say it once")
+    return made

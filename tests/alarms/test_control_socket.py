@@ -115,7 +115,7 @@ async def test_the_client_and_the_server_understand_each_other(tmp_path: Path) -
     async with serving(tmp_path, desk):
         outcome = await asyncio.to_thread(ask, tmp_path, request)
     assert outcome == CommandOutcome(accepted=False, reason="no alarm is named 'nothing'")
-    assert desk.told[0][0] == request.command()
+    assert desk.told[0][0] == request.command(request.verb)
 
 
 @pytest.mark.parametrize(

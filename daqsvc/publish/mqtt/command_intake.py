@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 from pydantic import ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
-from daqsvc.alarms.text_validation import refuse_twice
+from daqsvc.alarms.commands import CommandOutcome, Verb, faults_of
 from daqsvc.outbox.command_ids import REMEMBERED
 from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import stamp_now
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.alarms.commands import CommandHandler
+    from daqsvc.alarms.commands import AlarmCommand, CommandHandler
     from daqsvc.outbox.command_ids import CommandIds
     from daqsvc.publish.connection import Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
@@ -201,14 +200,7 @@ class CommandIntake:
             )
         self._check_age(told)
         await self._check_new(machine, told)
-        return AlarmCommand(
-            verb=Verb(verb),
-            alarm=told.alarm,
-            by=told.by,
-            duration_s=told.duration_s,
-            occurrence=told.occurrence,
-            reason=told.reason,
-        )
+        return told.command(Verb(verb))
 
     def _read(self, asked: bytes) -> CommandPayload:
         if len(asked) > self._settings.max_bytes:
@@ -217,22 +209,16 @@ class CommandIntake:
                 f"it has {len(asked)} bytes; a command has at most {self._settings.max_bytes}"
             )
         try:
-            told = CommandPayload.model_validate_json(asked)
+            return CommandPayload.read(asked)
         except ValidationError as error:
             self.counters.malformed += 1
-            found = [
-                f"{'.'.join(map(str, e['loc'])) or 'payload'}: {e['msg'].removeprefix('Value error, ')}"
-                for e in error.errors()
-            ]
             # The names of unknown keys are the sender's: nothing of them may write a line into a log.
-            shown = re.sub(r"[^ -~]", "?", "; ".join(found[:5]))[:_SHOWN_FAULTS]
+            found = "; ".join(faults_of(error, "payload")[:5])
+            shown = re.sub(r"[^ -~]", "?", found)[:_SHOWN_FAULTS]
             raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error
-        try:
-            refuse_twice(asked)
         except ValueError as error:
             self.counters.malformed += 1
             raise CommandRefusedError(f"{error}") from error
-        return told
 
     def _check_age(self, told: CommandPayload) -> None:
         now_ns = self._clock.wall_ns()
