@@ -52,8 +52,9 @@ demo: $(READY)
 test: $(READY)
 	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(TESTS) $(ARGS)
 
+# Property tests are tried with all their examples here, with a third of them in `make test`.
 test-long: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m long $(TESTS) $(ARGS)
+	@DAQSVC_EXAMPLES=all $(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m "long or hypothesis" $(TESTS) $(ARGS)
 
 hil: $(READY)
 	@tests/hil/run.sh $(ARGS)

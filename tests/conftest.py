@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 import pytest_asyncio
 from hypothesis import settings
+from support.examples import examples
 from support.paths import ROOT
 
 if TYPE_CHECKING:
@@ -22,7 +23,11 @@ if TYPE_CHECKING:
 # The machine that runs this may be slow and shared: what counts is what is right, not when.
 # The same examples in every run, so that a red run is red again; DAQSVC_ROAM=1 looks for new ones.
 settings.register_profile(
-    "daqsvc", deadline=None, print_blob=True, derandomize=os.environ.get("DAQSVC_ROAM") != "1"
+    "daqsvc",
+    deadline=None,
+    print_blob=True,
+    derandomize=os.environ.get("DAQSVC_ROAM") != "1",
+    max_examples=examples(100),
 )
 settings.load_profile("daqsvc")
 

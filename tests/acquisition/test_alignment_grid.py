@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.aligned_streams import Device, aligned
+from support.examples import examples
 
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
 from daqsvc.acquisition.alignment_source import FractionalDelay
@@ -131,7 +132,7 @@ def cut(draw, n):
     return [0, *sorted(inner), n]
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     data=st.data(), rate_hz=st.floats(300, 3000), offset_ms=st.floats(-20, 20), latency_ms=st.floats(0, 30)
 )
@@ -159,7 +160,7 @@ def test_rows_hold_the_signal_at_the_references_instants(data, rate_hz, offset_m
     assert there[max(0, math.ceil(lead_s * 1000.0) - begin) :].all()
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(gap=st.integers(0, 60), length=st.integers(1, 10))
 def test_what_is_lost_is_missing_for_the_reach_of_the_filter_and_no_longer(gap, length) -> None:
     cuts = list(range(0, 1001, 10))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.assembler import StreamAssembler, StreamCounters
 from daqsvc.acquisition.clock_line import clock_line
@@ -71,7 +72,7 @@ def check(blocks: list[SampleBlock], counters: StreamCounters) -> None:
         assert span == counters.samples_received + counters.samples_lost
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(
     seed=st.integers(0, 2**31),
     counter=st.sampled_from(sorted(COUNTERS)),
@@ -115,7 +116,7 @@ def test_whatever_the_counter_every_frame_is_counted_once(
     check(blocks, unit.counters)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(
     seed=st.integers(0, 2**31),
     n=st.integers(1, 40),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
@@ -93,7 +94,7 @@ def check_order(unit: StreamAssembler, blocks: list[SampleBlock]) -> None:
     assert span == unit.counters.samples_received + unit.counters.samples_lost
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(
     seed=st.integers(0, 2**31),
     ran_s=st.floats(3.0, 20.0),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.standing import StreamState
@@ -111,7 +112,7 @@ def test_a_device_that_changes_its_rate_while_it_is_watched_is_found_out(hz: flo
 
 
 @pytest.mark.long
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(
     seed=st.integers(0, 2**31),
     bits=st.sampled_from([8, 32, None]),

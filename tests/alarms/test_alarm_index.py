@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.alarm_rig import alarm_handling
 from support.clocks import SettableClock
+from support.examples import examples
 
 from daqsvc.alarms.commands import AlarmCommand, Verb
 from daqsvc.alarms.events import Doubt, Identity
@@ -249,7 +250,7 @@ OTHERS = st.one_of(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(st.lists(st.one_of(LEVELS, LEVELS, FOUND, FOUND, ORDERS, OTHERS), max_size=60))
 def test_what_is_found_by_index_is_what_a_walk_over_all_alarms_finds(steps):
     twins = Twins()

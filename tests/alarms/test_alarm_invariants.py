@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from support.alarm_rig import alarm_handling
 from support.clocks import SettableClock
+from support.examples import examples
 
 from daqsvc.alarms.alarm import FINDINGS
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -315,7 +316,7 @@ class Alarms(RuleBasedStateMachine):
             assert flood.own_state.is_active
 
 
-Alarms.TestCase.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)
+Alarms.TestCase.settings = settings(max_examples=examples(120), stateful_step_count=50, deadline=None)
 
 
 @pytest.mark.timeout(170)

@@ -9,6 +9,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, Verb
@@ -90,7 +91,7 @@ class Box:
         }
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=examples(500), deadline=None)
 @given(STEPS)
 def test_a_restart_changes_nothing(steps):
     steady, restarted = Box(), Box()
@@ -102,7 +103,7 @@ def test_a_restart_changes_nothing(steps):
         assert restarted.standing() == steady.standing()
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=examples(500), deadline=None)
 @given(STEPS)
 def test_what_nobody_judges_any_more_ends_normal(steps):
     box = Box()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 from test_bearing_model import random_parameters
 
 from daqsvc.bearing.model import BearingModel
@@ -148,7 +149,7 @@ def test_an_offset_of_a_sensor_does_not_show():
     assert np.nanmax(np.abs(generator.process(y))) < 1e-6
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(cuts=st.lists(st.integers(0, 3000), max_size=8), missing=st.lists(st.integers(0, 2999), max_size=3))
 def test_blocks_may_be_cut_anywhere(cuts, missing):
     y = np.random.default_rng(2).standard_normal((3000, 2))

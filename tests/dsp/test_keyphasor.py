@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.dsp.speed.keyphasor import KeyphasorTracker
 from sim_hw.plants.sensors import keyphasor_voltage
@@ -43,7 +44,7 @@ def angle_error(angle, expected):
     return float(np.abs(np.angle(np.exp(1j * (angle - expected)[known]))).max())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(period=st.floats(12.0, 300.0), phase=st.floats(0.05, 0.7), off=st.floats(0.9, 1.1))
 def test_edges_of_straight_flanks_are_exact(period, phase, off):
     subject = tracker(period * off, threshold=0.0, hysteresis=0.2)
@@ -58,7 +59,7 @@ def test_edges_of_straight_flanks_are_exact(period, phase, off):
     assert not np.isnan(track.angle_rad[math.ceil(edges[1]) :]).any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(per_rev=st.floats(48.0, 256.0), noise_v=st.floats(0.0, 0.05), seed=st.integers(0, 1000))
 def test_angle_of_a_simulated_probe(per_rev, noise_v, seed):
     revolution = np.arange(round(30 * per_rev)) / per_rev
@@ -70,7 +71,7 @@ def test_angle_of_a_simulated_probe(per_rev, noise_v, seed):
     assert track.period_samples == pytest.approx(per_rev, rel=0.01)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     period=st.floats(12.0, 100.0),
     phase=st.floats(0.05, 0.7),
@@ -95,7 +96,7 @@ def test_cutting_changes_nothing(period, phase, cuts, lost, skip):
     assert pieces.revolutions_since_edge == whole.revolutions_since_edge
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(period=st.floats(20.0, 200.0), skip=st.sets(st.integers(3, 17), max_size=10))
 def test_missing_pulses_are_counted_and_the_angle_runs_on(period, skip):
     subject = tracker(period, threshold=0.0, hysteresis=0.2)
@@ -108,7 +109,7 @@ def test_missing_pulses_are_counted_and_the_angle_runs_on(period, skip):
     assert angle_error(track.angle_rad, 2 * math.pi * (sample / period - 0.4)) < 1e-5
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     period=st.floats(40.0, 200.0),
     extra=st.dictionaries(st.integers(3, 17), st.floats(0.35, 0.65), max_size=8),
@@ -127,7 +128,7 @@ def test_double_pulses_are_rejected_and_bend_nothing(period, extra):
     assert angle_error(track.angle_rad, 2 * math.pi * (t / period - 0.3)) < 1e-5
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(part=st.floats(0.3, 0.7))
 def test_first_pulse_may_be_a_wrong_one(part):
     period = 50.0
@@ -143,7 +144,7 @@ def test_first_pulse_may_be_a_wrong_one(part):
     assert angle_error(track.angle_rad[settled], expected[settled]) < 1e-5
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(seed=st.integers(0, 1000), noise=st.floats(0.0, 0.09))
 def test_hysteresis_keeps_noise_from_making_edges(seed, noise):
     signal = ramps(64.0, 0.3, 20) * 0.3
@@ -208,7 +209,7 @@ def pulses(turns, *, width=0.2):
     return signal
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     slow=st.floats(120.0, 250.0),
     ratio=st.floats(2.0, 8.0),
@@ -249,7 +250,7 @@ def test_drift_is_followed_without_lag(seed, per_rev):
     assert np.degrees(error.std()) < 0.6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     period=st.floats(40.0, 200.0),
     early=st.lists(st.floats(-0.15, 0.15), min_size=2, max_size=2),

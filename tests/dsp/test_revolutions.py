@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
 from sim_hw.plants.sensors import keyphasor_voltage
@@ -105,7 +106,7 @@ def assert_sound(got):
 cuts_anywhere = st.lists(st.floats(0.0, 1.0), max_size=12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(period=st.floats(3.0, 100.0), cuts=cuts_anywhere)
 def test_fixed_speed_in_any_blocks(period, cuts):
     turns = np.arange(2000) / period
@@ -119,7 +120,7 @@ def test_fixed_speed_in_any_blocks(period, cuts):
     assert_same(process_in_pieces(FixedSpeedCutter(period), xy, None, cuts), whole)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     period=st.floats(12.0, 100.0),
     ratio=st.floats(0.4, 2.5),
@@ -161,7 +162,7 @@ def test_orbit_in_any_blocks(seed, cuts, lost, noise):
     assert_same(process_in_pieces(OrbitCutter(40.0), xy, None, cuts), whole)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(period=st.floats(12.0, 300.0), phase=st.floats(0.0, 0.99), off=st.floats(0.2, 5.0))
 def test_edges_of_straight_flanks_are_exact(period, phase, off):
     turns = phase + np.arange(round(14 * period)) / period
@@ -194,7 +195,7 @@ def test_constant_acceleration_leaves_no_error(fast, ratio, revolutions, down):
     assert np.abs(errors(got, turns)[0]).max() < 1e-3
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(direction=st.sampled_from([1, -1]), phase=st.floats(0.0, 1.0), noise_v=st.floats(0.0, 0.05))
 def test_run_up_over_1_to_8_with_a_simulated_probe(direction, phase, noise_v):
     # 107 to 856 rad/s in 3 s, sampled at 17445 Hz: 13 % faster from the first revolution to the next.
@@ -211,7 +212,7 @@ def test_run_up_over_1_to_8_with_a_simulated_probe(direction, phase, noise_v):
     assert error.std() < 4e-4 + 0.05 * noise_v
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     period=st.floats(30.0, 200.0),
     first=st.integers(6, 20),
@@ -235,7 +236,7 @@ def test_up_to_three_missing_pulses_are_bridged(period, first, missing, ratio):
     assert subject.counts.accepted == 39 - missing
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     period=st.floats(40.0, 200.0),
     ratio=st.sampled_from([1.0, 0.8, 1.25]),
@@ -256,7 +257,7 @@ def test_double_pulses_change_nothing(period, ratio, extra):
     assert subject.counts.rejected == len(extra)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     period=st.floats(16.0, 120.0),
     expected=st.sampled_from([0.5, 0.8, 1.0, 1.25, 2.0]),

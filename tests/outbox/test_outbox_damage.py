@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.messages import OutboxError
@@ -82,7 +83,7 @@ async def restarted(store, numbers):
         await outbox.close()
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(40), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_flipped_bytes(stores, data):
     kept, numbers = stores

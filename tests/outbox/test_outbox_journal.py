@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from support.examples import examples
 from support.journal_commits import commit
 
 from daqsvc.outbox import journal as journal_module
@@ -221,5 +222,5 @@ class Restarts(RuleBasedStateMachine):
         self.patch.undo()
 
 
-Restarts.TestCase.settings = settings(max_examples=40, stateful_step_count=20, deadline=None)
+Restarts.TestCase.settings = settings(max_examples=examples(40), stateful_step_count=20, deadline=None)
 TestRestarts = Restarts.TestCase

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from support.examples import examples
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.outbox import telemetry_file
@@ -134,5 +135,5 @@ class Keeping(RuleBasedStateMachine):
         self.directory.cleanup()
 
 
-Keeping.TestCase.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
+Keeping.TestCase.settings = settings(max_examples=examples(60), stateful_step_count=25, deadline=None)
 TestKeeping = Keeping.TestCase

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat, wavfile
+from support.examples import examples
 
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
@@ -82,7 +83,7 @@ def folder():
 
 @pytest.mark.parametrize("name", WRITERS)
 @given(samples=arrays(np.float64, st.tuples(st.integers(2, 12), st.integers(1, 3)), elements=FINITE))
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 def test_round_trip(folder, name, samples):
     path = folder / name
     path.write_bytes(WRITERS[name](samples))
@@ -106,7 +107,7 @@ def load_damaged(path, content):
 
 @pytest.mark.parametrize("name", WRITERS)
 @given(data=st.data())
-@settings(max_examples=120)
+@settings(max_examples=examples(120))
 def test_changed_bytes(folder, name, data):
     content = bytearray(WHOLE[name])
     # Heads and tails hold the structure, and deserve as many tries as all of the samples.
@@ -119,7 +120,7 @@ def test_changed_bytes(folder, name, data):
 
 @pytest.mark.parametrize("name", WRITERS)
 @given(data=st.data())
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_bytes_missing_or_too_many(folder, name, data):
     content = WHOLE[name]
     first, last = sorted(data.draw(st.tuples(*[st.integers(0, len(content))] * 2)))
@@ -128,7 +129,7 @@ def test_bytes_missing_or_too_many(folder, name, data):
 
 @pytest.mark.parametrize("name", WRITERS)
 @given(content=st.binary(max_size=300))
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_any_bytes(folder, name, content):
     load_damaged(folder / name, WHOLE[name][: len(content) % 7] + content)
 

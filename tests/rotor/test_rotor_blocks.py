@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.rotor.bank import ModelBank
 from daqsvc.rotor.decision import DecisionRules
@@ -52,7 +53,7 @@ def outcome(subject, data, cuts):
     return declared, report
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     rule=st.sampled_from(["cusum", "paper"]),
@@ -70,7 +71,7 @@ def test_cutting_changes_nothing(seed, rule, cuts):
     np.testing.assert_array_equal(end_pieces.lead_nats, end_whole.lead_nats)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     xy=st.lists(st.tuples(st.floats(width=32), st.floats(width=32)), min_size=1, max_size=60),
     known=st.booleans(),

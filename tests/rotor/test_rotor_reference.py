@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import rotor_runs as runs
+from support.examples import examples
 
 from daqsvc.rotor.bank import UNDETERMINED, ModelBank
 from daqsvc.rotor.decision import DecisionRules
@@ -205,7 +206,7 @@ def measured(seed, revolutions, truth):
 
 
 @pytest.mark.long
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=examples(20), deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     modes=st.sampled_from([FOUR, TWELVE, TWELVE[:9]]),

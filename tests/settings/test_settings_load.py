@@ -7,6 +7,7 @@ from itertools import combinations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 from support.paths import ROOT
 
 from daqsvc.settings import MachineFileError, describe, parse_machine_file
@@ -90,7 +91,7 @@ def leaves_of(text):
 
 @pytest.mark.long
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=examples(100))
 @given(data=st.data())
 def test_any_value_in_any_place(path, data):
     text = path.read_text(encoding="utf-8")
@@ -105,7 +106,7 @@ def test_any_value_in_any_place(path, data):
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=examples(100))
 @given(data=st.data())
 def test_any_lines_left_out(path, data):
     lines = path.read_text(encoding="utf-8").split("\n")
@@ -146,7 +147,7 @@ def toml(value):
 TABLES = ["machine", "buses", "streams", "sensors", "pipeline", "alarms", "mqtt", "store"]
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 @given(st.dictionaries(st.sampled_from(TABLES), STRUCTURES, min_size=1))
 def test_any_structure_in_place_of_a_table(tables):
     text = "".join(f"{name} = {toml(value)}\n" for name, value in tables.items())

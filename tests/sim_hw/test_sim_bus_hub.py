@@ -17,6 +17,7 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 from support.unix_buses import frame, numbers, running
 from support.waiting import PATIENCE_S, eventually_blocking
 
@@ -116,7 +117,7 @@ def test_only_one_hub_to_a_path(bus_path: str) -> None:
 
 
 @given(st.lists(st.binary(min_size=1, max_size=100), max_size=20))
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(25), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_is_no_frame_is_counted_and_goes_no_further(bus_path: str, packets: list[bytes]) -> None:
     packets = [packet for packet in packets if len(packet) not in {16, 72}]
     with running(bus_path) as hub, UnixBus(bus_path) as one, UnixBus(bus_path) as other:
@@ -134,7 +135,7 @@ def test_what_is_no_frame_is_counted_and_goes_no_further(bus_path: str, packets:
 
 
 @given(st.binary(min_size=16, max_size=16) | st.binary(min_size=72, max_size=72))
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(200), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_is_in_a_frame_a_reader_survives_it(shared: tuple[UnixBus, UnixBus], packet: bytes) -> None:
     one, other = shared
     os.write(one.fileno(), packet)

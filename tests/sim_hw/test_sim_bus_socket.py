@@ -11,6 +11,7 @@ import can
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 from support.unix_buses import frame, numbers, running
 from support.waiting import PATIENCE_S, eventually_blocking
 
@@ -56,7 +57,7 @@ messages = st.one_of(
 
 
 @given(st.lists(messages, min_size=1, max_size=30))
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(40), suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_every_kind_of_frame_arrives_as_it_was_sent(bus_path: str, sent: list[can.Message]) -> None:
     with UnixBus(bus_path, fd=True) as one, UnixBus(bus_path, fd=True) as other:
         for message in sent:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
 
@@ -76,7 +77,7 @@ def test_the_first_and_the_last_frame_arrive(link, t_ns):
 
 
 @given(links, schedules)
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_same_seed_same_faults(link, t_ns):
     one, other = link.plan(t_ns, LENGTH), link.plan(t_ns, LENGTH)
     for name in ("t_ns", "frame", "fault", "flips"):

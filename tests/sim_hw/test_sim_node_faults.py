@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from drivers.frames import FrameLayout
@@ -170,7 +171,7 @@ def test_a_delayed_frame_is_late_by_no_more_than_its_window_says_and_overtakes_n
 
 
 @given(node_faults)
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 def test_same_seed_same_faults(faults: NodeFaults) -> None:
     one, other = plan_of(faults), plan_of(faults)
     for name in ("t_ns", "frame", "fault", "flips", "late", "mark", "babble_id"):
@@ -230,7 +231,7 @@ def received(plan, samples: np.ndarray, reorder_window_ns: int = 100_000_000):
 
 @pytest.mark.long
 @given(node_faults)
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 def test_a_receiver_s_books_agree_to_the_sample(faults: NodeFaults) -> None:
     # With one count throughout, the receiver can know everything.
     faults = NodeFaults(
@@ -251,7 +252,7 @@ def test_a_receiver_s_books_agree_to_the_sample(faults: NodeFaults) -> None:
 
 
 @given(st.integers(400, 2000), st.integers(50, 850), st.booleans())
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 def test_a_receiver_follows_a_restart_at_the_cost_of_one_frame(at_ms: int, off_ms: int, reset: bool) -> None:  # noqa: FBT001
     assume(at_ms + off_ms < 2900)
     start_s = at_ms / 1000

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from drivers.can.adapter import batch_of
 from drivers.can.batches import ERROR, DecodedBatch
@@ -91,7 +92,7 @@ def read_again(path: Path) -> list[can.Message]:
 
 
 @pytest.mark.parametrize("log_format", ENDINGS)
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     batches=st.lists(
         st.tuples(st.lists(frames, min_size=1, max_size=12), st.booleans()), min_size=1, max_size=6

@@ -10,6 +10,7 @@ import pytest
 from cantools.database.errors import DecodeError
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 from support.paths import ROOT
 
 from drivers.base import StreamSpec
@@ -96,7 +97,7 @@ def paged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(page=st.integers(0, 15), payload=st.binary(min_size=12, max_size=12))
 @example(page=4, payload=bytes([0, 0, 6, 0x85, *range(8)]))
 @example(page=2, payload=bytes([0, 0, 0x7F, 0xC0, *range(8)]))
@@ -105,7 +106,7 @@ def test_every_page_of_a_multiplexed_message(paged: Path, page: int, payload: by
     check_every_signal(paged, message, bytes([payload[0], page, *payload[2:]]))
 
 
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(st.data())
 def test_every_message_of_the_device_files(draw: st.DataObject) -> None:
     for path in sorted(DEVICES.glob("*.dbc")):

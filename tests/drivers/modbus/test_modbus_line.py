@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
+from support.examples import examples
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -41,7 +42,7 @@ def register_of(unit, function, address):
     return (0x4000 if function == 4 else 0) | unit << 10 | address
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     st.integers(0, 2**32),
     st.lists(
@@ -324,7 +325,7 @@ def test_a_line_on_which_nobody_answers_is_lost_and_opened_again():
     assert rig.counters("s").samples_lost >= 79 * 5
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     st.integers(0, 2**32),
     st.sampled_from([16, 32]),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from drivers.frames import LayoutError
 from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
@@ -146,7 +147,7 @@ def wish(draw):
     return wanted, forbidden, draw(st.integers(0, 20)), draw(st.integers(60, 125))
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(wish())
 def test_a_plan_reads_what_is_wanted_once_and_nothing_forbidden(given_wish):
     wanted, forbidden, max_gap, max_count = given_wish

@@ -7,6 +7,7 @@ import struct
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from drivers.modbus.replies import (
     MAX_RTU_BYTES,
@@ -49,7 +50,7 @@ expected_replies = st.builds(
 heads = st.sampled_from([b"", b"\0\x4d\0\0\0\x05\1\3", b"\1\3\4", b"\1\x18\0\x06\0\2", b"\1\x83\2"])
 
 
-@settings(max_examples=3000)
+@settings(max_examples=examples(3000))
 @given(st.builds(bytes.__add__, heads, st.binary(max_size=300)), expected_replies)
 def test_any_bytes_are_judged(data, expected):
     for verdict in (judge_tcp(data, expected), judge_tcp(data, None), judge_rtu(data, expected, crc_of)):
@@ -79,7 +80,7 @@ def sound_pdu(expected, payload):
     return bytes([16]) + (payload * 4)[:4], b""
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(expected_replies, st.binary(min_size=1, max_size=40), st.integers(0, 300))
 def test_a_reply_is_taken_once_it_is_whole_and_not_before(expected, payload, cut):
     pdu, data = sound_pdu(expected, payload)
@@ -95,7 +96,7 @@ def test_a_reply_is_taken_once_it_is_whole_and_not_before(expected, payload, cut
         assert register_bytes(verdict.pdu) == data
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(expected_replies, st.binary(min_size=1, max_size=40), st.data())
 def test_a_reply_that_is_not_the_one_is_told_by_kind(expected, payload, data):
     pdu, _ = sound_pdu(expected, payload)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
+from support.examples import examples
 from support.modbus_lines import Rig, options_of, responding, simulate
 
 from drivers.modbus.layouts import TrendLayout, shared_runs
@@ -206,7 +207,7 @@ limits = st.builds(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.lists(st.tuples(st.sets(st.integers(0, 300), min_size=1, max_size=12), limits), min_size=1, max_size=5)
 )

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
+from support.examples import examples
 from support.modbus_lines import Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import link as supervision
@@ -47,7 +48,7 @@ def now_s():
     return LoopClock().monotonic_ns() / NS_PER_S - 1000
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(st.integers(0, 2**32), st.integers(1, 2))
 def test_no_late_reply_becomes_the_value_of_another_stream_however_often_the_line_is_opened(
     seed, demote_after

@@ -10,6 +10,7 @@ import pytest
 from can.io import TRCReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.examples import examples
 
 from drivers.can.batches import DecodedBatch
 from drivers.replay.can_log import CanLog
@@ -46,7 +47,7 @@ def is_frame(line: bytes) -> bool:
 
 
 @pytest.mark.parametrize("ending", LOGS)
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=examples(150))
 @given(
     damages=st.lists(
         st.tuples(

@@ -1,0 +1,17 @@
+"""How many examples a property test draws: a share of them every day, all in ``make test-long``."""
+
+from __future__ import annotations
+
+import os
+
+ALL = os.environ.get("DAQSVC_EXAMPLES") == "all"
+_FEW = 15
+"""Counts up to this are not cut."""
+
+
+def examples(count: int) -> int:
+    """Examples for ``max_examples``, of the ``count`` that the property is tried with in ``make test-long``.
+
+    They are drawn in the same order each time, so the short run is the beginning of the long one.
+    """
+    return count if ALL else max(min(count, _FEW), count // 3)
