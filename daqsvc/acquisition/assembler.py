@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.arrivals import ArrivalRate
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding, tell_nobody
 from daqsvc.acquisition.timebase import TimeBase, TimeBaseState, rate_in_words
+from daqsvc.dsp.quality.rate import ArrivalRate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -78,7 +78,7 @@ class StreamAssembler:
         stream: name of the stream.
         rate_hz: nominal sampling rate.
         counter_bits: width of the device's counter; None if it sends none, and loss can only be estimated
-            from the times of arrival (`daqsvc.acquisition.arrivals`).
+            from the times of arrival (`daqsvc.dsp.quality.rate`).
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         deliver: called with each block, in order, from the thread that calls `accept`.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from daqsvc.alarms.states import AlarmState, Level
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Doubt(NamedTuple):
     """
 
     detector: str
-    quality: DataQuality
+    quality: Quality
     not_ok: bool
     reason: str
     sensors: tuple[str, ...]

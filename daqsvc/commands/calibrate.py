@@ -80,7 +80,8 @@ class CalibrateCommand:
             if machine is None:
                 return EXIT_USAGE
         from daqsvc.bearing.identify import NotIdentifiableError  # noqa: PLC0415
-        from daqsvc.recording.errors import RecordingError, RefusedError  # noqa: PLC0415
+        from daqsvc.dsp.quality import RefusedError  # noqa: PLC0415
+        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
         from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415
 
         try:

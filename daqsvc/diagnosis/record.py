@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 Severity = Literal["normal", "alert", "danger"]
 
@@ -66,7 +66,7 @@ class Diagnosis:
     thresholds: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
     revolutions: float | None = None
-    quality: DataQuality = "good"
+    quality: Quality = "good"
     reason: str = ""
     sensors: tuple[str, ...] = ()
     model: str = ""

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.quality import DataQuality
     from daqsvc.diagnosis.detector import Detector
     from daqsvc.diagnosis.record import Diagnosis
+    from daqsvc.dsp.quality.recorded import DataQuality
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
 

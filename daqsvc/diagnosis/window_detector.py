@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Severity
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
     from daqsvc.settings.models import MachineFile
 
 
@@ -80,7 +80,7 @@ class WindowDetector:
         samples = window.samples[at : at + length, self._columns]
         after = len(window.samples) - at - length
         missing = float(np.mean(~np.isfinite(samples)))
-        quality: DataQuality = "missing" if missing else "good"
+        quality: Quality = "missing" if missing else "good"
         said = replace(
             self._held,
             t_ns=window.t_end_ns - round(after * window.period_ns),

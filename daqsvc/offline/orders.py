@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
 
 import numpy as np
 
-from daqsvc.analysis.quality import DataQuality, known_against
 from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
+from daqsvc.dsp.quality.recorded import DataQuality, known_against
 from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.recording.channels import M_S2_PER_UNIT
 from daqsvc.recording.errors import RecordingError

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 import numpy as np
 
 from daqsvc import kernel_cache
-from daqsvc.analysis.quality import known_against
 from daqsvc.detectors.shaft.verdict import RotorVerdict
 from daqsvc.diagnosis.recorded import Recorded, worst
-from daqsvc.recording.errors import RecordingError, RefusedError
+from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality.recorded import known_against
+from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.recording import (
     get_limits,

@@ -15,7 +15,7 @@ from daqsvc.acquisition.clock import iso_utc
 from daqsvc.alarms.events import AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.states import HOLDS, AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis, Severity
-from daqsvc.dsp.quality import DataQuality  # noqa: TC001 - pydantic reads it
+from daqsvc.dsp.quality import Quality  # noqa: TC001 - pydantic reads it
 from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class _Statement(JsonPayload):
     evidence: dict[str, Number] = Field(description="log-likelihood ratios in nats")
     revolutions: Number = Field(description="shaft revolutions since the detector started")
     window: WindowPayload
-    quality: DataQuality
+    quality: Quality
     reason: str = Field(description="why the quality is not good")
     sensors: tuple[str, ...]
     model: str
@@ -110,7 +110,7 @@ class DoubtPayload(JsonPayload):
     """What a detector has against a sensor."""
 
     detector: str
-    quality: DataQuality = Field(description="what it said last")
+    quality: Quality = Field(description="what it said last")
     not_ok: bool = Field(description="whether it said not_ok since it was last good")
     reason: str
     sensors: tuple[str, ...]

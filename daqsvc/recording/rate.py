@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
 from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
 from daqsvc.recording.errors import RecordingError
 
@@ -33,29 +34,6 @@ TIME_NAME = re.compile(
 """Names that a column of time may have, with its unit or in seconds: ``t``, ``Time [ms]``, ``time_s``."""
 
 PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9}
-
-SAME_RATE = 0.005
-"""Rates that differ by less are the same, rounded."""
-
-MOST_UNEVEN = 0.5
-"""Steps of an even column of time are within this fraction of their median (rounded times do that)."""
-
-LEAST_UNBROKEN = 0.75
-"""Part of the steps that are one sample where a column of time has gaps; with fewer it is uneven."""
-
-MOST_OFF_GRID = 0.3
-"""A gap in a column of time is a whole number of samples to within so much of one, ..."""
-SHORT_GAP = 20
-"""... if it is not longer than so many samples; what was not sampled may have had a clock of its own."""
-
-LEAST_IN_ORDER = 0.75
-"""Part of the stamps, or of the steps, that go forward where a column of time with stamps that go back still
-tells the rate."""
-
-_PIECE = 1 << 14
-"""Values whose medians are looked for at a time."""
-_NEIGHBOURS = 51
-"""Stamps that the one in their middle is held against."""
 
 MOST_STRETCHED = 4
 """A recording is given up whose gaps make it so many times as long."""
@@ -86,27 +64,20 @@ class _TimeColumn:
         name: of the column.
         unit: it was read in, in words.
         unit_is_named: whether the file says that.
-        rate_hz: samples per second.
-        tolerance: how far the rate may be off by the digits of the column, relative.
-        rows: see `Timing`.
-        is_even: whether each sample has its place by the column; else only the mean rate is known.
-        backward: how many steps go back in time.
+        stamps: what its stamps say.
     """
 
     name: str
     unit: str
     unit_is_named: bool
-    rate_hz: float
-    tolerance: float
-    rows: NDArray[np.int64] | None = None
-    is_even: bool = True
-    backward: int = 0
+    stamps: StampedRate
 
     def notes(self) -> tuple[str, ...]:
         """What is wrong with it, in sentences."""
-        if not self.backward:
+        backward = self.stamps.backward
+        if not backward:
             return ()
-        steps = "a step" if self.backward == 1 else f"{self.backward:,} steps"
+        steps = "a step" if backward == 1 else f"{backward:,} steps"
         note = (
             f"time column {self.name!r} goes back in {steps}: the samples are taken in the order of the "
             "file; check the logger's clock and the order of the rows"
@@ -114,12 +85,9 @@ class _TimeColumn:
         return (note,)
 
     def agrees(self, hz: float) -> bool:
-        """Whether a rate is the column's, as far as its digits tell."""
-        return abs(self.rate_hz / hz - 1.0) <= SAME_RATE + self.tolerance
-
-    def agrees_in_other_unit(self, hz: float) -> bool:
-        """Whether a column that names no unit would be right in ms, us or ns."""
-        return not self.unit_is_named and any(self.agrees(hz / per) for per in (1e3, 1e6, 1e9))
+        """Whether a rate is the column's; one that names no unit may be in ms, us or ns, too."""
+        others = () if self.unit_is_named else (1e3, 1e6, 1e9)
+        return any(self.stamps.agrees(hz / per) for per in (1.0, *others))
 
 
 def timing_of(path: Path, contents: Contents, length: int, given_hz: float | None) -> Timing:
@@ -149,8 +117,9 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
     elif len(set(stated.values())) == 1:
         name, rate_hz = next(iter(stated.items()))
         source = f"stated as {name}"
-    elif not stated and column is not None and column.is_even:
-        rate_hz, source = column.rate_hz, f"derived from time column {column.name!r}, read as {column.unit}"
+    elif not stated and column is not None and column.stamps.is_even:
+        rate_hz = column.stamps.rate_hz
+        source = f"derived from time column {column.name!r}, read as {column.unit}"
     else:
         told = f"states several: {stated}" if stated else f"does not state one{_why_not(contents, length)}"
         raise RecordingError(
@@ -164,7 +133,7 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
     _refuse_contradictions(path, stated, column, given_hz)
     if column is None:
         return Timing(float(rate_hz), source)
-    return Timing(float(rate_hz), source, column.rows, column.notes())
+    return Timing(float(rate_hz), source, column.stamps.rows, column.notes())
 
 
 def _refuse_contradictions(
@@ -179,26 +148,22 @@ def _refuse_contradictions(
     """
     said = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
     if column is not None:
-        said.append(f"{column.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
+        said.append(f"{column.stamps.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
     if given_hz is None:
-        if column is not None and any(not _agrees(column, hz) for hz in stated.values()):
+        if column is not None and any(not column.agrees(hz) for hz in stated.values()):
             raise RecordingError(
                 f"the sampling rate of {path} is {' and '.join(said)} by the file, which contradicts itself: "
                 "say which with --fs, or correct the file"
             )
         return
     agreed = any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()) or (
-        column is not None and _agrees(column, given_hz)
+        column is not None and column.agrees(given_hz)
     )
     if said and not agreed:
         raise RecordingError(
             f"the sampling rate of {path} is {' and '.join(said)} by the file and {given_hz:g} Hz as given: "
             "leave --fs out, or correct it"
         )
-
-
-def _agrees(column: _TimeColumn, hz: float) -> bool:
-    return column.agrees(hz) or column.agrees_in_other_unit(hz)
 
 
 def time_column(contents: Contents, length: int) -> str | None:
@@ -209,7 +174,7 @@ def time_column(contents: Contents, length: int) -> str | None:
     of one are left: they number the samples.
     """
     found = (_read(contents, name) for name in _candidates(contents, length))
-    return next((column.name for column in found if column is not None and column.is_even), None)
+    return next((column.name for column in found if column is not None and column.stamps.is_even), None)
 
 
 def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
@@ -219,11 +184,12 @@ def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
         RecordingError: it lacks most of the samples.
     """
     found = [column for name in _candidates(contents, length) if (column := _read(contents, name))]
-    column = next((one for one in found if one.is_even), found[0] if found else None)
-    if column is not None and column.rows is not None and column.rows[-1] >= MOST_STRETCHED * length:
-        longest = int(np.argmax(np.diff(column.rows)))
+    column = next((one for one in found if one.stamps.is_even), found[0] if found else None)
+    rows = None if column is None else column.stamps.rows
+    if column is not None and rows is not None and rows[-1] >= MOST_STRETCHED * length:
+        longest = int(np.argmax(np.diff(rows)))
         raise RecordingError(
-            f"{path} lacks {column.rows[-1] + 1 - length:,} of {column.rows[-1] + 1:,} samples by its time "
+            f"{path} lacks {rows[-1] + 1 - length:,} of {rows[-1] + 1:,} samples by its time "
             f"column {column.name!r}, the most behind sample {longest + 1:,}; cut the recording there"
         )
     return column
@@ -252,98 +218,8 @@ def _read(contents: Contents, name: str) -> _TimeColumn | None:
     values = contents.entries[name]
     with np.errstate(invalid="ignore"):  # infinities make NaN
         seconds, unit, unit_is_named = _seconds(name, values)
-        steps = np.diff(seconds)
-    by_name = values.dtype.kind == "M" or _is_named(name)
-    median = float(np.median(steps))
-    if not (np.isfinite(steps).all() and median > 0.0):
-        return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
-    backward = int((steps < 0.0).sum())
-    if backward:
-        steps = np.diff(_in_order(seconds, median))
-    ones = np.abs(steps - median) <= MOST_UNEVEN * median
-    period = float(steps[ones].mean())
-    rows = None
-    if not ones.all():
-        counts = np.maximum(np.rint(steps / period), 1.0)
-        off = np.abs(steps / period - counts)
-        short = counts <= SHORT_GAP
-        is_gap = (counts > 1) & (~short | (off <= MOST_OFF_GRID))
-        # A clock that is set back says nothing of what is missing there.
-        known = ones | is_gap | (steps < 0.0)
-        if not by_name or ones.mean() < LEAST_UNBROKEN or not known.all():
-            return _mean_rate(name, unit, seconds, unit_is_named=unit_is_named) if by_name else None
-        if is_gap.any():
-            rows = np.concatenate(([0], np.cumsum(np.where(ones, 1.0, counts)))).astype(np.int64)
-    rate_hz = len(steps) / float(steps.sum()) if ones.all() else 1.0 / period
-    rounding = float(np.abs(steps[ones] - period).max())
-    tolerance = 2.0 * rounding / (period * ones.sum())
-    return _TimeColumn(name, unit, unit_is_named, float(rate_hz), tolerance, rows, backward=backward)
-
-
-def _median_of_neighbours(values: Floats) -> Floats:
-    """The median of each value with those around it, float64 ``[n]``; mirrored at both ends.
-
-    NumPy's, and in pieces: SciPy's cannot be loaded in the little memory that recordings are read with.
-    """
-    half = _NEIGHBOURS // 2
-    padded = np.pad(values, half, mode="reflect")
-    medians = np.empty_like(values)
-    for begin in range(0, len(values), _PIECE):
-        windows = np.lib.stride_tricks.sliding_window_view(
-            padded[begin : begin + _PIECE + 2 * half], _NEIGHBOURS
-        )
-        medians[begin : begin + len(windows)] = np.median(windows, axis=1)
-    return medians
-
-
-def _in_order(seconds: Floats, period: float) -> Floats:
-    """Stamps of which those out of order follow the ones before them by even steps.
-
-    A few rows that a logger wrote in another order, or stamped wrongly, are no gaps. Where the clock was set
-    back the stamps are left as they are.
-    """
-    at = np.arange(len(seconds))
-    late = seconds - period * at
-    # A median keeps the edge that a gap makes, and leaves out what lies beside its neighbours.
-    neighbours = _median_of_neighbours(late)
-    fits = np.abs(late - neighbours) <= MOST_UNEVEN * period
-    fits[0] = True
-    in_place = _follow(seconds, fits, period)
-    fits &= in_place == np.maximum.accumulate(in_place)
-    fits &= in_place == np.minimum.accumulate(in_place[::-1])[::-1]
-    fits[0] = True
-    return in_place if fits.mean() < LEAST_IN_ORDER else _follow(seconds, fits, period)
-
-
-def _follow(seconds: Floats, fits: NDArray[np.bool_], period: float) -> Floats:
-    """The stamps that fit, and between them even steps from the last one that does."""
-    at = np.arange(len(seconds))
-    last = np.maximum.accumulate(np.where(fits, at, 0))
-    return np.asarray(seconds[last] + period * (at - last), np.float64)
-
-
-def _mean_rate(name: str, unit: str, seconds: Floats, *, unit_is_named: bool) -> _TimeColumn | None:
-    """What a column with coarse stamps, or without some, says all the same; None if it goes back often."""
-    there = np.flatnonzero(np.isfinite(seconds))
-    steps = np.diff(seconds[there])
-    if len(there) < 2 or steps.max() <= 0.0:
-        return None
-    backward = int((steps < 0.0).sum())
-    if not backward:
-        span_s = float(seconds[there[-1]] - seconds[there[0]])
-        rate_hz = float(there[-1] - there[0]) / span_s
-        tolerance = 2.0 * float(steps.max()) / span_s
-        return _TimeColumn(name, unit, unit_is_named, rate_hz, tolerance, is_even=False)
-    if backward > (1.0 - LEAST_IN_ORDER) * len(steps):
-        return None
-    # From the middle of one half to that of the other: a few wrong stamps, even at the ends, move neither.
-    early, late = np.array_split(there, 2)
-    span_s = float(np.median(seconds[late]) - np.median(seconds[early]))
-    if span_s <= 0.0:
-        return None
-    rate_hz = float(np.median(late) - np.median(early)) / span_s
-    tolerance = 2.0 * float(np.median(np.abs(steps[steps != 0.0]))) / span_s
-    return _TimeColumn(name, unit, unit_is_named, rate_hz, tolerance, is_even=False, backward=backward)
+    stamps = rate_of_stamps(seconds, surely_time=values.dtype.kind == "M" or _is_named(name))
+    return None if stamps is None else _TimeColumn(name, unit, unit_is_named, stamps)
 
 
 def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]:

@@ -39,7 +39,7 @@ from daqsvc.service import LoopLag
 
 if TYPE_CHECKING:
     from daqsvc.alarms.rules import Rule
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 CLOCK = SystemClock()
 RIG = Identity("lab", "edge-1", "rig")
@@ -56,7 +56,7 @@ FLOOD_EVENTS_PER_S = 533
 SHARE_OF_A_CORE = 0.20
 LAG_P99_MS = 10.0
 BEHIND_S = 1.0
-ROUND: tuple[tuple[float, DataQuality], ...] = ((2.0, "good"), (9.0, "good"), (9.0, "not_ok"), (2.0, "good"))
+ROUND: tuple[tuple[float, Quality], ...] = ((2.0, "good"), (9.0, "good"), (9.0, "not_ok"), (2.0, "good"))
 
 
 def rules(count: int) -> list[Rule]:

@@ -17,7 +17,7 @@ from daqsvc.diagnosis.record import Diagnosis, Severity
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 HOUR_S = 3600
 PAUSES_S = (0.0, 0.0, 0.005, 0.03, 0.07)
@@ -68,7 +68,7 @@ class Step:
     number: int
     detector: str
     severity: Severity
-    quality: DataQuality
+    quality: Quality
     pause_s: float
     wall_offset_s: int
 
@@ -112,7 +112,7 @@ class Script:
                 severity[detector] = rng.choice(SEVERITIES)
             if rng.random() < 0.04:
                 wall_offset_s = rng.choice((-HOUR_S, 0, HOUR_S))
-            quality: DataQuality = "missing" if missing else "good"
+            quality: Quality = "missing" if missing else "good"
             pause_s = rng.choice(PAUSES_S)
             steps.append(Step(number, detector, severity[detector], quality, pause_s, wall_offset_s))
         steps += [

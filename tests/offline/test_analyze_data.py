@@ -11,11 +11,11 @@ import pytest
 from scipy.signal import butter, lfilter
 from support.orbit_files import RATE_HZ, SAMPLES_PER_REV, SPEED_RPM, Orbit
 
-from daqsvc.analysis.quality import Complaint
 from daqsvc.detectors.rotor_synchronous.calibrating import calibrate_recordings
 from daqsvc.detectors.rotor_synchronous.recorded import analyse
 from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
-from daqsvc.recording.errors import RefusedError
+from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality.recorded import Complaint
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.calibration.file import CalibrationFileError, load_healthy, save_record
 from daqsvc.rotor.laval import LavalRotor

@@ -16,16 +16,17 @@ import numpy as np
 import pytest
 from support.orbit_files import AMPLITUDE_UM, RATE_HZ, SPEED_RPM, Orbit
 
-from daqsvc.analysis import quality
 from daqsvc.commands.option_types import SpeedOption, speed
 from daqsvc.detectors.rotor_synchronous.recorded import analyse, posterior
 from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.recorded import by_name, finite, worst
+from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality import recorded as quality
+from daqsvc.dsp.quality.unit import refuse_size
 from daqsvc.offline import progress
 from daqsvc.offline.progress import ProgressInterval
 from daqsvc.offline.runner import Outcome, WorkerLostError, judge_all
-from daqsvc.recording.errors import RefusedError
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 
@@ -81,9 +82,9 @@ def test_json_holds_no_nan() -> None:
 @pytest.mark.parametrize("unit_um", [1e-5, 150.0])
 def test_orbits_of_impossible_size_are_refused(unit_um: float) -> None:
     samples = unit_um * AMPLITUDE_UM * np.column_stack([np.cos(np.arange(640)), np.sin(np.arange(640))])
-    quality.refuse_size(samples / unit_um, 200.0, "um")
+    refuse_size(samples / unit_um, 200.0, "um")
     with pytest.raises(RefusedError, match="the unit 'um' looks wrong"):
-        quality.refuse_size(samples, 200.0, "um")
+        refuse_size(samples, 200.0, "um")
 
 
 def test_a_coarse_converter_is_not_a_clipped_probe() -> None:
@@ -92,7 +93,7 @@ def test_a_coarse_converter_is_not_a_clipped_probe() -> None:
     known = quality.count_bad(("x", "y"), samples)
     assert quality.refuse_stuck(known, ("x", "y"), samples, 64.0) == known
     samples[:, 0] = np.minimum(samples[:, 0], 20.0)
-    with pytest.raises(quality.ClippedError, match="x is clipped at 20 um") as refused:
+    with pytest.raises(quality.ClippedProbeError, match="x is clipped at 20 um") as refused:
         quality.refuse_stuck(known, ("x", "y"), samples, 64.0)
     assert refused.value.quality.clipped["x"] > 1000
 

@@ -11,9 +11,8 @@ from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
 from daqsvc.detectors.bearing.recorded_checks import against_healthy_run
-from daqsvc.dsp.quality import UnfitError
-from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
-from daqsvc.recording.errors import RefusedError
+from daqsvc.dsp.quality import RefusedError, UnfitError
+from daqsvc.dsp.quality.clipped import refuse_clipped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -125,7 +124,7 @@ def _refuse_faults(recording: Recording, bearings: Mapping[str, BearingOrders], 
             verdict = race_test(
                 np.where(np.isfinite(column), column, np.nan), recording.rate_hz, speed_rpm, orders
             ).verdict
-        except (ClippedError, UnfitError) as error:
+        except UnfitError as error:
             raise RefusedError(f"{recording.source}: {name}: {error}") from None
         if verdict != "normal":
             damage = "ball" if verdict == "ball" else f"{verdict.replace('_', ' ')} race"

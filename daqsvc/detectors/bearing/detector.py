@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.bearing.housed import HousedBearing
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Severity
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
     from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 
     Floats = NDArray[np.float64]
@@ -265,7 +265,7 @@ class BearingDetector:
             return Evaluation(races, changes, unfit[0][0], reason, finding, directions)
         return Evaluation(races, changes, "good", reason, finding, directions)
 
-    def _follow_speed(self, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
+    def _follow_speed(self, samples: Floats) -> Iterator[tuple[Quality, str]]:
         """Measure the speed; begin anew where it has changed. Yields what is against the look."""
         self._speed_unknown = False
         if self.keyphasor is None:
@@ -424,7 +424,7 @@ class BearingDetector:
         return said
 
 
-def _lacking_pair(bearing: HousedBearing, samples: Floats) -> Iterator[tuple[DataQuality, str]]:
+def _lacking_pair(bearing: HousedBearing, samples: Floats) -> Iterator[tuple[Quality, str]]:
     """What is against "normal" where the second accelerometer lacks samples: then no change can be seen."""
     for name, column in zip(bearing.sensors, bearing.columns, strict=True):
         if column != bearing.column and (lost := lacking(name, samples[:, column])):

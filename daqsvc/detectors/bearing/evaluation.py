@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.direction import Direction
     from daqsvc.detectors.bearing.finding import BearingFinding
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 LARGE = 10.0
 """Innovations of so many times those of the healthy machine are danger."""
@@ -37,7 +37,7 @@ class Evaluation:
 
     races: Mapping[str, RaceVerdict]
     changes: Mapping[str, ResidualChange]
-    quality: DataQuality
+    quality: Quality
     reason: str
     finding: BearingFinding | None
     directions: Mapping[str, Direction] = field(default_factory=dict)

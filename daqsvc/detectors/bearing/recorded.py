@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.analysis.quality import DataQuality
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import ChangeRules, compare_residual
 from daqsvc.bearing.identify_file import load_bearing_baseline
@@ -38,6 +37,7 @@ from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Statements
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
+from daqsvc.dsp.quality.recorded import DataQuality
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_matching
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.analysis.quality import count_bad
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.bearing.race.verdict import PLACES
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import OFFSET_NOTE
-from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
+from daqsvc.dsp.quality.clipped import refuse_clipped
+from daqsvc.dsp.quality.recorded import count_bad
 from daqsvc.recording.channels import M_S2_PER_UNIT
 
 if TYPE_CHECKING:
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.quality import DataQuality
     from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
     from daqsvc.detectors.bearing.verdict import BearingSetup
+    from daqsvc.dsp.quality.recorded import DataQuality
     from daqsvc.recording.channels import AccelerationUnit
     from daqsvc.recording.recording import Recording
 
@@ -210,7 +210,7 @@ def _judged(recording: Recording, name: str, setup: BearingSetup, speed_rpm: flo
     try:
         refuse_clipped(column)
         return race_test(column, recording.rate_hz, speed_rpm, setup.bearings[name], setup.race)
-    except (ClippedError, UnfitError) as error:
+    except UnfitError as error:
         return str(error)
 
 

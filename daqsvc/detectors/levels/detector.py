@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
     from daqsvc.dsp.quality.missing import Bounds
     from daqsvc.dsp.quality.stuck import Standstill
 
@@ -180,7 +180,7 @@ class LevelDetector:
         if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
             return self._state(channel, evidence, statistics, "not_ok", reason, share)
         reason = partly_missing(channel.sensor, len(samples) - count, len(samples), bounds)
-        quality: DataQuality = "missing" if reason else "good"
+        quality: Quality = "missing" if reason else "good"
         return self._state(channel, evidence, statistics, quality, reason, share, bounds)
 
     def _state(
@@ -188,7 +188,7 @@ class LevelDetector:
         channel: LevelChannel,
         evidence: Evidence,
         statistics: dict[str, float],
-        quality: DataQuality,
+        quality: Quality,
         reason: str,
         missing_share: float = 1.0,
         bounds: Bounds = NO_BOUNDS,

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daqsvc.diagnosis.record import Severity
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
 NO_BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType({})
 """Of statistics that are all certain."""
@@ -82,7 +82,7 @@ class LevelStatements:
         evidence: Evidence,
         statistics: Mapping[str, float],
         units: Mapping[str, str],
-        quality: DataQuality = "good",
+        quality: Quality = "good",
         reason: str = "",
         missing_share: float | None = None,
         bounds: Mapping[str, tuple[float, float]] = NO_BOUNDS,

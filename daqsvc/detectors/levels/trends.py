@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.levels.statements import Limits
     from daqsvc.diagnosis.detector import Window
     from daqsvc.diagnosis.record import Diagnosis
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
     from daqsvc.dsp.quality.missing import Bounds
 
 VALUE = "value"
@@ -140,7 +140,7 @@ class TrendDetector:
         missing, value = len(samples) - len(known), _as_read(known)
         bounds: Bounds = {}
         if reason := _beyond_ok(channel, known):
-            quality: DataQuality = "not_ok"
+            quality: Quality = "not_ok"
         else:
             bounds = _bounds(value, known, missing)
             quality = "missing" if bounds else "good"

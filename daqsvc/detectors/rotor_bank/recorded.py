@@ -7,11 +7,11 @@ from collections import defaultdict
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from daqsvc.analysis.quality import complaints, known_against
 from daqsvc.detectors.rotor_bank.build import bank_detector
 from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.detectors.shaft.verdict import Instant, RotorVerdict, Step
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, statements_of
+from daqsvc.dsp.quality.recorded import complaints, known_against
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.analysis import quality as checks
 from daqsvc.detectors.rotor_synchronous.recorded import analyse
 from daqsvc.detectors.rotor_synchronous.recorded_speed import LEAST_JUDGED, speed_of
 from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
+from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality import recorded as checks
+from daqsvc.dsp.quality.unit import refuse_size
 from daqsvc.dsp.speed.revolutions import KeyphasorCutter
 from daqsvc.recording.channels import to_um
-from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.calibration.file import CalibrationRecord
 from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
@@ -181,7 +182,7 @@ def _sweep(recording: Recording, taken: RotorSetup, sweep_rpm: tuple[float, floa
         if found is None:
             return None
         sweep, period = found
-    checks.refuse_size(samples[:, :2], taken.rotor.clearance_um, taken.unit)
+    refuse_size(samples[:, :2], taken.rotor.clearance_um, taken.unit)
     checks.refuse_stuck(checks.count_bad(taken.probes, samples[:, :2]), taken.probes, samples[:, :2], period)
     return sweep
 

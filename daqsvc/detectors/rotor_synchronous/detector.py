@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.dsp.speed.keyphasor import EdgeCounts
+    from daqsvc.dsp.quality.missing import EdgeCounts
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.analysis import quality as checks
-from daqsvc.analysis.quality import ClippedError, Complaint, DataQuality
 from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.detectors.rotor_synchronous.recorded_speed import (
@@ -32,8 +30,11 @@ from daqsvc.detectors.shaft.verdict import Instant, RotorAlarm, RotorVerdict, St
 from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, known
 from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality import RefusedError
+from daqsvc.dsp.quality import recorded as checks
+from daqsvc.dsp.quality.recorded import ClippedProbeError, Complaint, DataQuality
+from daqsvc.dsp.quality.unit import doubt_size, refuse_size
 from daqsvc.recording.channels import to_um
-from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.calibration.record import baseline_at
 from daqsvc.rotor.synchronous.baseline import Calibration, compensated
 from daqsvc.rotor.synchronous.departure import threshold_for
@@ -185,7 +186,7 @@ def analyse(recording: Recording, setup: RotorSetup, progress: Progress | None =
     try:
         return _judge(recording, setup, quality, watched, progress)
     except RefusedError as error:
-        if isinstance(error, ClippedError):
+        if isinstance(error, ClippedProbeError):
             quality = error.quality
         return RotorVerdict(
             recording=str(recording.source),
@@ -209,11 +210,11 @@ def _judge(
     samples = samples[:, [recording.names.index(name) for name in setup.names]]
     samples[:, :2] = to_um(samples[:, :2], setup.unit)
     checks.refuse_unreadable(tuple(setup.names), samples)
-    checks.refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
+    refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
     speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
     refuse_coarse(period, recording.rate_hz)
-    quality = checks.doubt_size(quality, samples[:, :2], setup.rotor.clearance_um, setup.unit)
+    quality = doubt_size(quality, samples[:, :2], setup.rotor.clearance_um, setup.unit)
     quality = checks.refuse_stuck(quality, setup.probes, samples[:, :2], period)
     healthy = _healthy_state(setup, speed.rpm)
     if healthy is None and setup.calibrations:

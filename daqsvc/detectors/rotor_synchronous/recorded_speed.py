@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.speed.keyphasor import EdgeFinder, KeyphasorProbe
 from daqsvc.dsp.speed.orbit import estimate_speed
 from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
-from daqsvc.recording.errors import RefusedError
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 from daqsvc.rotor.synchronous.watch import WatchRules
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from daqsvc.analysis.quality import DataQuality
+    from daqsvc.dsp.quality.recorded import DataQuality
     from daqsvc.dsp.speed.keyphasor import Edge
     from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording

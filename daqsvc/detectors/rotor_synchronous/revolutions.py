@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.speed.keyphasor import EdgeCounts
+    from daqsvc.dsp.quality.missing import EdgeCounts
     from daqsvc.dsp.speed.revolutions import RevolutionCutter
 
     Floats = NDArray[np.float64]

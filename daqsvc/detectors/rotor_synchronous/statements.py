@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.record import Severity
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
     from daqsvc.dsp.quality.probes import Verdict
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.identify import Identification
@@ -116,7 +116,7 @@ class Stater:
         self._decision = UNDETERMINED
         self._group: tuple[str, ...] = ()
         self._large = False
-        self._quality: DataQuality = "good"
+        self._quality: Quality = "good"
         self._said_index: int | None = None
 
     def maybe(self, standing: Standing, verdict: Verdict, end_index: int, t_ns: int) -> Diagnosis | None:

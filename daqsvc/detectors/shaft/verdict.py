@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, get_args
 
-from daqsvc.analysis.quality import DataQuality
 from daqsvc.diagnosis.recorded import Verdict, finite
+from daqsvc.dsp.quality.recorded import DataQuality
 from daqsvc.rotor.synchronous.signatures import RotorFault
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-DataQuality = Literal["good", "missing", "not_ok"]
+Quality = Literal["good", "missing", "not_ok"]
 """Of what a statement rests on: good, too little of it there, or not what a sound sensor delivers."""
 
 
-class UnfitError(ValueError):
+class RefusedError(ValueError):
+    """What was measured cannot be judged; the message names the thing, its value and the remedy."""
+
+
+class UnfitError(RefusedError):
     """Samples cannot be judged: they are not what a healthy sensor delivers, or not enough of it.
 
     Args:

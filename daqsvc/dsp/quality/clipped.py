@@ -28,7 +28,7 @@ CLIPPED_REVOLUTION = 1 / 16
 """Part of a revolution at one extreme value that makes a probe clipped."""
 LEAST_CUT_OFF = 8
 """So often a recording must end at its extreme value."""
-_LEAST_IN_REVOLUTION = 3.0
+LEAST_IN_REVOLUTION = 3.0
 _USUAL = 4
 """An extreme value is a limit if it comes so many times as often as any other."""
 _LEAST_PILED_UP = 3
@@ -75,7 +75,7 @@ def clipped_at(signal: Floats) -> float | None:
     Args:
         signal: float64 ``[n]``, without missing samples.
     """
-    least = max(CLIPPED_REVOLUTION * len(signal), _LEAST_IN_REVOLUTION)
+    least = max(CLIPPED_REVOLUTION * len(signal), LEAST_IN_REVOLUTION)
     # Sorting costs more than this look, which leaves nothing to sort in nearly every revolution.
     if all(np.count_nonzero(signal == extreme) < least for extreme in (signal.min(), signal.max())):
         return None

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -65,6 +66,21 @@ UNKNOWN_NS = 60 * _NS_PER_S
 """How often a device takes snapshots that nobody has said it of, until it has been seen."""
 
 _REMEMBERED = 8
+
+
+@dataclass(slots=True)
+class EdgeCounts:
+    """What became of the pulses of a keyphasor since the start.
+
+    Attributes:
+        accepted: edges that marked a revolution.
+        missing: revolutions without an edge, found out at the next one.
+        rejected: edges that came where none can be: second pulses, noise.
+    """
+
+    accepted: int = 0
+    missing: int = 0
+    rejected: int = 0
 
 
 def lacking(name: str, signal: Floats, effect: str = "") -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.probes import Probe
-    from daqsvc.dsp.quality import DataQuality
+    from daqsvc.dsp.quality import Quality
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ _CLEAR = 4.0
 class Verdict:
     """Whether the last revolution can be trusted, and why not."""
 
-    quality: DataQuality = "good"
+    quality: Quality = "good"
     reason: str = ""
 
 

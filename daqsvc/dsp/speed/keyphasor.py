@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from daqsvc.dsp.quality.missing import EdgeCounts
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -68,21 +70,6 @@ class KeyphasorProbe:
     threshold_v: float
     hysteresis_v: float = 0.5
     edge: Edge = "rising"
-
-
-@dataclass(slots=True)
-class EdgeCounts:
-    """What became of the pulses since the start.
-
-    Attributes:
-        accepted: edges that marked a revolution.
-        missing: revolutions without an edge, found out at the next one.
-        rejected: edges that came where none can be: second pulses, noise.
-    """
-
-    accepted: int = 0
-    missing: int = 0
-    rejected: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from daqsvc.dsp.speed.keyphasor import Edge, EdgeCounts, EdgeFinder, EdgeLine, KeyphasorEdge
+from daqsvc.dsp.quality.missing import EdgeCounts
+from daqsvc.dsp.speed.keyphasor import Edge, EdgeFinder, EdgeLine, KeyphasorEdge
 from daqsvc.dsp.speed.orbit import OrbitPhase
 from daqsvc.dsp.speed.steady_edges import SharpEdges, SteadyEdges
 

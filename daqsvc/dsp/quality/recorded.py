@@ -1,39 +1,42 @@
-"""What is wrong with the samples of a recording, before anybody makes a diagnosis of them."""
+"""What is known against a recording as a whole, before it is judged and after.
+
+The detector judges each revolution of a recording as it does live (`daqsvc.dsp.quality.probes`). Here a
+recording of probes is refused besides that has a few revolutions which stand still or are clipped: it can be
+cut, or taken again, and whoever asks is there to do it. Live a detector leaves them out and goes on.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from daqsvc.dsp.quality.clipped import clipped_at
-from daqsvc.recording.errors import RefusedError
+from daqsvc.dsp.quality import RefusedError, UnfitError
+from daqsvc.dsp.quality.clipped import (
+    CLIPPED_REVOLUTION,
+    LEAST_CUT_OFF,
+    LEAST_IN_REVOLUTION,
+    clipped_at,
+    ends_cut_off,
+)
+from daqsvc.dsp.quality.missing import RECORDING_SHARE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.dsp.speed.keyphasor import EdgeCounts
-    from daqsvc.recording.recording import Recording
+    from daqsvc.dsp.quality.missing import EdgeCounts
 
     Floats = NDArray[np.float64]
 
-_LEAST_ORBIT_UM = 0.01
-_MOST_ORBIT_UM = 10_000.0
-_MOST_CLEARANCES = 20.0
-_LEAST_OF_CLEARANCE = 1e-3
-_CLIPPED = 1 / 16
-"""Part of a revolution at an extreme value from which on a probe may be clipped."""
-_LEAST_CLIPPED_REVOLUTIONS = 3
-_LEAST_CUT_OFF = 8
-"""So often a recording must end at its extreme value, and four times as often as at any other."""
+_LEAST_BAD_REVOLUTIONS = 3
+"""So many revolutions that stand still, or are clipped, are no chance."""
 _NO_MEAN = 1e-3
 """A mean position within this part of the 1X amplitude is none."""
-_MOST_UNUSABLE = 0.5
 _FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 
 
@@ -101,7 +104,26 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
     return quality
 
 
-def known_against(recording: Recording) -> DataQuality:
+class Recorded(Protocol):
+    """What is looked at of a `daqsvc.recording.recording.Recording`."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of the channels."""
+        ...
+
+    @property
+    def samples(self) -> Floats:
+        """Float64 ``[n, channels]``."""
+        ...
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was odd about the file."""
+        ...
+
+
+def known_against(recording: Recorded) -> DataQuality:
     """What is known against a recording before anybody looks at its signals."""
     quality = count_bad(recording.names, recording.samples)
     return replace(quality, problems=(*recording.notes, *quality.problems))
@@ -115,18 +137,20 @@ def refuse_unreadable(names: Sequence[str], samples: Floats) -> None:
         samples: float64 ``[n, channels]``, NaN where missing.
 
     Raises:
-        RefusedError: a channel holds nothing, or one value only.
+        UnfitError: a channel holds nothing, or one value only.
     """
     for name, signal in zip(names, samples.T, strict=True):
         there = signal[np.isfinite(signal)]
-        if len(there) <= len(signal) * (1.0 - _MOST_UNUSABLE):
-            raise RefusedError(
-                f"{name}: {len(signal) - len(there)} of {len(signal)} samples are missing or infinite, more "
-                "than half; repair the recording, or map another channel with --map"
+        if len(there) <= len(signal) * (1.0 - RECORDING_SHARE):
+            raise UnfitError(
+                f"{name}:",
+                f"{len(signal) - len(there)} of {len(signal)} samples are missing or infinite, more "
+                "than half",
+                "repair the recording, or map another channel with --map",
             )
         if float(there.min()) == float(there.max()):
-            raise RefusedError(
-                f"{name} is dead: all samples are {there[0]:.6g}; check the probe, its cable and driver"
+            raise UnfitError(
+                name, f"is dead: all samples are {there[0]:.6g}", "check the probe, its cable and driver"
             )
 
 
@@ -145,7 +169,7 @@ def refuse_stuck(
         The quality with the clipped samples counted, and told if they are few.
 
     Raises:
-        RefusedError: a probe repeats one value through whole revolutions, or is clipped in some.
+        UnfitError: a probe repeats one value through whole revolutions, or is clipped in some.
     """
     revolution = max(4, round(period_samples))
     count = len(samples) // revolution
@@ -156,24 +180,28 @@ def refuse_stuck(
         high = np.where(there, signal, -np.inf).max(axis=1, initial=-np.inf)
         seen = there.sum(axis=1)
         still = np.flatnonzero((low == high) & (seen > revolution // 2))
-        if len(still) >= _LEAST_CLIPPED_REVOLUTIONS:
+        if len(still) >= _LEAST_BAD_REVOLUTIONS:
             first = int(still[0])
-            raise RefusedError(
-                f"{name} is dead in {len(still)} of {count} revolutions, the first is revolution {first + 1} "
-                f"(all samples are {low[first]:.6g} um); check the probe, its cable and driver, or give only "
-                f"the {first * revolution} samples before"
+            raise UnfitError(
+                name,
+                f"is dead in {len(still)} of {count} revolutions, the first is revolution {first + 1} "
+                f"(all samples are {low[first]:.6g} um)",
+                "check the probe, its cable and driver, or give only "
+                f"the {first * revolution} samples before",
             )
         at_end = np.maximum(
             (signal == low[:, np.newaxis]).sum(axis=1), (signal == high[:, np.newaxis]).sum(axis=1)
         )
-        suspects = np.flatnonzero(at_end >= max(3.0, _CLIPPED * revolution))
+        suspects = np.flatnonzero(at_end >= max(LEAST_IN_REVOLUTION, CLIPPED_REVOLUTION * revolution))
         clipped = [(int(i), at) for i in suspects if (at := clipped_at(signal[i][there[i]])) is not None]
-        if len(clipped) >= _LEAST_CLIPPED_REVOLUTIONS:
+        if len(clipped) >= _LEAST_BAD_REVOLUTIONS:
             samples_at = sum(int((signal[i] == at).sum()) for i, at in clipped)
             first, at = clipped[0]
-            raise ClippedError(
-                f"{name} is clipped at {at:.6g} um in {len(clipped)} of {count} revolutions, the first is "
-                f"revolution {first + 1}; check the gap and the range of the converter",
+            raise ClippedProbeError(
+                name,
+                f"is clipped at {at:.6g} um in {len(clipped)} of {count} revolutions, the first is "
+                f"revolution {first + 1}",
+                "check the gap and the range of the converter",
                 replace(quality, clipped={**quality.clipped, name: samples_at}),
             )
         quality = _peaks_cut_off(quality, name, samples[:, column])
@@ -182,9 +210,7 @@ def refuse_stuck(
 
 def _peaks_cut_off(quality: DataQuality, name: str, signal: Floats) -> DataQuality:
     """Tell of a probe whose highest or lowest peaks all end at one value, now and then."""
-    values, counts = np.unique(signal[np.isfinite(signal)], return_counts=True)
-    least = max(_LEAST_CUT_OFF, 4 * int(counts[1:-1].max(initial=0)))
-    ends = {float(values[end]): int(counts[end]) for end in (0, -1) if counts[end] >= least}
+    ends = ends_cut_off(signal, LEAST_CUT_OFF)
     if not ends:
         return quality
     clipped = {**quality.clipped, name: sum(ends.values())}
@@ -195,68 +221,19 @@ def _peaks_cut_off(quality: DataQuality, name: str, signal: Floats) -> DataQuali
     )
 
 
-class ClippedError(RefusedError):
+class ClippedProbeError(UnfitError):
     """A probe is clipped.
 
-    Attributes:
-        quality: with the clipped samples counted.
+    Args:
+        name: of the probe.
+        value: what was found.
+        remedy: what to do about it.
+        quality: what is known, with the clipped samples counted.
     """
 
-    def __init__(self, message: str, quality: DataQuality) -> None:
-        super().__init__(message)
+    def __init__(self, name: str, value: str, remedy: str, quality: DataQuality) -> None:
+        super().__init__(name, value, remedy)
         self.quality = quality
-
-
-def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
-    """Refuse orbits of a size that no rotor has: the unit must be wrong.
-
-    Args:
-        samples: float64 ``[n, 2]`` in um, NaN where missing.
-        clearance_um: radial clearance, if known.
-        unit: what the samples were said to be in.
-
-    Raises:
-        RefusedError: the orbit is too small or too large.
-    """
-    radius_um = _radius_um(samples)
-    most_um = _MOST_ORBIT_UM
-    than = f"{most_um / 1000:g} mm"
-    if clearance_um is not None and _MOST_CLEARANCES * clearance_um < most_um:
-        most_um = _MOST_CLEARANCES * clearance_um
-        than = f"{_MOST_CLEARANCES:g} times the clearance of {clearance_um:g} um"
-    if radius_um > most_um:
-        raise RefusedError(
-            f"the orbit has a radius of {radius_um:.3g} um, more than {than}: the unit {unit!r} looks wrong; "
-            "correct --unit (m, mm, um or mil)"
-        )
-    if radius_um < _LEAST_ORBIT_UM:
-        raise RefusedError(
-            f"the orbit has a radius of {radius_um:.3g} um, less than {_LEAST_ORBIT_UM:g} um: the unit "
-            f"{unit!r} looks wrong; correct --unit (m, mm, um or mil)"
-        )
-
-
-def doubt_size(quality: DataQuality, samples: Floats, clearance_um: float | None, unit: str) -> DataQuality:
-    """Tell of an orbit so small in its clearance that the unit may be wrong.
-
-    Args:
-        quality: what is known so far.
-        samples: float64 ``[n, 2]`` in um, NaN where missing.
-        clearance_um: radial clearance, if known.
-        unit: what the samples were said to be in.
-    """
-    radius_um = _radius_um(samples)
-    if clearance_um is None or radius_um >= _LEAST_OF_CLEARANCE * clearance_um:
-        return quality
-    return quality.with_problem(
-        f"the unit {unit!r} may be wrong: the orbit has a radius of {radius_um:.2g} um in a clearance of "
-        f"{clearance_um:.4g} um"
-    )
-
-
-def _radius_um(samples: Floats) -> float:
-    spread = np.nanpercentile(samples, [1.0, 99.0], axis=0)
-    return float((spread[1] - spread[0]).max()) / 2.0
 
 
 def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[Complaint]) -> None:
@@ -271,8 +248,8 @@ def refuse_gaps(unusable: int, revolutions: int, complaints: Sequence[Complaint]
         RefusedError: more than half of them, or there is none at all.
     """
     if not revolutions:
-        raise RefusedError("no whole revolution was found; check the speed and the keyphasor")
-    if unusable > _MOST_UNUSABLE * revolutions:
+        raise UnfitError("no whole revolution", "was found", "check the speed and the keyphasor")
+    if unusable > RECORDING_SHARE * revolutions:
         why = max(complaints, key=lambda one: one.times).reason if complaints else "samples are missing"
         raise RefusedError(f"{why} ({unusable} of {revolutions} revolutions cannot be judged)")
 
