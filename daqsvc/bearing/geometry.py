@@ -2,12 +2,22 @@
 
 Pure rolling, inner ring turning, outer ring standing still. Real bearings slip by 1 to 2 %: the cage falls
 behind, and with it the rate at which balls pass the outer race, while they pass the inner race more often.
+A small catalogue, `bearings.toml`, has the figures by a bearing's designation.
 """
 
 from __future__ import annotations
 
+import difflib
 import math
+import tomllib
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 
 SUM_TOLERANCE = 0.05
 """Relative departure of stated orders from the kinematic laws at which they are refused."""
@@ -129,3 +139,63 @@ class BearingGeometry:
             ball=0.5 * self.pitch_diameter / self.ball_diameter * (1.0 - gamma**2),
             cage=0.5 * (1.0 - gamma),
         )
+
+
+SEALS = (
+    "-2RS1",
+    "-2RSH",
+    "-2RSR",
+    "-2RS",
+    "-2RZ",
+    "-2Z",
+    "-RS",
+    "-RZ",
+    "-ZZ",
+    "-Z",
+    "2RS",
+    "ZZ",
+    "VV",
+    "DDU",
+)
+"""Suffixes of seals and shields: they change nothing inside."""
+
+
+@cache
+def catalogue() -> Mapping[str, BearingOrders]:
+    """Fault orders of all known bearings, by designation."""
+    text = files("daqsvc.bearing").joinpath("bearings.toml").read_text(encoding="utf-8")
+    return {name: _orders(entry) for name, entry in tomllib.loads(text).items()}
+
+
+def bearing_orders(designation: str) -> BearingOrders:
+    """Fault orders of a bearing in the catalogue.
+
+    Args:
+        designation: e.g. ``"6205-2RS"``; case, blanks and the seals' suffix do not matter.
+
+    Raises:
+        KeyError: it is not in the catalogue; the message lists near names.
+    """
+    known = catalogue()
+    wanted = designation.upper().replace(" ", "")
+    bare = next((wanted.removesuffix(seal) for seal in SEALS if wanted.endswith(seal)), wanted)
+    for name in (wanted, bare):
+        if name in known:
+            return known[name]
+    near = difflib.get_close_matches(bare, known, n=4, cutoff=0.5) or sorted(known)
+    stem = bare.partition("-")[0]
+    # Of a known bearing, only the seals were written in a way that nobody uses.
+    meant = f" (did you mean {stem}-2RS?)" if stem in known else ""
+    raise KeyError(
+        f"bearing {designation!r} is not in the catalogue; near names: {', '.join(near)}{meant}. "
+        "Give its orders instead: BPFI=..,BPFO=..,BSF=..,FTF=.."
+    )
+
+
+def _orders(entry: Mapping[str, float]) -> BearingOrders:
+    return BearingGeometry(
+        balls=int(entry["balls"]),
+        ball_diameter=entry["ball_diameter_mm"],
+        pitch_diameter=entry["pitch_diameter_mm"],
+        contact_angle_deg=entry.get("contact_angle_deg", 0.0),
+    ).orders()

@@ -28,7 +28,7 @@ from daqsvc.bearing.residual import CORNER_HZ
 if TYPE_CHECKING:
     from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import Complexes, Floats
-    from daqsvc.bearing.ratio_rule import Race
+    from daqsvc.bearing.sliding_mode import Race
 
 FRAME_S = 128 / 48_000
 """Length of a frame: a hit, and little of the next."""

@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from daqsvc.bearing.bursts import STEADY, BurstMeter
+from daqsvc.bearing.impact import STEADY, BurstMeter
 from daqsvc.bearing.isolation import Isolation, IsolationRule, isolation_spectrum, short_lines
 from daqsvc.bearing.likelihood import Detection, WhittleDetector, detection_spectrum
 from daqsvc.bearing.model import BearingModel
-from daqsvc.bearing.ratio_rule import RatioRule
 from daqsvc.bearing.residual import CORNER_HZ, TwoSensorResidual
-from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair, UnitEnergies
+from daqsvc.bearing.sliding_mode import RatioRule, SlidingGains, SlidingPair, UnitEnergies
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.impact import HealthySpectrum
     from daqsvc.bearing.model import BearingParameters
-    from daqsvc.bearing.ratio_rule import Race
+    from daqsvc.bearing.sliding_mode import Race
 
 UNITS_CORNER_PER_BALL_MODE = 0.25
 """Corner of the residual that drives the sliding units: below, the races look alike to them."""

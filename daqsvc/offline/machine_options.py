@@ -10,8 +10,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.detectors.bearing.settings import Bearing, FaultOrders, WatchedBearing
 from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.diagnosis.recorded import RecordingOptions

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.detectors.rotor_bank.settings import RotorBank
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.settings import MachineFile, MachineFileError, parse_machine_file

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daqsvc.bearing.catalogue import bearing_orders, catalogue
-from daqsvc.bearing.geometry import BearingGeometry, BearingOrders
+from daqsvc.bearing.geometry import BearingGeometry, BearingOrders, bearing_orders, catalogue
 
 
 def test_the_drive_end_bearing_of_the_cwru_rig() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, Housing, healthy, knocks
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.identify import LEAST_SAMPLES, NotIdentifiableError, identify, whiteness
 from daqsvc.bearing.identify_baseline import learn_baseline, resampled
 from daqsvc.bearing.identify_change import BANDS, ChangeRules, compare_residual, learn_healthy

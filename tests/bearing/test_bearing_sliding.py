@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.bearing.ratio_rule import RatioRule
-from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair, UnitEnergies
+from daqsvc.bearing.sliding_mode import RatioRule, SlidingGains, SlidingPair, UnitEnergies
 from sim_hw.reproduce.bearing.design import S3
 from sim_hw.reproduce.bearing.paper_units import INNER_SLOPE, OUTER_SLOPE, AbsoluteRule, PaperUnit
 

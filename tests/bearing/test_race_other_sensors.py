@@ -9,7 +9,7 @@ import pytest
 from scipy.io import loadmat
 from support import race_records
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.race import race_test
 
 if TYPE_CHECKING:

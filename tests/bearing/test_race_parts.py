@@ -12,9 +12,14 @@ from support.race_signals import BEARING, RATE_HZ
 from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import best_comb, fundamental, highest_order
 from daqsvc.bearing.race.decision import decide
-from daqsvc.bearing.race.depth import ModulationDepth, sharpest
-from daqsvc.bearing.race.lines import LineEvidence, line_evidence
-from daqsvc.bearing.race.null import false_alarm_probability, significance
+from daqsvc.bearing.race.lines import (
+    LineEvidence,
+    ModulationDepth,
+    false_alarm_probability,
+    line_evidence,
+    sharpest,
+    significance,
+)
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
 from daqsvc.dsp.envelope import line_power, running_median, squared_envelope, whiten

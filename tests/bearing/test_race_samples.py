@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
-from daqsvc.bearing.race.confidence import MOST_MARGIN, doubted
+from daqsvc.bearing.race.decision import MOST_MARGIN, doubted
 from daqsvc.bearing.race.rules import RaceRules
 from daqsvc.dsp.envelope import levelled
 from daqsvc.dsp.quality import UnfitError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.race import RaceWatch, race_baseline, race_test
 from daqsvc.dsp.quality import UnfitError
 

@@ -14,7 +14,7 @@ import tracemalloc
 import numpy as np
 from targets import Targets
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.race import RaceWatch, race_test
 from daqsvc.bearing.race.watch import WINDOW_S
 

@@ -16,7 +16,7 @@ from support.shaft_channels import channels_of, feed
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.manager import AlarmManager, Identity
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.identify import NotIdentifiableError
 from daqsvc.bearing.identify_change import learn_healthy
 from daqsvc.bearing.race.judge import race_test

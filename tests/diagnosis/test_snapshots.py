@@ -17,7 +17,7 @@ from daqsvc.acquisition.ring import RingReader, SampleRing
 from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.manager import LevelRule
 from daqsvc.alarms.setpoints import Setpoint
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector

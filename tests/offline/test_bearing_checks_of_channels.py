@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
-from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.bearing.race import race_test
 from daqsvc.detectors.bearing.recorded_checks import ball_order_problem, refuse_no_machine
 from daqsvc.dsp.quality import UnfitError

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from scipy.io import loadmat
 
-from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.recording.recording import load_recording
 
 if TYPE_CHECKING:

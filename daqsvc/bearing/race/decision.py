@@ -1,4 +1,4 @@
-"""From evidence to a word: significance and size, and what cannot be told apart."""
+"""From evidence to a word: significance and size, what cannot be told apart, and how sure "normal" may be."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.baseline import RaceBaseline
     from daqsvc.bearing.race.rules import RaceRules
     from daqsvc.bearing.race.verdict import Part, RaceWord
+
 
 STEEPNESS = 4.0
 """Odds grow with this power of the factor by which a limit is passed: a convention, not a measurement."""
@@ -157,3 +158,29 @@ def _grown(part: Part, e: PartEvidence, before: PartEvidence, rules: RaceRules) 
     significance = (e.z - max(0.0, before.z)) / rules.z_growth
     size = e.depth / max(rules.changed_growth * before.depth, LEAST_FACTOR)
     return max(0.0, min(_passed(part, e, rules, rules.changed_ease), significance, size))
+
+
+MOST_MARGIN = 10.0
+"""A limit missed by more is no less missed."""
+NOTE_DOUBT, REPAIR_DOUBT = 0.01, 0.1
+"""Of each thing that weakens the test, and of each kind of defect of its samples: a convention."""
+MOST_DOUBT = 0.5
+
+
+def doubted(probability: Mapping[str, float], notes: int, repairs: int, lost: float) -> dict[str, float]:
+    """Shares of belief in which "normal" gives to the parts what was perhaps not seen.
+
+    Args:
+        probability: share of belief per word, by the evidence alone.
+        notes: number of other things that weaken the test.
+        repairs: kinds of defects that were put right.
+        lost: share of the record in which nothing could be seen.
+    """
+    doubt = min(NOTE_DOUBT * notes + REPAIR_DOUBT * repairs + lost, MOST_DOUBT)
+    shares = dict(probability)
+    given = doubt * shares.get("normal", 0.0)
+    if given > 0.0:
+        shares["normal"] -= given
+        for part in PARTS:
+            shares[part] = shares.get(part, 0.0) + given / len(PARTS)
+    return shares

@@ -15,13 +15,10 @@ import scipy.fft
 
 from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
 from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
-from daqsvc.bearing.race.confidence import MOST_DOUBT, MOST_MARGIN, doubted
-from daqsvc.bearing.race.decision import RACES, decide
-from daqsvc.bearing.race.lines import NOTCHED_HARMONICS
-from daqsvc.bearing.race.null import false_alarm_probability
-from daqsvc.bearing.race.rival import refuse_rivals
+from daqsvc.bearing.race.decision import MOST_DOUBT, MOST_MARGIN, RACES, decide, doubted
+from daqsvc.bearing.race.lines import NOTCHED_HARMONICS, false_alarm_probability
 from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.scoring import EnvelopeView, Scales, view_of
+from daqsvc.bearing.race.scoring import EnvelopeView, Scales, refuse_rivals, view_of
 from daqsvc.bearing.race.track import shaft_track
 from daqsvc.bearing.race.verdict import (
     PARTS,

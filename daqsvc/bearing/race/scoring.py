@@ -1,4 +1,8 @@
-"""What speaks for damage of each part: its comb's significance and its lines' size, in two envelopes."""
+"""What speaks for damage of each part: its comb's significance and its lines' size, in two envelopes.
+
+Lines of one part at the stated speed are those of another part at another speed: which speed is true is
+asked at the end (`refuse_rivals`).
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,18 @@ import numpy as np
 
 from daqsvc.bearing.race.combs import best_comb, fundamental, part_lines
 from daqsvc.bearing.race.decision import weight_of
-from daqsvc.bearing.race.depth import ModulationDepth, sharpest
-from daqsvc.bearing.race.lines import LineEvidence, line_evidence
-from daqsvc.bearing.race.null import REVOLUTIONS, false_alarm_probability, significance
+from daqsvc.bearing.race.lines import (
+    REVOLUTIONS,
+    LineEvidence,
+    ModulationDepth,
+    false_alarm_probability,
+    line_evidence,
+    sharpest,
+    significance,
+)
 from daqsvc.bearing.race.verdict import PARTS, PLACES, Part, PartEvidence
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.speed.harmonics import REMEDY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -26,6 +38,8 @@ if TYPE_CHECKING:
     from daqsvc.dsp.speed.harmonics import ShaftRate
 
     Real = NDArray[np.float64]
+    from collections.abc import Mapping
+
 
 SHARPEN_SHARE = 0.01
 """How far the deepest lines may be from the most significant comb, as a share."""
@@ -180,3 +194,38 @@ def _why_not(order: float, gap: float, rules: RaceRules) -> str:
         f"2 BSF = {order:.3f} is too close to {round(order)}X; a record of {needed:.0f} revolutions "
         "or more would tell them apart"
     )
+
+
+def refuse_rivals(
+    evidence: Mapping[Part, PartEvidence], bearing: BearingOrders, shaft: ShaftRate, slip: float
+) -> None:
+    """Refuse to name a part that only a doubtful speed makes of these lines.
+
+    Harmonics may be too few to confirm the stated speed, and yet more of them may speak for the speed at
+    which the same lines are those of another part.
+
+    Args:
+        evidence: of each part.
+        bearing: its fault orders.
+        shaft: rate of the shaft.
+        slip: how far the lines of a part may be from their place, as a share.
+
+    Raises:
+        UnfitError: they do.
+    """
+    if shaft.seen:
+        return
+    for part in PARTS:
+        e = evidence[part]
+        if e.z < e.z_limit or e.severity < e.limit:
+            continue
+        for other in PARTS:
+            rival_hz = shaft.rate_hz * e.order / fundamental(bearing, other)
+            if other != part and shaft.outvoted(rival_hz, slip):
+                here, there = 60.0 * shaft.rate_hz, 60.0 * rival_hz
+                raise UnfitError(
+                    "shaft speed or sample rate",
+                    f"is in doubt: the lines of the {PLACES[part]} at {here:.0f} rpm are those of the "
+                    f"{PLACES[other]} at {there:.0f} rpm, where more harmonics of a shaft stand out",
+                    REMEDY,
+                )

@@ -6,8 +6,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING
 
-from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.bearing.identify_change import ChangeRules
 from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.isolation import least_rate_hz

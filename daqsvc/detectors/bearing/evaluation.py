@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from daqsvc.bearing.bursts import STEADY
+from daqsvc.bearing.impact import STEADY
 from daqsvc.bearing.race.verdict import PARTS
 
 if TYPE_CHECKING:

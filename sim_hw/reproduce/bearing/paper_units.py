@@ -19,8 +19,7 @@ from numba import njit
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import Floats
-    from daqsvc.bearing.ratio_rule import Race
-    from daqsvc.bearing.sliding_mode import UnitEnergies
+    from daqsvc.bearing.sliding_mode import Race, UnitEnergies
 
 STIFFNESS, DAMPING = 12.0, 8.0
 """a in 1/s^2 and b in 1/s of the free dynamics, chosen so that both surfaces are their eigenvectors."""

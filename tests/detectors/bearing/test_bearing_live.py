@@ -12,8 +12,7 @@ from support.bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, healthy, k
 from support.machine_files import MACHINES
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.bearing.catalogue import bearing_orders
-from daqsvc.bearing.geometry import BearingOrders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.bearing.identify_file import load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.two_sensors import PairModel
 from daqsvc.detectors.bearing.detector import BearingDetector

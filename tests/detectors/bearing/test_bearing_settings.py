@@ -11,7 +11,7 @@ import pytest
 from support.bearing_signals import healthy
 from support.machine_files import MACHINES, changed, only_problem, parsed, problems_of
 
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.identify_baseline import learn_baseline
 from daqsvc.bearing.identify_file import save_bearing_baseline
 from daqsvc.cli import main

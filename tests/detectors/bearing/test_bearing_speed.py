@@ -10,7 +10,7 @@ import pytest
 from support.bearing_signals import OUTER, RATE_HZ, SPEED_RPM, healthy, knocks
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.bearing.catalogue import bearing_orders
+from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.diagnosis.detector import Window
