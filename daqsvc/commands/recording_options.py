@@ -21,13 +21,8 @@ from daqsvc.commands.option_types import (
     probe_pair,
     speed,
 )
-from daqsvc.recording.channels import (
-    ACCELERATION_UNITS,
-    LENGTH_UNITS,
-    add_max_memory,
-    channel_map,
-    sampling_rate_hz,
-)
+from daqsvc.dsp.quality.unit import ACCELERATION_UNITS, LENGTH_UNITS
+from daqsvc.recording.channels import add_max_memory, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

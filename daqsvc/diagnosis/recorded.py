@@ -11,7 +11,7 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.detector import Window
-from daqsvc.recording.channels import UM_PER_UNIT
+from daqsvc.dsp.quality.unit import UM_PER_UNIT
 from daqsvc.settings.models import ProximityProbe
 from daqsvc.settings.section import Section
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
     _Weights: TypeAlias = tuple[Floats, Floats]
 
-STANDARD_GRAVITY = 9.80665
-"""m/s2 per g (CGPM 1901)."""
 
 SURE = 4.0
 """Bounds are so many standard deviations wide on either side."""

@@ -15,8 +15,8 @@ from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
 from daqsvc.dsp.quality.recorded import DataQuality, known_against
+from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
-from daqsvc.recording.channels import M_S2_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
 from daqsvc.rotor.orders.change import OrderChange, OrderRules, compare_orders
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
-    from daqsvc.recording.channels import AccelerationUnit
+    from daqsvc.dsp.quality.unit import AccelerationUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
 

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import argparse
 import math
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.confined.limits import GIGABYTE
+from daqsvc.dsp.quality.unit import LENGTH_UNITS, UM_PER_UNIT
 from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     import numpy as np
     from numpy.typing import NDArray
 
     Floats: TypeAlias = NDArray[np.float64]
-
-LengthUnit = Literal["m", "mm", "um", "mil"]
-
-LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
-
-UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
-
-AccelerationUnit = Literal["g", "m/s2", "V"]
-
-ACCELERATION_UNITS: tuple[AccelerationUnit, ...] = get_args(AccelerationUnit)
-
-M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0}
-"""Volts are missing: what they mean only the sensor's sensitivity tells."""
 
 LEAST_MEMORY_GB = 0.05
 MOST_MEMORY_GB = 1000.0

@@ -5,13 +5,8 @@ import argparse
 import numpy as np
 import pytest
 
-from daqsvc.recording.channels import (
-    LENGTH_UNITS,
-    channel_map,
-    metres_per_unit,
-    sampling_rate_hz,
-    to_um,
-)
+from daqsvc.dsp.quality.unit import LENGTH_UNITS
+from daqsvc.recording.channels import channel_map, metres_per_unit, sampling_rate_hz, to_um
 from daqsvc.recording.errors import RecordingError
 
 

@@ -16,7 +16,7 @@ from daqsvc.detectors.bearing.detector import SAME_SPEED, BearingDetector
 from daqsvc.detectors.bearing.direction import TwoSensors
 from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.detectors.bearing.settings import BEARING
-from daqsvc.dsp.levels import STANDARD_GRAVITY
+from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings.models import Keyphasor
 
@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 
 SAME_RATE = 1e-3
 """How far two sampling rates may differ that count as one, as a share."""
-_M_S2_PER_UNIT = {"g": STANDARD_GRAVITY, "m/s2": 1.0}
 
 
 def bearing_detector(
@@ -136,7 +135,7 @@ def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> Two
     )
     rotor, housing = machine.sensor(given.rotor_sensor), machine.sensor(given.sensor)
     column = machine.streams[rotor.stream].layout.channel_names.index(rotor.channel)
-    m_s2_per_unit = (_M_S2_PER_UNIT[rotor.unit], _M_S2_PER_UNIT[housing.unit])
+    m_s2_per_unit = (M_S2_PER_UNIT[rotor.unit], M_S2_PER_UNIT[housing.unit])
     try:
         parameters = BearingParameters(
             m_r=m_r, m_b=m_b, m_h=m_h, k_s=k_s, k_c=k_c, k_h=k_h, c_s=c_s, c_c=c_c, c_h=c_h

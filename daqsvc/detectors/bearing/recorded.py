@@ -22,12 +22,9 @@ from daqsvc.detectors.bearing.calibrating import HealthyRun
 from daqsvc.detectors.bearing.finding import BearingFinding, find
 from daqsvc.detectors.bearing.persistence import UNDETERMINED
 from daqsvc.detectors.bearing.recorded_checks import (
-    accelerometer_quality,
     ball_order_problem,
     meant_in_hz,
-    refuse_no_machine,
     stated_speed_problem,
-    unit_problems,
     with_offsets,
     with_repairs,
 )
@@ -38,6 +35,7 @@ from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Statements
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 from daqsvc.dsp.quality.recorded import DataQuality
+from daqsvc.dsp.quality.unit import accelerometer_quality, refuse_no_machine, unit_problems
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_matching
 
@@ -54,7 +52,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.bearing.persistence import ConfirmedState
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
-    from daqsvc.recording.channels import AccelerationUnit
+    from daqsvc.dsp.quality.unit import AccelerationUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.settings.models import MachineFile
 
@@ -307,7 +305,8 @@ def analyse_bearings(
             race = race_test(
                 column, recording.rate_hz, setup.speed_rpm, setup.bearings[name], setup.race, before
             )
-            refuse_no_machine(column, setup.unit, race)
+            seen = race.speed_seen or race.verdict != "normal"
+            refuse_no_machine(column, setup.unit, seen=seen)
         except ClippedError as error:
             unfit[name] = str(error)
             quality = replace(quality, clipped={**quality.clipped, name: error.samples})
@@ -356,7 +355,7 @@ def _quality(recording: Recording, setup: BearingSetup) -> DataQuality:
     quality = replace(quality, problems=(*recording.notes, *quality.problems))
     orders = dict.fromkeys(ball_order_problem(setup.bearings[name]) for name in recording.names)
     speed = stated_speed_problem(recording, setup.speed_rpm)
-    for problem in (speed, *unit_problems(recording, setup.unit), *orders):
+    for problem in (speed, *unit_problems(recording.names, recording.samples, setup.unit), *orders):
         quality = quality.with_problem(problem) if problem else quality
     return quality
 

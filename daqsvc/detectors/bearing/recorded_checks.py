@@ -12,11 +12,9 @@ from daqsvc.bearing.race.verdict import PLACES
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import OFFSET_NOTE
 from daqsvc.dsp.quality.clipped import refuse_clipped
-from daqsvc.dsp.quality.recorded import count_bad
-from daqsvc.recording.channels import M_S2_PER_UNIT
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
     from daqsvc.detectors.bearing.verdict import BearingSetup
     from daqsvc.dsp.quality.recorded import DataQuality
-    from daqsvc.recording.channels import AccelerationUnit
     from daqsvc.recording.recording import Recording
 
     Floats = NDArray[np.float64]
@@ -34,14 +31,6 @@ _RPM_NAME = re.compile(r"(?i)(?:.*[^a-z])?rpm|(?:.*[._])?(?:speed|shaft)_?rpm")
 _SAME_SPEED = 0.03
 _LIKE_HZ_RPM = 200.0
 """A speed below may be meant in revolutions per second."""
-_G_M_S2 = 9.80665
-_USUAL_G = (1e-3, 50.0)
-"""R.m.s. of a housing on a running machine, at the least and at the most."""
-_LEAST_M_S2 = 1e-4
-_MOST_M_S2 = 10_000.0
-"""No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""
-_LEAST_MACHINE_M_S2 = 1e-3
-"""A tenth of a milli-g: what a good accelerometer shows by itself where nothing turns."""
 _TWICE_TOLERANCE = 0.1
 
 
@@ -52,21 +41,6 @@ def stated_speed_problem(recording: Recording, speed_rpm: float) -> str:
         return ""
     said = " and ".join(f"{rpm:g} rpm ({name})" for name, rpm in stated.items())
     return f"{recording.source} states {said}, --speed-rpm is {speed_rpm:g}: correct the one that is wrong"
-
-
-def unit_problems(recording: Recording, unit: AccelerationUnit) -> Iterator[str]:
-    """What to say of channels that are possible, but quiet or loud for a running machine."""
-    for name, column in zip(recording.names, recording.samples.T, strict=True):
-        signal = column[np.isfinite(column)]
-        m_s2 = float(signal.std()) * M_S2_PER_UNIT.get(unit, np.nan) if len(signal) else np.nan
-        g = m_s2 / _G_M_S2
-        if not (_LEAST_M_S2 <= m_s2 <= _MOST_M_S2) or _USUAL_G[0] <= g <= _USUAL_G[1]:
-            continue
-        how = "little" if g < 1.0 else "much"
-        yield (
-            f"{name}: {float(signal.std()):.3g} {unit} r.m.s. is {how} for a running machine: it was taken "
-            f"to be in {unit}; correct --unit if it is not"
-        )
 
 
 def meant_in_hz(recording: Recording, setup: BearingSetup) -> str:
@@ -108,52 +82,6 @@ def against_healthy_run(recording: Recording, setup: BearingSetup) -> tuple[str,
                 or f"{name}: its harmonics do not confirm {setup.speed_rpm:g} rpm at {recording.rate_hz:g} Hz"
             )
     return damage, doubt
-
-
-def accelerometer_quality(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> DataQuality:
-    """Count what is missing, and tell of sizes that no acceleration has; the race test tells of offsets.
-
-    Args:
-        names: of the channels.
-        samples: float64 ``[n, channels]`` as they were recorded.
-        unit: that they are said to be in.
-    """
-    quality = count_bad(names, samples)
-    for name, column in zip(names, samples.T, strict=True):
-        signal = column[np.isfinite(column)]
-        if not len(signal):
-            continue
-        rms = float(signal.std())
-        if np.ptp(signal) == 0.0:
-            continue  # dead: the race test says so; the rounding of its mean is no vibration
-        m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
-        if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
-            quality = quality.with_problem(
-                f"{name}: vibrates with {rms:.3g} {unit} r.m.s., which no housing does: the unit looks "
-                "wrong; correct --unit (g, m/s2 or V)"
-            )
-    return quality
-
-
-def refuse_no_machine(samples: Floats, unit: AccelerationUnit, race: RaceVerdict) -> None:
-    """Refuse a channel that shows no machine at all, as of a sensor that is unplugged.
-
-    Args:
-        samples: ``[n]``, as they were recorded.
-        unit: that they are said to be in.
-        race: what the race test says of them.
-
-    Raises:
-        UnfitError: they are quieter than any machine, and no harmonics of a shaft stand out.
-    """
-    rms = float(np.nanstd(samples))
-    quiet = rms * M_S2_PER_UNIT.get(unit, float("nan")) < _LEAST_MACHINE_M_S2
-    if quiet and not race.speed_seen and race.verdict == "normal":
-        raise UnfitError(
-            "channel",
-            f"shows no machine: {rms:.3g} {unit} r.m.s. and no speed that its harmonics confirm",
-            "check sensor, cable and --unit",
-        )
 
 
 def ball_order_problem(orders: BearingOrders) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
     from daqsvc.detectors.bearing.finding import BearingFinding
-    from daqsvc.recording.channels import AccelerationUnit
+    from daqsvc.dsp.quality.unit import AccelerationUnit
 
 _TOLD_LINES = 4
 

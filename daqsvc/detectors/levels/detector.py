@@ -9,7 +9,7 @@ import numpy as np
 
 from daqsvc.detectors.levels.statements import NO_BOUNDS, Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
-from daqsvc.dsp.levels import STANDARD_GRAVITY, band_rms, gapped_band_rms, levels
+from daqsvc.dsp.levels import band_rms, gapped_band_rms, levels
 from daqsvc.dsp.quality.missing import (
     LEAST_KNOWN_ERROR,
     MIN_PRESENT,
@@ -21,6 +21,7 @@ from daqsvc.dsp.quality.missing import (
     partly_missing,
 )
 from daqsvc.dsp.quality.stuck import StandstillWatch
+from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -44,7 +45,7 @@ SensorUnit = Literal["um", "mm", "mil", "g", "m/s2", "mm/s"]
 
 # How a band velocity in mm/s comes from the samples: factor, and whether to integrate.
 _TO_VELOCITY: Mapping[str, tuple[float, bool]] = {
-    "g": (1000.0 * STANDARD_GRAVITY, True),
+    "g": (1000.0 * M_S2_PER_UNIT["g"], True),
     "m/s2": (1000.0, True),
     "mm/s": (1.0, False),
 }

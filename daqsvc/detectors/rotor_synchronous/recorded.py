@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
-    from daqsvc.recording.channels import LengthUnit
+    from daqsvc.dsp.quality.unit import LengthUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.signatures import RotorFault

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.dsp.quality.recorded import DataQuality
+    from daqsvc.dsp.quality.unit import LengthUnit
     from daqsvc.dsp.speed.keyphasor import Edge
-    from daqsvc.recording.channels import LengthUnit
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration

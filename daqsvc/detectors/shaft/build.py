@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from daqsvc.dsp.probes import Probe
+from daqsvc.dsp.quality.unit import UM_PER_UNIT
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.settings.models import Keyphasor, ProximityProbe
 
 if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.streams import Grid
-
-_UM_PER_UNIT = {"um": 1.0, "mm": 1000.0, "mil": 25.4}
 
 
 def probes(machine: MachineFile, grid: Grid, names: tuple[str, str]) -> tuple[Probe, Probe]:
@@ -22,7 +21,7 @@ def probes(machine: MachineFile, grid: Grid, names: tuple[str, str]) -> tuple[Pr
         sensor = machine.sensor(name)
         assert isinstance(sensor, ProximityProbe)  # noqa: S101 - detectors/shaft/checks.py
         assert sensor.angle_deg is not None  # noqa: S101 - detectors/shaft/checks.py
-        return Probe(name, grid.column(sensor), sensor.angle_deg, _UM_PER_UNIT[sensor.unit])
+        return Probe(name, grid.column(sensor), sensor.angle_deg, UM_PER_UNIT[sensor.unit])
 
     return probe(names[0]), probe(names[1])
 

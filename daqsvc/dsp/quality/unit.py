@@ -1,4 +1,4 @@
-"""Whether samples can be in the unit that they are said to be in, by their size.
+"""Units of recordings, and whether samples can be in the one that they are said to be in, by their size.
 
 This is asked of recordings only. Live a sensor's unit stands in the machine file, where `daqsvc check` shows
 what becomes of it, and a machine that stands still is as quiet as one in a wrong unit.
@@ -6,19 +6,42 @@ what becomes of it, and a machine that stands still is as quiet as one in a wron
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.recorded import count_bad
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
     from numpy.typing import NDArray
 
     from daqsvc.dsp.quality.recorded import DataQuality
 
     Floats = NDArray[np.float64]
 
+LengthUnit = Literal["m", "mm", "um", "mil"]
+
+LENGTH_UNITS: tuple[LengthUnit, ...] = get_args(LengthUnit)
+
+UM_PER_UNIT: Mapping[str, float] = {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}
+
+AccelerationUnit = Literal["g", "m/s2", "V"]
+
+ACCELERATION_UNITS: tuple[AccelerationUnit, ...] = get_args(AccelerationUnit)
+
+M_S2_PER_UNIT: Mapping[str, float] = {"g": 9.80665, "m/s2": 1.0}
+"""Of standard gravity (CGPM 1901). Volts are missing: what they mean only the sensor's sensitivity tells."""
+
+_USUAL_G = (1e-3, 50.0)
+"""R.m.s. of a housing on a running machine, at the least and at the most."""
+_LEAST_M_S2 = 1e-4
+_MOST_M_S2 = 10_000.0
+"""No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""
+_LEAST_MACHINE_M_S2 = 1e-3
+"""A tenth of a milli-g: what a good accelerometer shows by itself where nothing turns."""
 _LEAST_ORBIT_UM = 0.01
 _MOST_ORBIT_UM = 10_000.0
 _MOST_CLEARANCES = 20.0
@@ -69,6 +92,73 @@ def doubt_size(quality: DataQuality, samples: Floats, clearance_um: float | None
 def _radius_um(samples: Floats) -> float:
     spread = np.nanpercentile(samples, [1.0, 99.0], axis=0)
     return float((spread[1] - spread[0]).max()) / 2.0
+
+
+def accelerometer_quality(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> DataQuality:
+    """Count what is missing, and tell of sizes that no acceleration has; the race test tells of offsets.
+
+    Args:
+        names: of the channels.
+        samples: float64 ``[n, channels]`` as they were recorded.
+        unit: that they are said to be in.
+    """
+    quality = count_bad(names, samples)
+    for name, column in zip(names, samples.T, strict=True):
+        signal = column[np.isfinite(column)]
+        if not len(signal):
+            continue
+        rms = float(signal.std())
+        if np.ptp(signal) == 0.0:
+            continue  # dead: the race test says so; the rounding of its mean is no vibration
+        m_s2 = rms * M_S2_PER_UNIT.get(unit, float("nan"))
+        if m_s2 < _LEAST_M_S2 or m_s2 > _MOST_M_S2:
+            quality = quality.with_problem(
+                f"{name}: vibrates with {rms:.3g} {unit} r.m.s., which no housing does: the unit looks "
+                "wrong; correct --unit (g, m/s2 or V)"
+            )
+    return quality
+
+
+def unit_problems(names: Sequence[str], samples: Floats, unit: AccelerationUnit) -> Iterator[str]:
+    """What to say of accelerometers that are possible, but quiet or loud for a running machine.
+
+    Args:
+        names: of the channels.
+        samples: float64 ``[n, channels]`` as they were recorded.
+        unit: that they are said to be in.
+    """
+    for name, column in zip(names, samples.T, strict=True):
+        signal = column[np.isfinite(column)]
+        m_s2 = float(signal.std()) * M_S2_PER_UNIT.get(unit, np.nan) if len(signal) else np.nan
+        g = m_s2 / M_S2_PER_UNIT["g"]
+        if not (_LEAST_M_S2 <= m_s2 <= _MOST_M_S2) or _USUAL_G[0] <= g <= _USUAL_G[1]:
+            continue
+        how = "little" if g < 1.0 else "much"
+        yield (
+            f"{name}: {float(signal.std()):.3g} {unit} r.m.s. is {how} for a running machine: it was taken "
+            f"to be in {unit}; correct --unit if it is not"
+        )
+
+
+def refuse_no_machine(samples: Floats, unit: AccelerationUnit, *, seen: bool) -> None:
+    """Refuse a channel that shows no machine at all, as of a sensor that is unplugged.
+
+    Args:
+        samples: ``[n]``, as they were recorded.
+        unit: that they are said to be in.
+        seen: whether damage, or harmonics of a shaft, stand out.
+
+    Raises:
+        UnfitError: they are quieter than any machine, and nothing of one stands out.
+    """
+    rms = float(np.nanstd(samples))
+    quiet = rms * M_S2_PER_UNIT.get(unit, float("nan")) < _LEAST_MACHINE_M_S2
+    if quiet and not seen:
+        raise UnfitError(
+            "channel",
+            f"shows no machine: {rms:.3g} {unit} r.m.s. and no speed that its harmonics confirm",
+            "check sensor, cable and --unit",
+        )
 
 
 def _wrong_unit(radius: str, unit: str) -> UnfitError:
