@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from daqsvc.bearing.kernels import ORDER
 from daqsvc.bearing.model import BearingModel
+from daqsvc.bearing.residual import ORDER
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

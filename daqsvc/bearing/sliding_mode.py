@@ -17,11 +17,49 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-
-from daqsvc.bearing import kernels
+from numba import njit
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import BearingParameters, Floats
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _soft(s: float, gain: float) -> float:
+    """What is left of a distance after the gain: beyond it the sign is +-1, within it the surface holds."""
+    return max(s - gain, 0.0) + min(s + gain, 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _slide(
+    residual: Floats, normals: Floats, gains: Floats, decays: Floats, sigma: Floats, distance: Floats
+) -> None:
+    """Two sliding units in scalar form: leaky sums with a soft threshold (implicit Euler).
+
+    A missing residual puts the units back onto their surfaces and is missing in what they say.
+
+    Args:
+        residual: float64 ``[n, 2]``.
+        normals: float64 ``[2, 2]``, normal of each unit's surface in the plane of the residual, a row each.
+        gains: float64 ``[2]``, what a unit takes off its distance in a step, in units of the residual.
+        decays: float64 ``[2]``, what the free dynamics take off in a step, as a share.
+        sigma: float64 ``[2]``, distances from the surfaces; changed.
+        distance: float64 ``[n, 2]``, written.
+    """
+    # Both units in one pass: each waits for its own last step, and the other fills the time.
+    inner, outer = sigma[0], sigma[1]
+    inner_shrink, outer_shrink = 1.0 / (1.0 + decays[0]), 1.0 / (1.0 + decays[1])
+    # The shrinking is done before the threshold, which shrinks with it: one step less to wait for.
+    i1, i2, inner_gain = inner_shrink * normals[0, 0], inner_shrink * normals[0, 1], inner_shrink * gains[0]
+    o1, o2, outer_gain = outer_shrink * normals[1, 0], outer_shrink * normals[1, 1], outer_shrink * gains[1]
+    for n in range(residual.shape[0]):
+        r1, r2 = residual[n, 0], residual[n, 1]
+        inner = _soft(inner_shrink * inner + (i1 * r1 + i2 * r2), inner_gain)
+        outer = _soft(outer_shrink * outer + (o1 * r1 + o2 * r2), outer_gain)
+        distance[n, 0], distance[n, 1] = inner, outer
+        if np.isnan(r1 + r2):
+            distance[n, 0] = distance[n, 1] = np.nan
+            inner = outer = 0.0
+    sigma[0], sigma[1] = inner, outer
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +138,7 @@ class SlidingPair:
             float64 ``[n, 2]``, distances of inner and outer unit from their surfaces, in m/s^2.
         """
         distance = np.empty_like(residual)
-        kernels.slide(residual, self._NORMALS, self._gains, self._decays, self._sigma, distance)
+        _slide(residual, self._NORMALS, self._gains, self._decays, self._sigma, distance)
         return distance
 
 

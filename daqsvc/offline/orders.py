@@ -19,7 +19,7 @@ from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.recording import load_recording
-from daqsvc.rotor.orders.change import OrderChange, OrderRules, compare_orders
+from daqsvc.rotor.orders import OrderChange, OrderRules, compare_orders
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ import numpy as np
 
 from daqsvc.rotor import kernels, sweep
 from daqsvc.rotor.decision import DecisionRules, Declaration, Departure
-from daqsvc.rotor.discretise import BankMode, at_speed, discretise
-from daqsvc.rotor.mode_similarity import alike
+from daqsvc.rotor.discretise import BankMode, alike, at_speed, discretise
 from daqsvc.rotor.observer_batch import FREE, PAPER, BankMemory
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.dsp.orders import order_vectors
 from daqsvc.recording.recording import load_recording
-from daqsvc.rotor.orders.change import compare_orders
+from daqsvc.rotor.orders import compare_orders
 
 if TYPE_CHECKING:
     from daqsvc.dsp.orders import OrderVectors

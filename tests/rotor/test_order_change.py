@@ -10,13 +10,13 @@ import pytest
 
 from daqsvc.cli import main
 from daqsvc.dsp.orders import order_vectors
-from daqsvc.rotor.orders.change import OrderRules, compare_orders
+from daqsvc.rotor.orders import OrderRules, compare_orders
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.dsp.orders import OrderVectors
-    from daqsvc.rotor.orders.change import OrderChange
+    from daqsvc.rotor.orders import OrderChange
 
 RATE_HZ = 2000.0
 RPM = 1500.0

@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from daqsvc.dsp.orders import order_vectors
 from daqsvc.recording.recording import load_recording
-from daqsvc.rotor.orders.change import compare_orders
+from daqsvc.rotor.orders import compare_orders
 
 if TYPE_CHECKING:
     from pathlib import Path

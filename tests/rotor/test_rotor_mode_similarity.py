@@ -10,8 +10,7 @@ from support import rotor_runs as runs
 
 from daqsvc.rotor import kernels
 from daqsvc.rotor.bank import ModelBank
-from daqsvc.rotor.discretise import at_speed, discretise
-from daqsvc.rotor.mode_similarity import alike, steady_evidence
+from daqsvc.rotor.discretise import alike, at_speed, discretise, steady_evidence
 
 MODES = runs.models()
 NAMES = [mode.name for mode in MODES]

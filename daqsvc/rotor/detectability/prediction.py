@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.detectability.evidence import Axis, Observation
-from daqsvc.rotor.detectability.passage import delay_samples
 from daqsvc.rotor.detectability.rub_evidence import simulate_rubs
-from daqsvc.rotor.detectability.visible_change import FAULTS, smallest_changes
+from daqsvc.rotor.detectability.visible_change import FAULTS, delay_samples, smallest_changes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

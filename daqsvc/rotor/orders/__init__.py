@@ -1,1 +1,0 @@
-"""1X without a phase reference: accelerometers against a healthy run."""
