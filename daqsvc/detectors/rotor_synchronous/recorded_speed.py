@@ -13,7 +13,7 @@ import numpy as np
 
 from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.speed.keyphasor import EdgeFinder, KeyphasorProbe
-from daqsvc.dsp.speed.orbit import estimate_speed
+from daqsvc.dsp.speed.orbit import AT_THE_EDGE, estimate_speed, refuse_elsewhere
 from daqsvc.dsp.speed.steadiness import Trend, trend_of_orbit, trend_of_pulses
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS
 from daqsvc.rotor.synchronous.watch import WatchRules
@@ -46,13 +46,8 @@ _HYSTERESIS = 0.2
 """Of the keyphasor's range from low to high."""
 _LEAST_PULSES = 4
 _OFF_NOMINAL = 0.05
-_AT_THE_EDGE = 0.08
-"""A line so far from the stated speed, of the tenth that is searched, may be the flank of another one."""
-_LEAST_TURNS = 10.0
 _ROUNDING = 0.5
 """Part of a revolution that the interpolation of the first and the last pulse may cost."""
-_STRONGER = 4.0
-"""So many times the 1X amplitude another line may have and still be a whirl or a harmonic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,15 +229,15 @@ def _fixed_speed(
         found = estimate_speed(first, recording.rate_hz, stated_rpm)
     except ValueError as error:
         _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
-        _refuse_elsewhere(first, recording.rate_hz, stated_rpm, None)
+        refuse_elsewhere(first, recording.rate_hz, stated_rpm, None)
         raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
     off = found.speed_rpm / stated_rpm - 1.0
     significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
     wrong = significant and abs(off) * calibrating > _FIXED_SPEED_TURN
     if wrong:
         _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
-    _refuse_elsewhere(
-        first, recording.rate_hz, stated_rpm, None if abs(off) > _AT_THE_EDGE else found.speed_rpm
+    refuse_elsewhere(
+        first, recording.rate_hz, stated_rpm, None if abs(off) > AT_THE_EDGE else found.speed_rpm
     )
     if wrong:
         raise RefusedError(
@@ -262,47 +257,6 @@ def _fixed_speed(
     weight = stated / (stated + found.uncertainty_rpm**2) if stated > 0.0 else 0.0
     rpm = stated_rpm + weight * (found.speed_rpm - stated_rpm)
     return Speed(rpm, uncertainty=math.sqrt((1.0 - weight) * stated) / abs(rpm)), quality
-
-
-def _refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm: float | None) -> None:
-    """Refuse a stated speed where the orbit is that of another one.
-
-    Args:
-        first: float64 ``[n, 2]``, the first revolutions.
-        rate_hz: sampling rate.
-        stated_rpm: what was stated.
-        found_rpm: the line near it; None if there is none to speak of.
-    """
-    try:
-        strongest_rpm = estimate_speed(first, rate_hz).speed_rpm
-        # So many revolutions at the true speed: beyond, the machine need not be healthy any more.
-        turns = max(_LEAST_TURNS, len(first) * abs(stated_rpm) / 60.0 / rate_hz)
-        healthy = first[: math.ceil(turns * 60.0 * rate_hz / strongest_rpm)]
-        strongest_rpm = estimate_speed(healthy, rate_hz, strongest_rpm).speed_rpm
-    except ValueError:
-        return  # no line anywhere: the search near the stated speed has said so
-    if abs(strongest_rpm / abs(stated_rpm) - 1.0) <= _AT_THE_EDGE:
-        return
-    if found_rpm is None:
-        near = f"there is no 1X line near {abs(stated_rpm):.6g} rpm"
-    else:
-        ratio = _line_um(first, rate_hz, strongest_rpm) / _line_um(first, rate_hz, found_rpm)
-        if ratio < _STRONGER:
-            return
-        near = f"the line at {abs(found_rpm):.1f} rpm has a {ratio:.2g}th of its amplitude"
-    raise RefusedError(
-        f"the orbit turns at {strongest_rpm:.1f} rpm: {near}; correct the speed, or use a keyphasor if the "
-        "shaft does turn as stated"
-    )
-
-
-def _line_um(orbit: Floats, rate_hz: float, rpm: float) -> float:
-    """Amplitude of the line of a speed, both senses together."""
-    z = orbit[:, 0] + 1j * orbit[:, 1]
-    there = np.isfinite(z)
-    turn = np.exp(2j * math.pi * rpm / 60.0 / rate_hz * np.flatnonzero(there))
-    z = z[there] - z[there].mean()
-    return math.hypot(abs(np.mean(z * turn.conj())), abs(np.mean(z * turn)))
 
 
 def _keyphasor_speed(

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from daqsvc.dsp.quality import RefusedError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -32,6 +34,12 @@ _LINE_OVER_NOISE = 25.0
 """Power of both 1X lines over the noise in one bin, below which there is no line: by chance, 1 in 10^6."""
 _UNDECIDED = 0.05
 """Forward and backward amplitudes that differ by less of the larger one do not tell the sense."""
+
+AT_THE_EDGE = 0.08
+"""A line so far from the stated speed, of the tenth that is searched, may be the flank of another one."""
+_LEAST_TURNS = 10.0
+_STRONGER = 4.0
+"""So many times the 1X amplitude another line may have and still be a whirl or a harmonic."""
 
 _LOCK_REVOLUTIONS = 16
 _LOCK_SEARCH = 0.04
@@ -109,6 +117,50 @@ def estimate_speed(xy: Floats, rate_hz: float, around_rpm: float | None = None) 
         direction = "straight"
     to_rpm = 60.0 * rate_hz * math.copysign(1.0, 1.0 if around_rpm is None else around_rpm)
     return SpeedEstimate(to_rpm * fit.frequency, abs(to_rpm) * fit.deviation, direction)
+
+
+def refuse_elsewhere(first: Floats, rate_hz: float, stated_rpm: float, found_rpm: float | None) -> None:
+    """Refuse a stated speed where the orbit is that of another one.
+
+    Args:
+        first: float64 ``[n, 2]``, the first revolutions.
+        rate_hz: sampling rate.
+        stated_rpm: what was stated.
+        found_rpm: the line near it; None if there is none to speak of.
+
+    Raises:
+        RefusedError: the orbit is that of another speed.
+    """
+    try:
+        strongest_rpm = estimate_speed(first, rate_hz).speed_rpm
+        # So many revolutions at the true speed: beyond, the machine need not be healthy any more.
+        turns = max(_LEAST_TURNS, len(first) * abs(stated_rpm) / 60.0 / rate_hz)
+        healthy = first[: math.ceil(turns * 60.0 * rate_hz / strongest_rpm)]
+        strongest_rpm = estimate_speed(healthy, rate_hz, strongest_rpm).speed_rpm
+    except ValueError:
+        return  # no line anywhere: the search near the stated speed has said so
+    if abs(strongest_rpm / abs(stated_rpm) - 1.0) <= AT_THE_EDGE:
+        return
+    if found_rpm is None:
+        near = f"there is no 1X line near {abs(stated_rpm):.6g} rpm"
+    else:
+        ratio = _line_um(first, rate_hz, strongest_rpm) / _line_um(first, rate_hz, found_rpm)
+        if ratio < _STRONGER:
+            return
+        near = f"the line at {abs(found_rpm):.1f} rpm has a {ratio:.2g}th of its amplitude"
+    raise RefusedError(
+        f"the orbit turns at {strongest_rpm:.1f} rpm: {near}; correct the speed, or use a keyphasor if the "
+        "shaft does turn as stated"
+    )
+
+
+def _line_um(orbit: Floats, rate_hz: float, rpm: float) -> float:
+    """Amplitude of the line of a speed, both senses together."""
+    z = orbit[:, 0] + 1j * orbit[:, 1]
+    there = np.isfinite(z)
+    turn = np.exp(2j * math.pi * rpm / 60.0 / rate_hz * np.flatnonzero(there))
+    z = z[there] - z[there].mean()
+    return math.hypot(abs(np.mean(z * turn.conj())), abs(np.mean(z * turn)))
 
 
 @dataclass(frozen=True, slots=True)
