@@ -1,0 +1,108 @@
+"""Live and recorded data are judged by the same functions, with the same limits, in the same words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from support.bearing_signals import RATE_HZ, SPEED_RPM, healthy
+
+from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.bearing.geometry import bearing_orders
+from daqsvc.detectors.bearing.detector import BearingDetector
+from daqsvc.detectors.bearing.housed import HousedBearing
+from daqsvc.detectors.bearing.recorded import analyse_bearings
+from daqsvc.detectors.bearing.verdict import BearingSetup
+from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.quality.clipped import clipped_at, ends_cut_off, refuse_clipped
+from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE, lacking
+from daqsvc.dsp.quality.rate import SAME_RATE, ArrivalRate, rate_of_stamps
+from daqsvc.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SENSOR = "accel-de"
+LOOK_S = 2.5
+
+
+def spoilt(spoil: Callable[[np.ndarray], object]) -> np.ndarray:
+    # As a ring holds them.
+    samples = healthy(LOOK_S, 7).astype(np.float32).astype(np.float64)
+    spoil(samples)
+    return samples
+
+
+def live(samples: np.ndarray) -> str:
+    bearing = HousedBearing("drive-end", SENSOR, 0, bearing_orders("6205-2RS"))
+    watch = BearingDetector(
+        machine="motor", stream="housing", rate_hz=RATE_HZ, speed_rpm=SPEED_RPM, bearings=[bearing]
+    )
+    window = Window(0, samples.astype(np.float32)[:, np.newaxis], NS_PER_S, NS_PER_S / RATE_HZ)
+    (said,) = watch.process(window)
+    assert said.quality != "good"
+    return said.reason
+
+
+def recorded(samples: np.ndarray) -> str:
+    recording = Recording((SENSOR,), samples[:, np.newaxis], RATE_HZ, Path("x.csv"), 0)
+    setup = BearingSetup(
+        channels=(SENSOR,), speed_rpm=SPEED_RPM, bearings={SENSOR: bearing_orders("6205-2RS")}
+    )
+    return f"{SENSOR}: {analyse_bearings(recording, setup).unfit.get(SENSOR, '')}"
+
+
+def clip(samples: np.ndarray) -> None:
+    limit = 1.2 * samples.std()
+    np.clip(samples, -limit, limit, out=samples)
+
+
+def die(samples: np.ndarray) -> None:
+    samples[len(samples) // 3 :] = samples[0]
+
+
+@pytest.mark.parametrize(("spoil", "word"), [(clip, "is clipped"), (die, "is dead")])
+def test_an_accelerometer_is_refused_in_the_same_words_live_and_recorded(
+    spoil: Callable[[np.ndarray], object], word: str
+) -> None:
+    samples = spoilt(spoil)
+    assert word in live(samples)
+    assert live(samples) == recorded(samples)
+
+
+@pytest.mark.parametrize(("share", "unfit"), [(0.9, False), (1.1, True)])
+def test_the_same_share_of_samples_may_be_missing_live_and_recorded(share: float, *, unfit: bool) -> None:
+    samples = spoilt(lambda _: None)
+    at = np.random.default_rng(3).permutation(len(samples))
+    samples[at[: round(share * ACCELEROMETER_SHARE * len(samples))]] = np.nan
+    assert ("lacks" in recorded(samples)) == unfit
+    assert bool(lacking(SENSOR, samples)) == unfit
+
+
+def test_what_stands_still_is_not_called_clipped() -> None:
+    still = np.full(640, 3.5)
+    assert clipped_at(still) is None
+    assert not ends_cut_off(still, 8)
+    refuse_clipped(still)
+
+
+def test_peaks_at_a_limit_are_found_with_the_samples_that_are_there() -> None:
+    sine = np.sin(np.linspace(0.0, 40.0, 4000))
+    assert not ends_cut_off(sine, 8)
+    clipped = np.minimum(sine, 0.8)
+    clipped[::7] = np.nan
+    assert ends_cut_off(clipped, 8) == {0.8: int(np.count_nonzero(clipped == 0.8))}
+
+
+def test_a_wrong_rate_is_seen_by_stamps_and_by_arrivals() -> None:
+    rate_hz = 1.0 / 1.06
+    stamps = rate_of_stamps(np.arange(500) / (1000.0 * rate_hz), surely_time=True)
+    assert stamps is not None
+    assert not stamps.agrees(1000.0)
+    assert stamps.agrees(1000.0 * rate_hz * (1.0 + 0.9 * SAME_RATE))
+    arrivals = ArrivalRate(1000.0)
+    arrivals.take(np.rint(np.arange(20_000) * 1e6 / rate_hz).astype(np.int64))
+    assert arrivals.rate_hz == pytest.approx(1000.0 * rate_hz, rel=1e-3)
+    assert not arrivals.fits
