@@ -17,7 +17,7 @@ from daqsvc.detectors.rotor_bank.statements import (
 )
 from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.missing import OBSERVED_SHARE
-from daqsvc.dsp.quality.probes import DEAD, RevolutionJudge, Verdict
+from daqsvc.dsp.quality.probes import DEAD, RevolutionJudge, RevolutionQuality
 from daqsvc.dsp.quality.stuck import stands_still
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
@@ -294,7 +294,7 @@ class RotorBankDetector:
     def _changes(
         self,
         report: BankReport,
-        verdict: Verdict,
+        verdict: RevolutionQuality,
         first_index: int,
         n: int,
         before: float,
@@ -315,7 +315,7 @@ class RotorBankDetector:
         return said
 
     def _departures(
-        self, report: BankReport, verdict: Verdict, end_index: int, t_ns: int, period_ns: float
+        self, report: BankReport, verdict: RevolutionQuality, end_index: int, t_ns: int, period_ns: float
     ) -> list[Diagnosis]:
         """The statement that the machine has left the declared mode, once."""
         departure, departed = report.departure, self._departed
@@ -329,7 +329,7 @@ class RotorBankDetector:
         ]
 
     def _calibrate(
-        self, xy: Floats, cos: Floats, sin: Floats, verdict: Verdict, end_index: int, t_ns: int
+        self, xy: Floats, cos: Floats, sin: Floats, verdict: RevolutionQuality, end_index: int, t_ns: int
     ) -> list[Diagnosis]:
         """Measure the healthy motion; at the end, put it into every mode and say so."""
         assert self._calibration is not None  # noqa: S101 - the caller asks while there is one
@@ -353,31 +353,31 @@ class RotorBankDetector:
         if abs(speed / self._bank.speed - 1.0) > _RETUNE:
             self._bank.retune(speed, angle_rad)
 
-    def _verdict(self) -> Verdict:
+    def _verdict(self) -> RevolutionQuality:
         """What the last revolution is worth."""
         probes = self._last_revolution[:, :2]
         if len(probes) < round(self._tracker.period_samples):
-            bad = self._judge.missing(probes) or Verdict()
+            bad = self._judge.missing(probes) or RevolutionQuality()
         else:
             bad = self._judge.judge(probes, self._least_motion_um)
         if bad.quality != "good":
             return bad
         if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
             expected_rpm = 60.0 * self._rate_hz / self._nominal_period
-            return Verdict(
+            return RevolutionQuality(
                 "missing",
                 f"{self._keyphasor.name}: no pulse for {blind:.0f} revolutions at {expected_rpm:.0f} rpm; "
                 "check that the shaft turns at that speed, and that the pulse crosses "
                 f"{self._keyphasor.threshold_v} V",
             )
         if doubt := self._watch.doubt():
-            return Verdict("not_ok", doubt)
-        return Verdict()
+            return RevolutionQuality("not_ok", doubt)
+        return RevolutionQuality()
 
     def _diagnosis(
         self,
         report: BankReport,
-        verdict: Verdict,
+        verdict: RevolutionQuality,
         first_index: int,
         end_index: int,
         t_ns: int,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.detectors.rotor_bank.modes import RotorMode
-    from daqsvc.dsp.quality.probes import Verdict
+    from daqsvc.dsp.quality.probes import RevolutionQuality
     from daqsvc.rotor.bank import BankReport
     from daqsvc.rotor.decision import DecisionRules
 
@@ -73,7 +73,7 @@ class BankDiagnosisBuilder:
     def state(
         self,
         report: BankReport,
-        verdict: Verdict,
+        verdict: RevolutionQuality,
         moment: Moment,
         *,
         decision: int,

@@ -18,7 +18,7 @@ from daqsvc.detectors.rotor_synchronous.vector_checks import (
 )
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.probes import Probe
-from daqsvc.dsp.quality.probes import RevolutionJudge, Verdict
+from daqsvc.dsp.quality.probes import RevolutionJudge, RevolutionQuality
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 
@@ -151,7 +151,7 @@ class RotorSynchronousDetector:
         self._refused = ""
         self._t_end_ns = 0
         self._period_ns = 0.0
-        self._verdicts: deque[Verdict] = deque(maxlen=_REMEMBERED)
+        self._verdicts: deque[RevolutionQuality] = deque(maxlen=_REMEMBERED)
         self._ends: deque[int] = deque(maxlen=_REACH)
         self._speed_rpm = self._stated_rpm = abs(speed_rpm)
         self._taken = self._missing = 0
@@ -210,7 +210,7 @@ class RotorSynchronousDetector:
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
-        verdict = Verdict("missing", silence_reason(self.stream, silence_s))
+        verdict = RevolutionQuality("missing", silence_reason(self.stream, silence_s))
         return [self._stater.silence(self._standing(), verdict, self._turns.end_index, t_ns)]
 
     def finish(self) -> Diagnosis | None:
@@ -258,14 +258,14 @@ class RotorSynchronousDetector:
             self._stater.maybe(self._standing(), self._verdict(), *self._end(self._ends[-1]))
         )
 
-    def _judge_revolution(self, revolution: Revolution) -> Verdict:
+    def _judge_revolution(self, revolution: Revolution) -> RevolutionQuality:
         """What a revolution is worth, the cheapest and clearest reason first."""
         calibration = self._watch.calibration
         least_um = 0.0
         if self._refused and not self._rules.retry:
-            return Verdict("not_ok", self._refused)
+            return RevolutionQuality("not_ok", self._refused)
         if not revolution.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
-            return Verdict("missing", self._angle_unknown())
+            return RevolutionQuality("missing", self._angle_unknown())
         if calibration is not None:
             verdict = speed_verdict(self._speed_rpm, calibration)
             if verdict.quality != "good":
@@ -275,9 +275,9 @@ class RotorSynchronousDetector:
         if verdict.quality != "good":
             return verdict
         if not revolution.vector.usable[0]:
-            return Verdict("missing", _cannot_fit(revolution))
+            return RevolutionQuality("missing", _cannot_fit(revolution))
         self._checks.add(revolution.vector.vectors[0])
-        return Verdict() if calibration is None else self._checks.judge(calibration)
+        return RevolutionQuality() if calibration is None else self._checks.judge(calibration)
 
     def _look_at_baseline(self, calibration: Calibration) -> None:
         """A baseline has just been made: is it one, and does it show a mean position?"""
@@ -301,7 +301,7 @@ class RotorSynchronousDetector:
         patience = _ORBIT_LOCK_REVOLUTIONS if self._reference == "orbit" else _BLIND_REVOLUTIONS
         if self._turns.waiting_samples <= patience * 60.0 * self._rate_hz / slowest_rpm:
             return None
-        verdict = Verdict("missing", self._angle_unknown())
+        verdict = RevolutionQuality("missing", self._angle_unknown())
         return self._stating(self._stater.maybe(self._standing(), verdict, *self._end(self._turns.end_index)))
 
     def _angle_unknown(self) -> str:
@@ -316,16 +316,16 @@ class RotorSynchronousDetector:
             "that speed, or use a keyphasor"
         )
 
-    def _verdict(self) -> Verdict:
+    def _verdict(self) -> RevolutionQuality:
         """What the last revolutions are worth together."""
         doubts = [verdict for verdict in self._verdicts if verdict.quality != "good"]
         if len(doubts) >= _DOUBTED:
             return doubts[-1]
         if self.refused:
-            return Verdict("not_ok", f"cannot be calibrated: {self.refused}")
+            return RevolutionQuality("not_ok", f"cannot be calibrated: {self.refused}")
         if self.ac_coupled:
-            return Verdict("good", "the probes show no mean position: a static load cannot be seen")
-        return Verdict()
+            return RevolutionQuality("good", "the probes show no mean position: a static load cannot be seen")
+        return RevolutionQuality()
 
     def _standing(self) -> Standing:
         watch, report = self._watch, self._report

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from daqsvc.diagnosis.record import Severity
     from daqsvc.dsp.quality import Quality
-    from daqsvc.dsp.quality.probes import Verdict
+    from daqsvc.dsp.quality.probes import RevolutionQuality
     from daqsvc.rotor.synchronous.baseline import Calibration
     from daqsvc.rotor.synchronous.identify import Identification
     from daqsvc.rotor.synchronous.watch import WatchReport, WatchRules
@@ -119,7 +119,9 @@ class Stater:
         self._quality: Quality = "good"
         self._said_index: int | None = None
 
-    def maybe(self, standing: Standing, verdict: Verdict, end_index: int, t_ns: int) -> Diagnosis | None:
+    def maybe(
+        self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int
+    ) -> Diagnosis | None:
         """The statement after a revolution, if there is something to say.
 
         Args:
@@ -138,7 +140,7 @@ class Stater:
         due = self._said_index is None or end_index - self._said_index >= self._steady_samples
         return self.state(standing, verdict, end_index, t_ns) if news or due else None
 
-    def state(self, standing: Standing, verdict: Verdict, end_index: int, t_ns: int) -> Diagnosis:
+    def state(self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int) -> Diagnosis:
         """The statement after a revolution; arguments as of `maybe`."""
         decision, group = self._decided(standing)
         changed = decision != self._decision or set(group) != set(self._group)
@@ -154,7 +156,7 @@ class Stater:
             changed=changed,
         )  # fmt: skip
 
-    def silence(self, standing: Standing, verdict: Verdict, end_index: int, t_ns: int) -> Diagnosis:
+    def silence(self, standing: Standing, verdict: RevolutionQuality, end_index: int, t_ns: int) -> Diagnosis:
         """A statement that holds what was said last and changes nothing; arguments as of `maybe`."""
         return self._diagnosis(
             standing, verdict, first_index=end_index, end_index=end_index, t_ns=t_ns, changed=False
@@ -186,7 +188,7 @@ class Stater:
     def _diagnosis(
         self,
         standing: Standing,
-        verdict: Verdict,
+        verdict: RevolutionQuality,
         *,
         first_index: int,
         end_index: int,

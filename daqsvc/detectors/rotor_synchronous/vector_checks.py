@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.dsp.quality.probes import Verdict, blind_probe
+from daqsvc.dsp.quality.probes import RevolutionQuality, blind_probe
 from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class VectorChecks:
         deviation = math.sqrt(float(calibration.variance[1]) / calibration.revolutions)
         return blind_probe(calibration.baseline, deviation, self._probes, self._axes_deg)
 
-    def judge(self, calibration: Calibration) -> Verdict:
+    def judge(self, calibration: Calibration) -> RevolutionQuality:
         """Whether the last vectors can be believed."""
         for length in _LENGTHS:
             if len(self._vectors) < length:
@@ -82,8 +82,8 @@ class VectorChecks:
             if not reason and self._angle_assumed and length >= _SLIP_LENGTH:
                 reason = self._lost(vectors, deviation, calibration)
             if reason:
-                return Verdict("not_ok", reason)
-        return Verdict()
+                return RevolutionQuality("not_ok", reason)
+        return RevolutionQuality()
 
     def _lost(self, vectors: Complexes, deviation: float, calibration: Calibration) -> str:
         """Whether the shaft no longer turns at the stated speed."""
@@ -111,11 +111,11 @@ class VectorChecks:
         return ""
 
 
-def speed_verdict(speed_rpm: float, calibration: Calibration) -> Verdict:
+def speed_verdict(speed_rpm: float, calibration: Calibration) -> RevolutionQuality:
     """Whether a revolution is near enough to the speed of calibration to be judged."""
     if abs(speed_rpm / calibration.speed_rpm - 1.0) <= SPEED_TOLERANCE:
-        return Verdict()
-    return Verdict(
+        return RevolutionQuality()
+    return RevolutionQuality(
         "missing",
         f"not judged at {speed_rpm:.0f} rpm: the machine was calibrated at {calibration.speed_rpm:.0f} rpm, "
         f"and beyond {100.0 * SPEED_TOLERANCE:.0f} % of that its healthy orbit is another; run it at that "

@@ -41,7 +41,7 @@ _CLEAR = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class RevolutionQuality:
     """Whether the last revolution can be trusted, and why not."""
 
     quality: Quality = "good"
@@ -73,7 +73,7 @@ class RevolutionJudge:
         """Forget the revolutions before a gap."""
         self._pool.clear()
 
-    def missing(self, samples: Floats) -> Verdict | None:
+    def missing(self, samples: Floats) -> RevolutionQuality | None:
         """Whether too many samples of a revolution, or of a part of one, are missing.
 
         Args:
@@ -84,13 +84,13 @@ class RevolutionJudge:
         if n and missing <= self._missing * n:
             return None
         worst = int(present.sum(axis=0).argmin())
-        return Verdict(
+        return RevolutionQuality(
             "missing",
             f"{self._probes[worst].name}: {'all' if missing == n else f'{missing} of {n}'} samples of a "
             "revolution are missing; check the bus and the device",
         )
 
-    def judge(self, samples: Floats, least_motion_um: float) -> Verdict:
+    def judge(self, samples: Floats, least_motion_um: float) -> RevolutionQuality:
         """What a revolution is worth.
 
         Args:
@@ -105,33 +105,33 @@ class RevolutionJudge:
         deviations = known.std(axis=0)
         for column, probe in enumerate(self._probes):
             if stands_still(known[:, column : column + 1]):
-                return Verdict(
+                return RevolutionQuality(
                     "not_ok",
                     f"{probe.name}: stood still at {known[0, column]:.6g} um for a revolution; "
                     "check the probe, its cable and driver",
                 )
             least = max(least_motion_um, DEAD * float(deviations[1 - column]))
             if deviations[column] < least:
-                return Verdict(
+                return RevolutionQuality(
                     "not_ok",
                     f"{probe.name}: moved by {deviations[column]:.3g} um rms in a revolution, at least "
                     f"{least:.3g} um is expected; check the probe, its cable and driver",
                 )
             for signal in signals:
                 if (clipped := clipped_at(signal[:, column])) is not None:
-                    return Verdict(
+                    return RevolutionQuality(
                         "not_ok",
                         f"{probe.name}: clipped at {clipped:.6g} um; "
                         "check the gap and the range of the converter",
                     )
             still = dropped_to(known[:, column])
             if still is not None:
-                return Verdict(
+                return RevolutionQuality(
                     "not_ok",
                     f"{probe.name}: stood still at {still.value:.6g} um for {still.samples} of {len(known)} "
                     "samples of a revolution; check the probe, its cable and driver",
                 )
-        return Verdict()
+        return RevolutionQuality()
 
 
 def seen_by(vector: Complexes, axis_deg: float) -> float:
