@@ -161,8 +161,8 @@ class CalibrateCommand:
         from daqsvc.bearing.identify import NotIdentifiableError  # noqa: PLC0415
         from daqsvc.detectors.bearing.calibrating import calibrate_bearings  # noqa: PLC0415
         from daqsvc.detectors.bearing.recorded import RecordedBearings  # noqa: PLC0415
+        from daqsvc.dsp.quality import RefusedError  # noqa: PLC0415
         from daqsvc.offline.machine_options import bearing_machine  # noqa: PLC0415
-        from daqsvc.recording.errors import RefusedError  # noqa: PLC0415
 
         runner = self._runner(bearing_machine, machine, arguments)
         (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
