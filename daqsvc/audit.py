@@ -108,7 +108,7 @@ class AuditLog:
         Raises:
             AuditError: the line is not on disk.
         """
-        told = refusals.take()
+        told = refusals.drain()
         if told is None:
             return
         try:
@@ -223,7 +223,7 @@ class Refusals:
         many.verbs[command.verb.value] += 1
         many.answer = reason
 
-    def take(self) -> RefusedMany | None:
+    def drain(self) -> RefusedMany | None:
         """What has been counted since the last time; None if nothing was."""
         many, self._many = self._many, None
         return many

@@ -26,7 +26,7 @@ class Expected:
         self.quality: dict[str, dict[str, Sequence[str]]] = {}
         """Those that say whether a sensor can be judged: their detectors, with the sensors these rest on."""
 
-    def take(self, active_detectors: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
+    def note(self, active_detectors: Mapping[str, Sequence[str]], conditions: Iterable[str]) -> None:
         """Learn more of them.
 
         Args:

@@ -219,7 +219,7 @@ class AlarmManager:
             no longer has them, or not what a quality alarm is about.
         """
         told = list(told)
-        self._expected.take(active_detectors, conditions)
+        self._expected.note(active_detectors, conditions)
         for ruled in self._ruled:
             named = {sensor for d in ruled.rule.detectors for sensor in active_detectors.get(d, ())}
             self._ruled.rest(ruled, frozenset(named) or ruled.sensors)
@@ -280,8 +280,8 @@ class AlarmManager:
             self._shown[now] += 1
 
     def _events(self, diagnosis: Diagnosis, at: ClockReading) -> Iterator[AlarmEvent]:
-        self._start_up.take(diagnosis)
-        touched = self._doubts.take(diagnosis)
+        self._start_up.note(diagnosis)
+        touched = self._doubts.update(diagnosis)
         yield from self._quality(touched.alarms, diagnosis, at)
         followers = self._ruled.fed_by(diagnosis.detector)
         for ruled in followers:

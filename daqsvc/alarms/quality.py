@@ -95,7 +95,7 @@ class _Shortage:
         """Go on from before a restart at ``t_ns``: samples were lacking then."""
         self._blind_ns = t_ns
 
-    def take(self, diagnosis: Diagnosis, share: float) -> None:
+    def update(self, diagnosis: Diagnosis, share: float) -> None:
         """Take in a statement about samples, and what share of them is missing."""
         t_ns = diagnosis.t_ns
         if diagnosis.quality == "missing" and not diagnosis.partial:
@@ -146,7 +146,7 @@ class SensorHealth:
         """The sensors that somebody blames by name, as it is at any time."""
         return self._blamed.keys()
 
-    def take(self, diagnosis: Diagnosis) -> Touched:
+    def update(self, diagnosis: Diagnosis) -> Touched:
         """Take in a statement; what it bears on."""
         detector = diagnosis.detector
         name = quality_alarm(detector, diagnosis.sensors)
@@ -178,7 +178,7 @@ class SensorHealth:
         if diagnosis.missing_share is not None and diagnosis.end_index > diagnosis.first_index:
             if (since_ns := self._lacked_at_restart.pop(detector, None)) is not None:
                 self._shortage[detector].resume(since_ns)
-            self._shortage[detector].take(diagnosis, diagnosis.missing_share)
+            self._shortage[detector].update(diagnosis, diagnosis.missing_share)
         if good:
             lasts = lasts or (detector in self._shortage and self._shortage[detector].lasts(diagnosis.t_ns))
             # The samples that are there show that the sensor is OK.

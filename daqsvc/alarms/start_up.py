@@ -42,7 +42,7 @@ class StartUpSignal:
             and t_ns - self._since_ns <= start_up.at_most_s * NS_PER_S
         )
 
-    def take(self, diagnosis: Diagnosis) -> None:
+    def note(self, diagnosis: Diagnosis) -> None:
         """Take in a diagnosis; one of another detector, or without the measure, says nothing."""
         start_up = self._start_up
         if start_up is None or diagnosis.detector != start_up.detector or diagnosis.quality == "not_ok":

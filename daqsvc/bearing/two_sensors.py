@@ -166,7 +166,7 @@ class TwoSensorMonitor:
         self._ratio = RatioRule(parameters, healthy.energies)
         self.reset()
 
-    def take(
+    def evaluate(
         self, y: NDArray[np.floating], v: NDArray[np.floating] | None = None, *, suspected: bool = False
     ) -> TwoSensorFinding:
         """Judge the next window; windows follow one another, or `reset` comes between.

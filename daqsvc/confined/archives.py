@@ -50,7 +50,7 @@ def load_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, budget: Budget
                 raise EOFError(f"{member.filename!r} ends after {at} of {size} bytes")
             view[at : at + len(chunk)] = chunk
             at += len(chunk)
-            budget.take(len(chunk))
+            budget.spend(len(chunk))
         if file.read(1):
             raise ValueError(f"{member.filename!r} holds more than it says")
     array = np.frombuffer(content, dtype, count) if size else np.empty(count, dtype)

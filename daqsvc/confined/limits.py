@@ -89,7 +89,7 @@ class Budget:
         """What more of it may be unpacked."""
         return self.most_bytes - self.taken_bytes
 
-    def take(self, count: int) -> None:
+    def spend(self, count: int) -> None:
         """Count bytes that have been unpacked.
 
         Raises:
@@ -137,7 +137,7 @@ class CountedFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """See `io.RawIOBase.readinto`."""
         data = self._file.read(len(buffer))
-        self._budget.take(len(data))
+        self._budget.spend(len(data))
         buffer[: len(data)] = data
         return len(data)
 

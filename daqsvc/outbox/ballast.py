@@ -30,7 +30,7 @@ class Ballast:
         self._size = size
         self._reserve_bytes = reserve_bytes
 
-    def take(self) -> None:
+    def allocate(self) -> None:
         """Have it on board, if the disk has room enough; without it, everything works all the same."""
         try:
             restrict(self._path)

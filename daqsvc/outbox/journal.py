@@ -215,7 +215,7 @@ class Journal:
             log.warning("outbox %s: the saving of what was left of %s is finished", self.path, aside)
         untold = self._renewal.untold()
         self.quarantined, self.vanished = untold.quarantined, untold.vanished
-        self._log_copy.take()
+        self._log_copy.copy()
         known_gone = self.vanished
         try:
             self._connect()
@@ -228,7 +228,7 @@ class Journal:
         self._put_log_away(is_whole=self.vanished == known_gone)
         self._look_up_topics(is_whole=not (self.quarantined or self.vanished))
         self._tidy()
-        self._ballast.take()
+        self._ballast.allocate()
 
     def _put_log_away(self, *, is_whole: bool) -> None:
         """Delete the copy of the log, or set it aside if something of it may be missing."""
@@ -797,7 +797,7 @@ class Journal:
                 connection.executescript(f"PRAGMA incremental_vacuum({SLACK_PAGES // 2})")
         except sqlite3.Error as error:
             log.warning("outbox %s cannot be made smaller: %s", self.path, error)
-        self._ballast.take()
+        self._ballast.allocate()
 
 
 @contextlib.contextmanager

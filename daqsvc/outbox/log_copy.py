@@ -50,7 +50,7 @@ class LogCopy:
         """Whether an unclean end has left a log."""
         return bool(self._contents)
 
-    def take(self) -> None:
+    def copy(self) -> None:
         """Copy the log, before SQLite opens the journal; a copy that an earlier start could not use counts.
 
         Raises:

@@ -73,7 +73,7 @@ class BlfFile:
         unpacked = zlib.decompressobj().decompress(
             data[LOG_CONTAINER_STRUCT.size :], self._budget.left_bytes + 1
         )
-        self._budget.take(len(unpacked))
+        self._budget.spend(len(unpacked))
         return LOG_CONTAINER_STRUCT.pack(NO_COMPRESSION, size) + unpacked
 
 

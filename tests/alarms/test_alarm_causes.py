@@ -13,7 +13,7 @@ def test_a_wrong_rate_takes_over_from_silence() -> None:
     doubts = SensorHealth()
     found = []
     for reason in (SILENCE.format(2.0), SILENCE.format(7.5), RATE.format(100.1), RATE.format(99)):
-        doubts.take(
+        doubts.update(
             Diagnosis("m", "levels", 1, "s", 5, 5, "N", quality="missing", reason=reason, sensors=("a",))
         )
         found.append(doubts.finding("sensor-ok/a"))

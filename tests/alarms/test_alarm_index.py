@@ -130,7 +130,7 @@ class WalkingManager(AlarmManager):
         self._doubts = WalkingDoubts()
 
     def _events(self, diagnosis, at):
-        yield from self._quality(self._doubts.take(diagnosis).alarms, diagnosis, at)
+        yield from self._quality(self._doubts.update(diagnosis).alarms, diagnosis, at)
         followers = [ruled for ruled in self._ruled if diagnosis.detector in ruled.rule.detectors]
         for ruled in followers:
             if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":

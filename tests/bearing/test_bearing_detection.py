@@ -94,7 +94,7 @@ def test_a_rate_too_low_for_the_bearing_leaves_every_fault_open():
 @pytest.mark.parametrize("louder", [(2.0, 2.0), (3.0, 1.0), (1.0, 3.0)])
 def test_steady_noise_is_a_change_and_no_race(louder):
     monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
-    finding = monitor.take(noise(0.5, 7) * louder)
+    finding = monitor.evaluate(noise(0.5, 7) * louder)
     assert (finding.verdict, finding.group) == ("changed", ("changed",))
     assert finding.detection.detected
     assert 0.7 < finding.bursts < 1.3
@@ -104,9 +104,9 @@ def test_steady_noise_is_a_change_and_no_race(louder):
 def test_a_level_that_differs_from_run_to_run_is_no_fault():
     healthy = learn_pair(S3, RATE_HZ, noise(3.0))
     louder = 10.0 ** (1.5 / 20.0) * noise(2.5, 8)
-    assert TwoSensorMonitor(healthy, false_alarm_rate=1e-4).take(louder).detection.detected
+    assert TwoSensorMonitor(healthy, false_alarm_rate=1e-4).evaluate(louder).detection.detected
     allowing = TwoSensorMonitor(healthy, false_alarm_rate=1e-4, repeatability_db=0.8)
-    assert not allowing.take(louder).detection.detected
+    assert not allowing.evaluate(louder).detection.detected
 
 
 def test_a_spectrum_of_another_rate_is_refused():
@@ -137,6 +137,6 @@ def test_short_records_and_dead_sensors_are_named():
 def test_the_monitor_is_calm_on_the_machine_that_it_has_learnt():
     monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
     y = noise(2.0, 5)
-    findings = [monitor.take(part) for part in np.split(y, 4)]
+    findings = [monitor.evaluate(part) for part in np.split(y, 4)]
     assert [finding.verdict for finding in findings] == ["normal"] * 4
     assert all(finding.isolation is None and finding.units is None for finding in findings)

@@ -54,7 +54,7 @@ def verdicts(name: str, snr_db: float, mismatch: float) -> dict[str, list[str]]:
         monitor = TwoSensorMonitor(learn_pair(SETS[name], RATE_HZ, calm.y, calm.v))
         for fault in FAULTS:
             window = simulate(true, signal, fault, level, rng)
-            said[fault].append(monitor.take(window.y, window.v).verdict)
+            said[fault].append(monitor.evaluate(window.y, window.v).verdict)
             monitor.reset()
     return said
 
@@ -137,6 +137,6 @@ def test_false_alarms_come_at_their_stated_rate():
         healthy = simulate(true, signal, "healthy", level, rng, seconds=0.5 * per_machine)
         for begin in range(0, len(healthy.y), round(RATE_HZ / 2)):
             part = slice(begin, begin + round(RATE_HZ / 2))
-            alarms += monitor.take(healthy.y[part], healthy.v[part]).detection.detected
+            alarms += monitor.evaluate(healthy.y[part], healthy.v[part]).detection.detected
     print(f"{alarms} false alarms in {8 * per_machine} windows at {rate:.1%}")
     assert alarms <= 40

@@ -138,7 +138,7 @@ class TestWatch:
     def test_it_judges_window_after_window_and_sees_more_with_time(self) -> None:
         samples = strikes("ball", 15.0, strength=0.5)
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
-        verdicts = [watch.take(w) for w in samples.reshape(-1, watch.window)]
+        verdicts = [watch.evaluate(w) for w in samples.reshape(-1, watch.window)]
         assert [round(v.revolutions) for v in verdicts[:5]] == [75, 150, 225, 299, 299]
         assert verdicts[3].verdict == "ball"
         assert verdicts[3].evidence["ball"].z > verdicts[0].evidence["ball"].z + 3.0
@@ -147,27 +147,27 @@ class TestWatch:
         samples = strikes("outer", 15.0)
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
         for window in samples.reshape(-1, watch.window):
-            last = watch.take(window)
+            last = watch.evaluate(window)
         assert last == judge(samples[-120_000:])
 
     def test_a_window_is_judged_alone_after_forgetting(self) -> None:
         samples = strikes("inner", 5.0)
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
-        watch.take(samples[: watch.window])
+        watch.evaluate(samples[: watch.window])
         watch.forget()
-        assert watch.take(samples[watch.window :]) == judge(samples[watch.window :])
+        assert watch.evaluate(samples[watch.window :]) == judge(samples[watch.window :])
 
     def test_another_speed_begins_anew(self) -> None:
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
-        watch.take(strikes("outer", 2.5))
-        v = watch.take(strikes("outer", 2.5, speed_rpm=1500.0), speed_rpm=1500.0)
+        watch.evaluate(strikes("outer", 2.5))
+        v = watch.evaluate(strikes("outer", 2.5, speed_rpm=1500.0), speed_rpm=1500.0)
         assert v.verdict == "outer"
         assert v.revolutions == pytest.approx(62.5, rel=0.01)
 
     def test_bad_samples_are_forgotten(self) -> None:
         samples = strikes("outer", 5.0)
         watch = RaceWatch(RATE_HZ, SPEED_RPM, BEARING)
-        watch.take(samples[: watch.window])
+        watch.evaluate(samples[: watch.window])
         with pytest.raises(UnfitError, match="dead"):
-            watch.take(np.zeros(3 * watch.window))
-        assert watch.take(samples[watch.window :]).revolutions == pytest.approx(75.0, rel=0.01)
+            watch.evaluate(np.zeros(3 * watch.window))
+        assert watch.evaluate(samples[watch.window :]).revolutions == pytest.approx(75.0, rel=0.01)

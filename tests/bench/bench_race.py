@@ -31,11 +31,11 @@ def main() -> int:
     watch = RaceWatch(RATE_HZ, SPEED_RPM, bearing)
     windows = [random.standard_normal(watch.window).astype(np.float32) for _ in range(8)]
     for window in windows:
-        watch.take(window)
+        watch.evaluate(window)
     spent = []
     for window in windows:
         begin = time.process_time()
-        watch.take(window)
+        watch.evaluate(window)
         spent.append(time.process_time() - begin)
     share = float(np.median(spent)) / WINDOW_S
     single = []
@@ -46,10 +46,10 @@ def main() -> int:
     print(f"one window    {1e3 * np.median(single):6.1f} ms CPU for {WINDOW_S} s alone")
     print(f"steady        {1e3 * np.median(spent):6.1f} ms CPU a window with the last 10 s")
     tracemalloc.start()
-    watch.take(windows[0])
+    watch.evaluate(windows[0])
     before = tracemalloc.get_traced_memory()[0]
     for window in windows:
-        watch.take(window)
+        watch.evaluate(window)
     print(f"memory        {(tracemalloc.get_traced_memory()[0] - before) / 1024:6.0f} KiB more after 20 s")
     targets.ask(f"at most {LIMIT:.0%} of a core in steady operation", f"{share:.2%}", LIMIT / share)
     return targets.exit_code

@@ -142,9 +142,9 @@ def test_a_budget_is_bounded_by_the_file_and_by_memory():
     small.check_declared(FREE_BYTES)
     with pytest.raises(TooLargeError, match="its 1 kB says that it unpacks to 64 MB, 200 times and more"):
         small.check_declared(FREE_BYTES + 1)
-    small.take(FREE_BYTES)
+    small.spend(FREE_BYTES)
     with pytest.raises(TooLargeError, match="its 1 kB unpacks to more than 64 MB"):
-        small.take(1)
+        small.spend(1)
     large = Budget(10**9, ResourceLimits(10**9).content_bytes)
     with pytest.raises(TooLargeError, match=r"500 MB may be read; allow more memory \(--max-memory"):
         large.check_declared(0.6e9)

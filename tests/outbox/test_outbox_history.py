@@ -377,11 +377,11 @@ def test_new_names_are_durable_before_they_are_relied_on(tmp_path, wall, monkeyp
 
 def test_ballast_is_taken_where_there_is_room_and_thrown_off_once(tmp_path):
     ballast = Ballast(tmp_path / "ballast", MIB, reserve_bytes=0)
-    ballast.take()
+    ballast.allocate()
     assert (tmp_path / "ballast").stat().st_blocks * 512 >= MIB
     assert ballast.throw_off()
     assert not ballast.throw_off()
-    Ballast(tmp_path / "ballast", MIB, reserve_bytes=free_bytes(tmp_path)).take()
+    Ballast(tmp_path / "ballast", MIB, reserve_bytes=free_bytes(tmp_path)).allocate()
     assert not (tmp_path / "ballast").exists()
 
 

@@ -40,7 +40,7 @@ def watched(data, name, snr_db, seed, tolerance):
     )
     watch = RotorWatch(rotor, float(record["fs"]) / 2.0)
     cut = FixedSpeedCutter(64.0).process(xy)
-    watch.take(synchronous_vectors(cut), cut)
+    watch.evaluate(synchronous_vectors(cut), cut)
     return watch.finish()
 
 

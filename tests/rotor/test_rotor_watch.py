@@ -25,7 +25,7 @@ def life(*segments, seed=3, noise_um=NOISE_UM, rules=None, deviation=None, rotor
     vectors = np.vstack([np.tile(vector, (count, 1)) for count, vector in segments])
     watch = RotorWatch(rotor, RATE_HZ, rules=rules)
     cut = orbits(vectors, noise_um, seed, deviation=deviation)
-    return watch, watch.take(synchronous_vectors(cut), cut)
+    return watch, watch.evaluate(synchronous_vectors(cut), cut)
 
 
 def with_change(**moved):
@@ -136,12 +136,12 @@ def test_1x_that_follows_the_speed_is_no_fault():
     for known in (0.2, 0.02):
         rotor = replace(ROTOR, natural_frequency_tolerance=known, damping_tolerance=known)
         watch = RotorWatch(rotor, RATE_HZ)
-        reports = watch.take(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
+        reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
         assert watch.calibration is not None
         assert not any(report.departed for report in reports)
     blind = replace(ROTOR, natural_frequency_tolerance=0.0, natural_frequency_hz=200.0)
     watch = RotorWatch(blind, RATE_HZ, rules=WatchRules(retry=False))
-    reports = watch.take(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
+    reports = watch.evaluate(synchronous_vectors(orbits(moved, NOISE_UM, 5, deviation=deviation)))
     assert watch.refused or any(report.departed for report in reports)
 
 
@@ -157,7 +157,7 @@ def test_noise_alone_that_gets_louder_is_a_change():
     quiet, loud = np.tile(HEALTHY, (100, 1)), np.tile(HEALTHY, (40, 1))
     parts = [orbits(quiet, 1.0, 1), orbits(loud, 3.0, 2)]
     watch = RotorWatch(ROTOR, RATE_HZ)
-    reports = [report for part in parts for report in watch.take(synchronous_vectors(part))]
+    reports = [report for part in parts for report in watch.evaluate(synchronous_vectors(part))]
     assert [report.revolution for report in reports if report.departed][:1] == [101]
 
 
@@ -173,7 +173,7 @@ def test_a_whirl_that_does_not_keep_step_with_the_shaft_is_no_unbalance():
     after.xy[:, 1] += whirl.imag
     watch = RotorWatch(ROTOR, RATE_HZ)
     for part in (healthy, after):
-        watch.take(synchronous_vectors(part))
+        watch.evaluate(synchronous_vectors(part))
     assert set(watch.finish().group) <= {"unmodelled", "rub"}
 
 
@@ -310,7 +310,7 @@ def test_a_steady_whirl_is_one_alarm_that_is_held_and_no_fault_of_the_shaft(orde
     cut.xy[:, 0] += whirl.real
     cut.xy[:, 1] += whirl.imag
     watch = RotorWatch(ROTOR, RATE_HZ)
-    reports = watch.take(synchronous_vectors(cut), cut)
+    reports = watch.evaluate(synchronous_vectors(cut), cut)
     assert sum(report.departed for report in reports) <= 2
     assert all(report.state == "departed" for report in reports if report.revolution > 105)
     found = watch.finish()
@@ -324,7 +324,7 @@ def test_a_probe_that_gets_noisier_is_no_rub():
         extra = np.random.default_rng(seed + 50).standard_normal(230 * PER_REV)
         cut.xy[100 * PER_REV :, 0] += 1.8 * NOISE_UM * extra
         watch = RotorWatch(ROTOR, RATE_HZ)
-        watch.take(synchronous_vectors(cut), cut)
+        watch.evaluate(synchronous_vectors(cut), cut)
         assert watch.finish().group == ("unmodelled",)
 
 

@@ -48,7 +48,7 @@ class RaceWatch:
         self._held: NDArray[np.float64] = np.empty(0)
         self._span = round(SPAN_S * rate_hz)
 
-    def take(self, window_samples: NDArray[np.floating], speed_rpm: float | None = None) -> RaceVerdict:
+    def evaluate(self, window_samples: NDArray[np.floating], speed_rpm: float | None = None) -> RaceVerdict:
         """Take in the next window and judge the last ten seconds.
 
         Args:

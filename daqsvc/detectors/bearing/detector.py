@@ -137,7 +137,7 @@ class BearingDetector:
         """See `Detector.warm`: makes the tables of the transforms, compiles what tells races by direction."""
         samples = round(WINDOW_S * self._rate_hz)
         noise = np.random.default_rng(1).standard_normal((samples, 2))
-        RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).take(noise[:, 0])
+        RaceWatch(self._rate_hz, self._speed_rpm, self.bearings[0].orders, self._race).evaluate(noise[:, 0])
         for direction in self._directions.values():
             direction.judge(noise)
 
@@ -214,7 +214,7 @@ class BearingDetector:
         changed = self._persistence.update(evaluated.finding, last=last)
         if self.baseline is None:
             learnt_from = samples if apart is None else np.concatenate((samples, apart))
-            self.baseline = self._learning.take(learnt_from, evaluated.finding, self._speed_rpm)
+            self.baseline = self._learning.add(learnt_from, evaluated.finding, self._speed_rpm)
             if self.baseline is not None:
                 self._watches, self._directions = self._new_watches(), self._new_directions()
                 if self._keep is not None:
@@ -243,7 +243,7 @@ class BearingDetector:
                 continue
             try:
                 refuse_clipped(signal)
-                race = self._watches[bearing.name].take(signal)
+                race = self._watches[bearing.name].evaluate(signal)
                 departed = self._departed(bearing, samples)
             except (UnfitError, _StandsStillError) as error:
                 self._watches[bearing.name].forget()

@@ -108,7 +108,7 @@ class RaceDirection:
         """
         self._monitor.reset()
         try:
-            found = self._monitor.take(pair * self._m_s2_per_unit, suspected=suspected)
+            found = self._monitor.evaluate(pair * self._m_s2_per_unit, suspected=suspected)
         except ValueError:
             return None  # no stretch between the gaps is as long as a frame
         isolation = found.isolation

@@ -43,7 +43,7 @@ class HealthyGathering:
         gathered = sum(map(len, self._gathered)) / self._rate_hz
         return f"learning the healthy state: {gathered:.0f} of {self._needed / self._rate_hz:.0f} s"
 
-    def take(
+    def add(
         self, samples: NDArray[np.float32], finding: BearingFinding, speed_rpm: float
     ) -> BearingBaseline | None:
         """Take in a look that follows those before.

@@ -177,7 +177,7 @@ class LevelDetector:
             return self._state(channel, evidence, {}, "missing", reason, share)
         statistics, bounds = self._measure(channel, samples, share)
         known = samples[present]
-        still = self._standstills[channel.sensor].take(known)
+        still = self._standstills[channel.sensor].push(known)
         if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
             return self._state(channel, evidence, statistics, "not_ok", reason, share)
         reason = partly_missing(channel.sensor, len(samples) - count, len(samples), bounds)

@@ -85,7 +85,7 @@ class StandstillWatch:
         self._open = 0
         self._dead = False
 
-    def take(self, samples: NDArray[np.float32] | NDArray[np.float64]) -> Standstill | None:
+    def push(self, samples: NDArray[np.float32] | NDArray[np.float64]) -> Standstill | None:
         """Take in the next window; when the sensor was dead in it, None if it was alive all the time.
 
         Args:
@@ -133,7 +133,7 @@ def dropped_to(signal: Floats) -> Standstill | None:
 
     A flat crest rests on one value of a coarse converter, too, but is reached in its finest steps.
     """
-    still = StandstillWatch().take(signal)
+    still = StandstillWatch().push(signal)
     if still is None:
         return None
     steps = np.abs(np.diff(signal))

@@ -119,7 +119,7 @@ class FixedSpeedCutter:
             self._shaft.turn(self._edge, end, 1, bend=0.0, trusted=True)
             self._edge = end
             self._done += 1
-        return self._shaft.take()
+        return self._shaft.drain()
 
 
 class KeyphasorCutter:
@@ -199,7 +199,7 @@ class KeyphasorCutter:
                 mark = self._steady.place(self._line.marks[-1], sharp=bool(sharp[sample]))
                 self._marks.add(mark, self._line.period)
         self._marks.wait(self._shaft.position)
-        return self._shaft.take()
+        return self._shaft.drain()
 
 
 class OrbitCutter:
@@ -241,7 +241,7 @@ class OrbitCutter:
                 self.counts.accepted += 1
             else:
                 self.counts.missing += 1
-        return self._shaft.take()
+        return self._shaft.drain()
 
 
 def _check_period(period_samples: float) -> None:
@@ -313,7 +313,7 @@ class Shaft:
         self._trusted.append(np.full(turns, trusted))
         self._cut_index = end.index
 
-    def take(self) -> Revolutions:
+    def drain(self) -> Revolutions:
         """The revolutions since the last call."""
         first_index = self._held_index
         n = 0 if self._cut_index is None else self._cut_index - first_index

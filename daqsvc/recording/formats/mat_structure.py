@@ -83,7 +83,7 @@ def _unpacked(body: memoryview, budget: Budget) -> bytes:
     """A compressed variable, no more of it than the file may hold."""
     unpacking = zlib.decompressobj()
     found = unpacking.decompress(body, budget.left_bytes + 1)
-    budget.take(len(found))
+    budget.spend(len(found))
     if not unpacking.eof:
         raise _DamageError("a compressed variable is cut short")
     return found

@@ -46,7 +46,7 @@ def read_parquet(path: Path, budget: Budget) -> Contents:
         wanted = None if len(set(schema.names)) < len(schema.names) else [schema.names[i] for i in numbers]
         for batch in file.iter_batches(_BATCH_ROWS, columns=wanted, use_threads=False):
             columns = batch.columns if wanted is not None else [batch.columns[i] for i in numbers]
-            budget.take(_ITEM_BYTES * len(batch) * len(columns))
+            budget.spend(_ITEM_BYTES * len(batch) * len(columns))
             for piece, column in zip(pieces, columns, strict=True):
                 piece.append(column)
     pieces.reverse()

@@ -214,7 +214,7 @@ class RotorWatch:
             return "calibrating"
         return "watching" if self._onset is None else "departed"
 
-    def take(self, vectors: SynchronousVectors, orbits: Revolutions | None = None) -> list[WatchReport]:
+    def evaluate(self, vectors: SynchronousVectors, orbits: Revolutions | None = None) -> list[WatchReport]:
         """Take in revolutions, in order; one report for each that could be fitted.
 
         Args:

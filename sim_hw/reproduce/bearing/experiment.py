@@ -156,5 +156,5 @@ def _verdicts(seed: int, snr_db: float) -> dict[str, str]:
     for fault in faults:
         monitor.reset()
         window = simulate(machine, signal, fault, level, rng)
-        verdicts[fault] = monitor.take(window.y, window.v).verdict
+        verdicts[fault] = monitor.evaluate(window.y, window.v).verdict
     return verdicts
