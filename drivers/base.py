@@ -67,11 +67,10 @@ class StreamSpec(Generic[LayoutT]):
 
 @dataclass(frozen=True, slots=True)
 class BusPort:
-    """All that a driver is given.
+    """All that a driver is given beside the table of its bus.
 
     Attributes:
         name: name of the bus in the machine file.
-        options: the bus's settings, by key.
         streams: what is expected on the bus.
         clock: the service's clock.
         deliver: called with each block, on the event loop.
@@ -81,7 +80,6 @@ class BusPort:
     """
 
     name: str
-    options: Mapping[str, Any]
     streams: Sequence[StreamSpec[Any]]
     clock: Clock
     deliver: Callable[[SampleBlock], None]

@@ -120,7 +120,9 @@ class RawValues:
     def __init__(self, cells: Sequence[Field], valid: Sequence[tuple[float, float] | None]) -> None:
         n = len(cells)
         self.all_measured = not any(valid)
-        self._measured = np.array([given or (-np.inf, np.inf) for given in valid], np.float64).reshape(n, 2).T
+        self._measured = (
+            np.array([bounds or (-np.inf, np.inf) for bounds in valid], np.float64).reshape(n, 2).T
+        )
         self._least, self._largest, self._no_value = np.empty(n), np.empty(n), np.full(n, np.nan)
         for k, (cell, (low, high)) in enumerate(zip(cells, self._measured.T.tolist(), strict=True)):
             least, largest = cell.limits

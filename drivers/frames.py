@@ -8,7 +8,8 @@ the same object that the driver decodes with.
 from __future__ import annotations
 
 import binascii
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
@@ -24,12 +25,13 @@ if TYPE_CHECKING:
     from drivers.fields import Payloads
 
     Floats: TypeAlias = NDArray[np.float64]
-    InUnits: TypeAlias = Callable[[NDArray[Any], Floats, Floats], NDArray[np.float32]]
+    Scaling: TypeAlias = Callable[[NDArray[Any], Floats, Floats], NDArray[np.float32]]
 
 __all__ = [
     "ByteOrder",
     "Counts",
-    "Decoded",
+    "DecodedBatch",
+    "DecodedFrames",
     "Field",
     "FrameLayout",
     "Kind",
@@ -42,18 +44,54 @@ Counts = Literal["samples", "frames"]
 CRC_BYTES = 2
 
 
-class Decoded(NamedTuple):
-    """A batch of decoded frames.
+class DecodedFrames(NamedTuple):
+    """Decoded frames of one stream, in their order of arrival; what `StreamAssembler.accept` takes.
 
     Attributes:
         counter: int64 ``[n]``, the device's counter as sent (wrapped); zeros if it sends none.
         samples: float32 ``[n, samples_per_frame, channels]`` in physical units.
         intact: bool ``[n]``, False where the frame's CRC does not match (all True without a CRC).
+        arrival_ns: int64 ``[n]``, host monotonic; zeros where nobody has said.
     """
 
     counter: NDArray[np.int64]
     samples: NDArray[np.float32]
     intact: NDArray[np.bool_]
+    arrival_ns: NDArray[np.int64]
+
+
+def joined(*parts: DecodedFrames) -> DecodedFrames:
+    """Frames of one stream, part after part."""
+    return DecodedFrames(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+@dataclass(slots=True)
+class DecodedBatch:
+    """What a batch of a bus held.
+
+    Attributes:
+        frames: decoded frames by stream.
+        notes: what to add to which of the bus's counters.
+        unknown: frames by unknown id, in words.
+        wrong_length: frames by stream, and the length of the last of them.
+        errors: what error frames say, of a bus that has such; see `drivers.can.errors.ErrorCounts`.
+        data_frames: frames that carry data, whosever they are.
+        drained_ns: when the bus was last known to hold no frame that was sent before; None if there may be
+            more.
+    """
+
+    frames: dict[str, DecodedFrames] = field(default_factory=dict)
+    notes: Counter[str] = field(default_factory=Counter)
+    unknown: Counter[str] = field(default_factory=Counter)
+    wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
+    errors: Any = None
+    data_frames: int = 0
+    drained_ns: int | None = None
+
+    def note(self, counter: str, count: int = 1) -> None:
+        """Add to a counter of the bus."""
+        if count:
+            self.notes[counter] += count
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,17 +247,6 @@ class FrameLayout:
         """By how much the counter grows from one frame to the next."""
         return self.samples_per_frame if self.counts == "samples" else 1
 
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> FrameLayout:
-        """The same layout with each channel's value ``v`` turned into ``gain * v + shift``.
-
-        Args:
-            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
-        """
-        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
-        gain = np.array([g for g, _ in pairs])
-        shift = np.array([s for _, s in pairs])
-        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
-
     @cached_property
     def _cells(self) -> list[Field]:
         return [cell for row in self.fields for cell in row]
@@ -278,22 +305,29 @@ class FrameLayout:
         crcs = (binascii.crc_hqx(covered[i : i + step], 0xFFFF) for i in range(0, len(covered), step))
         return np.fromiter(crcs, np.uint16, len(payloads))
 
-    def decode(self, payloads: Payloads, compiled: InUnits | None = None) -> Decoded:
+    def decode(
+        self,
+        payloads: Payloads,
+        arrival_ns: NDArray[np.int64] | None = None,
+        *,
+        scaling: Scaling | None = None,
+    ) -> DecodedFrames:
         """Decode a batch of frames.
 
         Args:
             payloads: uint8 ``[n, length]``.
-            compiled: turns raw numbers ``[n, fields]`` of one kind, with scale and offset ``[fields]``, into
+            arrival_ns: int64 ``[n]``, when each arrived.
+            scaling: turns raw numbers ``[n, fields]`` of one kind, with scale and offset ``[fields]``, into
                 physical units in one pass, where NumPy takes four; None to leave it to NumPy.
 
         Returns:
             Samples that are NaN where the device says that it has no value (`valid_raw`).
         """
         n = len(payloads)
-        if compiled is not None and len(self._sample_groups) == 1 and self._raw_values.all_measured:
+        if scaling is not None and len(self._sample_groups) == 1 and self._raw_values.all_measured:
             raw = self._sample_groups[0].read(payloads)
             native = np.ascontiguousarray(raw, raw.dtype.newbyteorder("="))
-            samples = compiled(native, self.scale.reshape(-1), self.offset.reshape(-1))
+            samples = scaling(native, self.scale.reshape(-1), self.offset.reshape(-1))
             samples = samples.reshape(n, *self.scale.shape)
         else:
             samples = self._samples(payloads)
@@ -308,7 +342,9 @@ class FrameLayout:
         else:
             sent = payloads[:, self.crc_byte].astype(np.uint16) << 8 | payloads[:, self.crc_byte + 1]
             intact = sent == self._crc(payloads)
-        return Decoded(counter, samples, intact)
+        if arrival_ns is None:
+            arrival_ns = np.zeros(n, np.int64)
+        return DecodedFrames(counter, samples, intact, arrival_ns)
 
     def _samples(self, payloads: Payloads) -> NDArray[np.float32]:
         n = len(payloads)

@@ -10,7 +10,7 @@ from daqsvc.settings.registry import bus_tables, driver_of_layout
 from drivers.base import BusOptionError, BusPort, StreamSpec
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
@@ -48,7 +48,7 @@ def bus_drivers(
     Raises:
         AssemblyError, LayoutError: see `bus_driver`.
     """
-    return [bus_driver(machine, name, clock, deliver, tell=tell) for name in machine.buses]
+    return [bus_driver(machine, name, clock, deliver, tell) for name in machine.buses]
 
 
 def bus_driver(
@@ -56,7 +56,6 @@ def bus_driver(
     name: str,
     clock: Clock,
     deliver: Callable[[SampleBlock], None],
-    changed: Mapping[str, Any] | None = None,
     tell: Tell = tell_nobody,
 ) -> Driver:
     """The driver of one bus.
@@ -66,7 +65,6 @@ def bus_driver(
         name: the bus.
         clock: the service's clock.
         deliver: see `drivers.base.BusPort`.
-        changed: options that are other than in the machine file.
         tell: see `drivers.base.BusPort`.
 
     Raises:
@@ -75,6 +73,20 @@ def bus_driver(
     """
     bus = machine.buses[name]
     plugin = cast("DriverPlugin[Any]", bus_tables()[bus.driver])
+    try:
+        return plugin.build(plugin.absolute(machine, bus), bus_port(machine, name, clock, deliver, tell))
+    except BusOptionError as error:
+        raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
+
+
+def bus_port(
+    machine: MachineFile,
+    name: str,
+    clock: Clock,
+    deliver: Callable[[SampleBlock], None],
+    tell: Tell = tell_nobody,
+) -> BusPort:
+    """What the driver of one bus is given beside its table; see `bus_driver`."""
     streams = [
         StreamSpec(
             stream_name,
@@ -85,9 +97,4 @@ def bus_driver(
         for stream_name, stream in machine.streams.items()
         if stream.bus == name
     ]
-    options = {**plugin.options(machine, bus), **(changed or {})}
-    port = BusPort(name, options, streams, clock, deliver, bus.start, tell)
-    try:
-        return plugin.build(bus, port)
-    except BusOptionError as error:
-        raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
+    return BusPort(name, streams, clock, deliver, machine.buses[name].start, tell)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from daqsvc.settings.buses import Bus
+from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.plugins import BusTable
 from daqsvc.settings.problems import AssemblyError
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 BusT = TypeVar("BusT", bound=Bus)
+LayoutT = TypeVar("LayoutT", bound=Layout)
 
 
 class DriverPlugin(BusTable, Generic[BusT]):
@@ -39,21 +40,21 @@ class DriverPlugin(BusTable, Generic[BusT]):
             AssemblyError: no driver decodes this layout.
             LayoutError: a file that it names does not hold what the machine file says.
         """
-        given = machine.streams[stream].layout
-        if isinstance(given, PackedLayout):
-            return packed_layout(given, given.frame_bytes).in_units(units_of(machine, stream))
-        raise AssemblyError(f"{machine.path}: streams.{stream}.layout: no driver decodes {given.kind}")
+        layout = machine.streams[stream].layout
+        if not isinstance(layout, PackedLayout):
+            raise AssemblyError(f"{machine.path}: streams.{stream}.layout: no driver decodes {layout.kind}")
+        return packed_layout(in_units(layout, machine, stream), layout.frame_bytes)
 
-    def options(self, machine: MachineFile, bus: BusT) -> dict[str, Any]:
-        """What `BusPort.options` holds: the bus's settings by key, with paths made absolute."""
+    def absolute(self, machine: MachineFile, bus: BusT) -> BusT:
+        """The table of a bus with its paths made absolute; they are relative to the machine file."""
         del machine
-        return bus.model_dump()
+        return bus
 
     def build(self, bus: BusT, port: BusPort) -> Driver:
         """The driver of a bus. Making it opens nothing.
 
         Args:
-            bus: its table in the machine file.
+            bus: its table in the machine file, paths made absolute.
             port: its streams, the clock, and where to deliver.
 
         Raises:
@@ -68,8 +69,22 @@ def units_of(machine: MachineFile, stream: str) -> dict[str, tuple[float, float]
     return {s.channel: (s.gain, s.shift) for s in machine.sensors if s.stream == stream}
 
 
+def in_units(layout: LayoutT, machine: MachineFile, stream: str) -> LayoutT:
+    """The layout of a stream whose channels lead to the physical units of their sensors.
+
+    Channels without a sensor stay in the units of the wire.
+    """
+    units = units_of(machine, stream)
+    channels = []
+    for channel in getattr(layout, layout.channels_key):
+        gain, shift = units.get(channel.name, (1.0, 0.0))
+        turned = {"scale": channel.scale * gain, "offset": channel.offset * gain + shift}
+        channels.append(channel.model_copy(update=turned))
+    return layout.model_copy(update={layout.channels_key: tuple(channels)})
+
+
 def packed_layout(
-    given: PackedFields,
+    fields: PackedFields,
     length: int,
     *,
     frame_id: int = 0,
@@ -79,7 +94,7 @@ def packed_layout(
     """The layout of a frame with samples side by side, in the units of the wire.
 
     Args:
-        given: where they lie.
+        fields: where they lie.
         length: bytes of a frame.
         frame_id: what tells the frames of the stream from others.
         extended: whether that has 29 bits; of CAN frames.
@@ -90,15 +105,15 @@ def packed_layout(
         extended=extended,
         any_priority=any_priority,
         length=length,
-        channels=packed(given.channels),
-        samples_per_frame=given.samples_per_frame,
-        counter_byte=None if given.counter is None else given.counter.byte,
-        counter_bits=32 if given.counter is None else given.counter.bits,
-        counts="frames" if given.counter is None else given.counter.counts,
-        first_byte=given.first_byte,
-        crc_byte=given.crc_byte,
-        byte_order=given.byte_order,
-        valid_raw=raw_limits(given.channels),
+        channels=packed(fields.channels),
+        samples_per_frame=fields.samples_per_frame,
+        counter_byte=None if fields.counter is None else fields.counter.byte,
+        counter_bits=32 if fields.counter is None else fields.counter.bits,
+        counts="frames" if fields.counter is None else fields.counter.counts,
+        first_byte=fields.first_byte,
+        crc_byte=fields.crc_byte,
+        byte_order=fields.byte_order,
+        valid_raw=raw_limits(fields.channels),
     )
 
 

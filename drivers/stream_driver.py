@@ -74,9 +74,8 @@ class StreamDriver:
             payloads: uint8 ``[n, spec.layout.length]``.
         """
         if len(payloads):
-            decoded = spec.layout.decode(payloads)
             arrival_ns = np.full(len(payloads), self.port.clock.monotonic_ns())
-            self._assemblers[spec.name].accept(decoded.counter, decoded.samples, decoded.intact, arrival_ns)
+            self._assemblers[spec.name].accept(*spec.layout.decode(payloads, arrival_ns))
 
     @property
     def _frames(self) -> int:

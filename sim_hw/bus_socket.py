@@ -260,8 +260,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--queue-frames", type=int, default=QUEUE_FRAMES, help=f"kept for a slow reader ({QUEUE_FRAMES})"
     )
-    given = parser.parse_args(arguments)
-    return run_hub(given.path, given.queue_frames)
+    parsed = parser.parse_args(arguments)
+    return run_hub(parsed.path, parsed.queue_frames)
 
 
 def run_hub(path: str, queue_frames: int = QUEUE_FRAMES) -> int:

@@ -225,14 +225,14 @@ def _script(
         SignalError,
     )
 
-    given = Path(arguments.what)
-    is_machine = given.is_file() and not _is_scenario(given)
+    source = Path(arguments.what)
+    is_machine = source.is_file() and not _is_scenario(source)
     scenario = None
     if not is_machine or arguments.scenario is not None or arguments.recording is None:
         scenario = load_any_scenario(arguments.scenario or SCENARIO if is_machine else arguments.what)
     unixbus: Path | None = arguments.bus
     if is_machine:
-        machine = load_machine_file(given)
+        machine = load_machine_file(source)
     elif isinstance(scenario, Scenario):
         from sim_hw.demo.machines import laval_rig  # noqa: PLC0415
 
@@ -240,7 +240,7 @@ def _script(
         unixbus = unixbus or Path(tempfile.gettempdir()) / DEFAULT_BUS
     else:
         raise SignalError(
-            f"a bearing needs sensors: name a machine file too, daqsvc sim FILE --scenario {given}"
+            f"a bearing needs sensors: name a machine file too, daqsvc sim FILE --scenario {source}"
         )
     if scenario is None and arguments.seed is not None:
         raise SignalError(

@@ -15,6 +15,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from drivers.can.plugin import frame_layout
+from drivers.can.settings import CanBus
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.sim_command_order import NodeError
 
@@ -33,7 +34,7 @@ async def node_for(order: NodeOrder) -> SimNode:
     Raises:
         NodeError: there is no such kind, or it cannot be put there.
     """
-    driver = str(order.options["driver"])
+    driver = order.settings.driver
     known: dict[str, Callable[[NodeOrder], Awaitable[SimNode]]] = {
         "can": CanNodes.open,
         "modbus": _modbus_nodes,
@@ -62,23 +63,26 @@ class CanNodes:
     @classmethod
     async def open(cls, order: NodeOrder) -> CanNodes:
         """See `node_for`."""
-        options = order.options
+        settings = order.settings
+        assert isinstance(settings, CanBus)  # noqa: S101 - the driver of the bus is "can"
         if order.unixbus is not None:
-            options |= {"interface": "unixbus", "channel": str(order.unixbus), "options": {}}
-        interface, channel = options["interface"], options["channel"]
+            virtual = {"interface": "unixbus", "channel": str(order.unixbus), "options": {}}
+            settings = settings.model_copy(update=virtual)
+        interface, channel, fd = settings.interface, settings.channel, settings.fd
         if interface == "virtual":
             raise NodeError(
                 f'buses.{order.bus}: python-can\'s interface "virtual" lives within one process; use a '
                 "virtual bus between processes with --bus PATH"
             )
 
-        chosen = {key: options[key] for key in ("bitrate", "data_bitrate") if options.get(key)}
-        chosen |= options["options"] or {}
+        rates = {"bitrate": settings.bitrate, "data_bitrate": settings.data_bitrate}
+        chosen: dict[str, Any] = {key: rate for key, rate in rates.items() if rate}
+        chosen |= settings.options
         # A node reads nothing: what the others send must not pile up for it.
         chosen |= {"receive": False} if interface == "unixbus" else {}
 
         def bus() -> can.BusABC:
-            opened = can.Bus(interface=interface, channel=channel, fd=options["fd"], **chosen)
+            opened = can.Bus(interface=interface, channel=channel, fd=fd, **chosen)
             if isinstance(opened, SocketcanBus):
                 opened.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
             return opened

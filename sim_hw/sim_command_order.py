@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.settings import MachineFile
+    from daqsvc.settings.buses import Bus
     from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.sim_command_signals import StreamSamples
@@ -42,9 +43,9 @@ class NodeOrder:
     port: int | None = None
 
     @property
-    def options(self) -> dict[str, Any]:
-        """The bus's settings."""
-        return dict(self.machine.buses[self.bus].model_dump())
+    def settings(self) -> Bus:
+        """The bus's table in the machine file."""
+        return self.machine.buses[self.bus]
 
 
 class SimNode(Protocol):

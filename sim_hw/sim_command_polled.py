@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from drivers.modbus.build import modbus_layout
+from drivers.make import stream_layout
+from drivers.modbus.settings import ModbusRtuBus, ModbusTcpBus
 from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
@@ -45,7 +46,7 @@ class ReplyFaults:
             "duplicate": [link for _, link in faults.link if link.duplicate],
             "reorder": [link for _, link in faults.link if link.reorder],
         }
-        if asked := [name for name, given in impossible.items() if given]:
+        if asked := [name for name, asked_for in impossible.items() if asked_for]:
             raise NodeError(
                 f"the scenario's fault {asked[0]!r} cannot be played on Modbus, where units only answer; "
                 "there are silence, delay, and link with drop and corrupt"
@@ -101,8 +102,8 @@ class ModbusNodes:
     @classmethod
     async def open(cls, order: NodeOrder) -> ModbusNodes:
         """See `sim_hw.sim_command_nodes.node_for`."""
-        options = order.options
-        layouts = {s.stream: modbus_layout(order.machine, s.stream) for s in order.streams}
+        bus = order.settings
+        layouts = {s.stream: stream_layout(order.machine, s.stream) for s in order.streams}
         units = {layout.unit: ModbusUnit() for layout in layouts.values()}
         nodes = {
             s.stream: ModbusNode(units[layouts[s.stream].unit], layouts[s.stream], s.samples, s.rate_hz)
@@ -110,12 +111,13 @@ class ModbusNodes:
         }
         replies = ReplyFaults(order.faults or NodeFaults())
         server: ModbusTcpServer | ModbusRtuServer
-        if options["transport"] == "tcp":
-            port = options["tcp_port"] if order.port is None else order.port
+        if isinstance(bus, ModbusTcpBus):
+            port = bus.tcp_port if order.port is None else order.port
             server = ModbusTcpServer(units, port=port, plan=replies)
             where, remedy = f"TCP port {port} of 127.0.0.1", "--port N, and as tcp_port in the machine file"
         else:
-            path = order.link or Path(options["serial_port"])
+            assert isinstance(bus, ModbusRtuBus)  # noqa: S101 - the driver of the bus is "modbus"
+            path = order.link or Path(bus.serial_port)
             if path.exists() and not path.is_symlink():
                 raise NodeError(f"{path} is a real port; put the simulated one elsewhere with --link PATH")
             server = ModbusRtuServer(units, path, replies)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.base import StreamSpec
 from drivers.make import stream_layout
 from drivers.serial.driver import framing_of
+from drivers.serial.settings import SerialBus
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
 from sim_hw.sim_command_order import NodeError
@@ -33,8 +34,9 @@ class SerialNodes:
     @classmethod
     async def open(cls, order: NodeOrder) -> SerialNodes:
         """See `sim_hw.sim_command_nodes.node_for`."""
-        options = order.options
-        path = order.link or Path(options["port"])
+        bus = order.settings
+        assert isinstance(bus, SerialBus)  # noqa: S101 - the driver of the bus is "serial"
+        path = order.link or Path(bus.port)
         specs: list[StreamSpec[Any]] = [
             StreamSpec(s.stream, stream_layout(order.machine, s.stream), s.rate_hz) for s in order.streams
         ]
@@ -52,7 +54,7 @@ class SerialNodes:
             for spec, played in zip(specs, order.streams, strict=True):
                 nodes[spec.name] = SerialNode(
                     cable,
-                    framing_of(options, specs),
+                    framing_of(bus, specs),
                     spec.name,
                     spec.layout,
                     played.samples,

@@ -229,11 +229,11 @@ class Aligner:
 
     def _tell(self, follower: Follower) -> None:
         """Say once that a stream can be placed, that it no longer can, and that it never could."""
-        said = follower.news(round(SETTLE_NS / NS_PER_S * self._reference.source.rate_hz))
-        if said is None:
+        placing = follower.news(round(SETTLE_NS / NS_PER_S * self._reference.source.rate_hz))
+        if placing is None:
             return
         error_us = follower.error_ns / 1e3
-        if said == "placed":
+        if placing == "placed":
             logger.info(
                 "stream %r is on the grid of %r to %.0f us",
                 follower.source.stream,

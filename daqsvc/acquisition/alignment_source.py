@@ -74,10 +74,10 @@ class FractionalDelay:
         taps = self._taps[row] * (1.0 - part) + self._taps[row + 1] * part
         around = np.lib.stride_tricks.sliding_window_view(samples, 2 * self.reach, axis=0)[first[there]]
         with np.errstate(invalid="ignore"):
-            told = np.einsum("nct,nt->nc", around, taps)
+            between = np.einsum("nct,nt->nc", around, taps)
         # Infinities of one sign would pass for a value.
-        told[~np.isfinite(told)] = np.nan
-        values[there] = told
+        between[~np.isfinite(between)] = np.nan
+        values[there] = between
         return values
 
 
@@ -323,14 +323,14 @@ class Follower:
         Args:
             patience: rows in which it should have found its place.
         """
-        told = self._told
+        before = self._told
         if self.trusted:
             self._told = "placed"
-        elif told == "placed":
+        elif before == "placed":
             self._told = "out of place"
-        elif told is None and self.counters.rows_withheld > patience:
+        elif before is None and self.counters.rows_withheld > patience:
             self._told = "never placed"
-        return None if self._told == told else self._told
+        return None if self._told == before else self._told
 
     def _target(self, index: int, grid: Line) -> tuple[int, float]:
         """Where the time bases see a row of the grid among our samples: whole index and fraction."""

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.counter import Placement
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -86,14 +84,16 @@ class ArrivalCount:
             arrival_ns = arrival_ns[seen:]
         return False
 
-    def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
+    def place(
+        self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], list[int]]:
         """Count a batch.
 
         Args:
             raw: int64 ``[n]``, anything.
             arrival_ns: int64 ``[n]``, host monotonic, in the order of arrival.
         """
-        return Placement(self.count(arrival_ns), np.ones(len(raw), np.bool_), [])
+        return self.count(arrival_ns), np.ones(len(raw), np.bool_), []
 
     def count(self, arrival_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The count of each frame; every frame counts one at least.

@@ -175,12 +175,12 @@ class StreamAssembler:
             return
         self._look(counter, samples, arrival_ns)
         known = self._time.rate_known if self._arrivals is None else self._arrivals.known
-        self._standing.take(self.doubt, int(arrival_ns[-1]), known=known)
+        self._standing.update(self.doubt, int(arrival_ns[-1]), known=known)
 
     def _look(self, counter: NDArray[np.int64], samples: Samples, arrival_ns: NDArray[np.int64]) -> None:
         """Place frames, or set them aside."""
         if self._arrivals is not None:
-            self._arrivals.take(arrival_ns)
+            self._arrivals.add(arrival_ns)
         was_aside = bool(self._sense.doubt)
         if self._sense.look(counter, arrival_ns):
             if not was_aside:
@@ -245,25 +245,25 @@ class StreamAssembler:
             self._asked_ns = newest_ns
             return
         self._unplaced = []
-        placed = self._time.place(counter, arrival_ns)
+        indices, fits, restarts, anew = self._time.place(counter, arrival_ns)
         before = self.counters.frames_rejected
-        self._reject(int((~placed.kept).sum()))
-        if placed.restarts:
+        self._reject(int((~fits).sum()))
+        if restarts:
             self._say(
                 "stream %r: the device has restarted its counter, or has not counted for a while; "
                 "how many samples are missing is estimated from the clock",
                 newest_ns,
             )
-        if placed.anew:
+        if anew:
             self._say(
                 "stream %r: its samples do not arrive when its clock has told; its time base begins anew",
                 newest_ns,
             )
         start = 0
-        for restart in [*placed.restarts, len(counter)]:
+        for restart in [*restarts, len(counter)]:
             part = slice(start, restart)
-            kept = placed.kept[part]
-            self._merge(placed.indices[part][kept], samples[part][kept], int(arrival_ns[-1]))
+            kept = fits[part]
+            self._merge(indices[part][kept], samples[part][kept], int(arrival_ns[-1]))
             if restart < len(counter):
                 self._release(everything=True)
                 self._after_restart = True

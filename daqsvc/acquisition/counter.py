@@ -125,8 +125,8 @@ def advance(step: int, elapsed: float, unsure: float, rules: Floats) -> int:
         rules: float64 ``[8]``, see `Rules`.
     """
     ahead, modulus = rules[2], rules[3]
-    found = step + np.rint((elapsed - step) / modulus) * modulus
-    return int(found) if 0.0 < found < 2.0**62 and abs(found - elapsed) <= ahead + unsure else 0
+    counts = step + np.rint((elapsed - step) / modulus) * modulus
+    return int(counts) if 0.0 < counts < 2.0**62 and abs(counts - elapsed) <= ahead + unsure else 0
 
 
 @njit(
@@ -164,7 +164,7 @@ def follow(
     """
     step_usual, back, ahead, modulus, doubt, rate, drift, _ = rules
     shift = np.uint64(unused_bits)
-    found = 0
+    n_restarts = 0
     budget = LOOKED_AHEAD * len(raw)
     for at in range(len(raw)):
         step = signed(raw[at] - last[RAW], unused_bits)
@@ -198,8 +198,8 @@ def follow(
                 # Never before anything placed already: two samples cannot share an index.
                 by_clock = last[COUNT] + np.int64(np.rint(elapsed + before))
                 place = max(by_clock, last[HIGHEST] + np.int64(step_usual))
-                restarts[found] = at
-                found += 1
+                restarts[n_restarts] = at
+                n_restarts += 1
                 late[0] = 0.0
             else:
                 last[SUSPECT], last[SUSPECTED] = raw[at], 1
@@ -210,7 +210,7 @@ def follow(
         last[RAW], last[COUNT], last[SEEN_NS] = raw[at], place, arrival_ns[at]
         last[HIGHEST] = max(last[HIGHEST], place)
         last[SUSPECTED] = 0
-    return found
+    return n_restarts
 
 
 JITTER_NS = 50_000_000
@@ -233,21 +233,6 @@ LEAST_BITS, MOST_BITS = 4, 64
 
 _FIRST_BITS = 32
 """A wider counter begins at so many of its low bits: far from the end of the integers that count on."""
-
-
-class Placement(NamedTuple):
-    """Where the frames of a batch belong.
-
-    Attributes:
-        counts: int64 ``[n]``, the counter unwrapped; meaningless where ``kept`` is False.
-        kept: bool ``[n]``, False for frames whose counter fits neither the sequence nor a restart.
-        restarts: places in the batch at which the device was found to have restarted its counter;
-            the distance to the frame before is estimated from the host clock.
-    """
-
-    counts: NDArray[np.int64]
-    kept: NDArray[np.bool_]
-    restarts: list[int]
 
 
 class CounterUnwrapper:
@@ -355,12 +340,20 @@ class CounterUnwrapper:
         self._late[0] = 0.0
         self.forget_rate()
 
-    def place(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placement:
+    def place(
+        self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], list[int]]:
         """Unwrap a batch.
 
         Args:
             raw: int64 ``[n]``, counters as sent; one of 64 bits as the signed number with the same bits.
             arrival_ns: int64 ``[n]``, host monotonic arrival times, not decreasing.
+
+        Returns:
+            int64 ``[n]``, the counter unwrapped; bool ``[n]``, False for frames whose counter fits neither
+            the sequence nor a restart, and whose count is meaningless; places in the batch at which the
+            device was found to have restarted its counter. The distance to the frame before these is
+            estimated from the host clock.
         """
         n = len(raw)
         count = np.zeros(n, np.int64)
@@ -373,7 +366,7 @@ class CounterUnwrapper:
             self._last[:] = raw[0], first, arrival_ns[0], first, 0, 0
             count[0] = first
             at = 1
-        found = follow(
+        n_restarts = follow(
             np.ascontiguousarray(raw[at:], np.int64),
             np.ascontiguousarray(arrival_ns[at:], np.int64),
             self._last,
@@ -384,7 +377,7 @@ class CounterUnwrapper:
             kept[at:],
             restarts,
         )
-        return Placement(count, kept, (restarts[:found] + at).tolist())
+        return count, kept, (restarts[:n_restarts] + at).tolist()
 
     def _lags(
         self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]

@@ -12,10 +12,11 @@ import heapq
 import itertools
 from bisect import bisect_right
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from daqsvc.acquisition.samples import Window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -246,25 +247,6 @@ class SampleRing:
         self._waiting.clear()
 
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """What a reader got.
-
-    Attributes:
-        first_index: absolute index of the first row.
-        samples: float32 ``[n, channels]``, a private copy.
-        skipped: samples between the last chunk and this one that were overwritten before they were read.
-        lost: how many of these were missing anyway: an outage that is longer than the ring.
-        snapshot: whether it is one block that was taken by itself.
-    """
-
-    first_index: int
-    samples: Samples
-    skipped: int
-    lost: int = 0
-    snapshot: bool = False
-
-
 class RingReader:
     """One reader's place in a ring.
 
@@ -285,7 +267,7 @@ class RingReader:
             return self.ring.end_index - self.ring.oldest_index if self.ring.started else 0
         return self.ring.end_index - self.position
 
-    async def take(self, block: int, most_blocks: int) -> Chunk:
+    async def read(self, block: int, most_blocks: int) -> Window:
         """Wait for ``block`` samples and read as many whole blocks as there are, up to ``most_blocks``.
 
         Of a stream of snapshots the next one is read, whatever its length.
@@ -299,7 +281,7 @@ class RingReader:
                 await self._first_block()
             self.position = ring.oldest_index
         if ring.has_snapshots:
-            return await self._take_snapshot(self.position)
+            return await self._read_snapshot(self.position)
         skipped = lost = 0
         while True:
             await ring.wait_for(self.position + block)
@@ -311,12 +293,11 @@ class RingReader:
                 lost += ring.lost_between(self.position, overrun.oldest)
                 self.position = overrun.oldest
                 continue
-            chunk = Chunk(self.position, samples, skipped, lost)
-            self.position += count
+            first, self.position = self.position, self.position + count
             self.samples_skipped += skipped - lost
-            return chunk
+            return self._window(first, samples, skipped)
 
-    async def _take_snapshot(self, position: int) -> Chunk:
+    async def _read_snapshot(self, position: int) -> Window:
         ring, skipped = self.ring, 0
         while True:
             await ring.wait_for(position + 1)
@@ -332,7 +313,11 @@ class RingReader:
                 skipped += end - first
                 continue
             self.samples_skipped += skipped
-            return Chunk(first, samples, skipped, snapshot=True)
+            return self._window(first, samples, skipped, snapshot=True)
+
+    def _window(self, first: int, samples: Samples, skipped: int, *, snapshot: bool = False) -> Window:
+        last = first + len(samples) - 1
+        return Window(first, samples, self.ring.time_of(last), self.ring.period_at(last), skipped, snapshot)
 
     async def _first_block(self) -> None:
         # Any index will do: the first block starts wherever the device's counter stands.

@@ -1,4 +1,4 @@
-"""What flows from a driver into the ring: blocks of samples that know their place, time and loss.
+"""What flows from a driver into the ring, and from there to detectors: samples that know place, time, loss.
 
 Most streams go on from block to block: what lies between two of them is lost. A device that takes a waveform
 now and then sends snapshots: each is complete by itself, and between them nothing is missing.
@@ -86,3 +86,26 @@ class SampleBlock:
     def end_index(self) -> int:
         """One past the index of the last sample."""
         return self.first_index + len(self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Consecutive samples handed to a detector.
+
+    Attributes:
+        first_index: absolute index of ``samples[0]``.
+        samples: float32 ``[n, channels]``, a private copy; missing samples are NaN rows.
+        t_end_ns: monotonic time of the last sample.
+        period_ns: time between samples.
+        skipped: samples between the previous window and this one that the detector was too slow
+            for (they were overwritten), or that were withheld from it; 0 in normal operation.
+        snapshot: whether the samples are one block that was taken by itself. Between it and the window before
+            nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
+    """
+
+    first_index: int
+    samples: Samples
+    t_end_ns: int
+    period_ns: float
+    skipped: int = 0
+    snapshot: bool = False

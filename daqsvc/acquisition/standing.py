@@ -69,7 +69,7 @@ class StreamStanding:
         self._said_ns: dict[str, int] = {}
         self._logged = False
 
-    def take(self, doubt: str, now_ns: int, *, known: bool) -> None:
+    def update(self, doubt: str, now_ns: int, *, known: bool) -> None:
         """Take in how the stream stands.
 
         Args:

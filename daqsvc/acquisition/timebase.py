@@ -89,22 +89,6 @@ class TimeBaseState(NamedTuple):
         return NS_PER_S / self.period_ns
 
 
-class Placed(NamedTuple):
-    """Where the frames of a batch belong: see `daqsvc.acquisition.counter.Placement`.
-
-    Attributes:
-        indices: int64 ``[n]``, sample index of each frame's first sample.
-        kept: bool ``[n]``.
-        restarts: places in the batch where the device restarted its counter.
-        anew: whether the arrivals contradicted the time base, so that it has begun anew.
-    """
-
-    indices: NDArray[np.int64]
-    kept: NDArray[np.bool_]
-    restarts: list[int]
-    anew: bool
-
-
 class Late(NamedTuple):
     """Arrivals that were late: their bucket, and how late the earliest of them was by the line, in ns."""
 
@@ -216,25 +200,32 @@ class TimeBase:
         self._forget()
         self._unwrapper.begin_afresh(first_index // self._samples_per_count)
 
-    def place(self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> Placed:
+    def place(
+        self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_], list[int], bool]:
         """Place a batch of frames and learn from their arrivals.
 
         Args:
             counter: int64 ``[n]``, as sent.
             arrival_ns: int64 ``[n]``, host monotonic, not decreasing.
+
+        Returns:
+            int64 ``[n]``, the index of each frame's first sample; bool ``[n]``, False for frames that belong
+            nowhere; places in the batch at which the device restarted its counter; whether the arrivals
+            contradicted the time base, so that it has begun anew.
         """
-        placement = self._unwrapper.place(counter, arrival_ns)
-        index = placement.counts * self._samples_per_count
-        if placement.restarts:
+        counts, kept, restarts = self._unwrapper.place(counter, arrival_ns)
+        index = counts * self._samples_per_count
+        if restarts:
             # A new epoch: where it begins on the old line is a guess, so the line starts afresh.
-            self._restarts += len(placement.restarts)
-            fresh = slice(placement.restarts[-1], None)
+            self._restarts += len(restarts)
+            fresh = slice(restarts[-1], None)
             self._forget()
             self._unwrapper.forget_rate()
-            anew = self._learn(index[fresh][placement.kept[fresh]], arrival_ns[fresh][placement.kept[fresh]])
+            anew = self._learn(index[fresh][kept[fresh]], arrival_ns[fresh][kept[fresh]])
         else:
-            anew = self._learn(index[placement.kept], arrival_ns[placement.kept])
-        return Placed(index, placement.kept, placement.restarts, anew)
+            anew = self._learn(index[kept], arrival_ns[kept])
+        return index, kept, restarts, anew
 
     def learn(self, index: NDArray[np.int64], arrival_ns: NDArray[np.int64], *, restarted: bool) -> bool:
         """Learn from frames whose place is known, since their driver follows the device's counter itself.
@@ -318,10 +309,10 @@ class TimeBase:
             bucket = Bucket(*self._bucket_best, count, sum_x / count, sum_late / count)
             self._bucket_best, self._bucket_sums = None, (0, 0.0, 0.0)
             self._bucket_start = newest
-            return self._take(bucket)
+            return self._append(bucket)
         return False
 
-    def _take(self, bucket: Bucket) -> bool:
+    def _append(self, bucket: Bucket) -> bool:
         """Lay the line under a bucket, unless it contradicts the line; returns whether that began anew."""
         off_ns = self._residual((bucket.x, bucket.y_ns)) - self._offset_ns if self._settled else 0.0
         may_err_ns = 3.0 * self._line_error(bucket.x) if self._settled else 0.0

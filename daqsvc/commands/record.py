@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from daqsvc.settings import MachineFile
     from drivers.base import Driver
+    from drivers.can.settings import CanBus
 
 
 ENDINGS = (".blf", ".asc", ".log")
@@ -71,25 +72,27 @@ class RecordCommand:
         if machine is None:
             return EXIT_USAGE
         try:
-            bus = _bus(machine, arguments.bus)
+            name, bus = _bus(machine, arguments.bus)
             _check_new(arguments.out)
         except _MisuseError as error:
             return _say(error, EXIT_USAGE)
         from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415 - each verb imports what it needs
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.base import DeviceAbsentError  # noqa: PLC0415
+        from drivers.can.driver import CanDriver  # noqa: PLC0415
+        from drivers.can.record_files import OneLog  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
-        from drivers.make import bus_driver  # noqa: PLC0415
+        from drivers.make import bus_port  # noqa: PLC0415
 
         there = _logs(arguments.out)
         try:
-            changed = {"record": {"file": arguments.out}}
-            driver = bus_driver(machine, bus, SystemClock(), lambda _block: None, changed)
+            port = bus_port(machine, name, SystemClock(), lambda _block: None)
+            driver = CanDriver(bus, port, logs=OneLog(arguments.out))
             asyncio.run(_run_until_stopped(driver, arguments.duration))
         except (AssemblyError, DeviceAbsentError, LayoutError) as error:
             return _say(error, EXIT_FAILED)
         files = sorted(_logs(arguments.out) - there)
-        summary = _summary(bus, driver, files)
+        summary = _summary(name, driver, files)
         print(json.dumps(summary))  # noqa: T201 - this is what the verb is for
         if summary["frames_unrecorded"]:
             return _say(
@@ -108,18 +111,19 @@ class _MisuseError(Exception):
     """The arguments do not fit the machine file or the disk."""
 
 
-def _bus(machine: MachineFile, name: str | None) -> str:
+def _bus(machine: MachineFile, name: str | None) -> tuple[str, CanBus]:
+    """The CAN bus that is meant: its name and its table."""
     from drivers.can.settings import CanBus  # noqa: PLC0415 - each verb imports what it needs
 
-    can_buses = [key for key, bus in machine.buses.items() if isinstance(bus, CanBus)]
+    can_buses = {key: bus for key, bus in machine.buses.items() if isinstance(bus, CanBus)}
     there = f"CAN buses of {machine.path} are {', '.join(can_buses)}" if can_buses else "there is none"
     if name is None:
         if len(can_buses) != 1:
             raise _MisuseError(f"--bus: say which CAN bus to record; {there}")
-        return can_buses[0]
+        return next(iter(can_buses.items()))
     if name not in can_buses:
         raise _MisuseError(f"--bus {name}: {machine.path} has no CAN bus of this name; {there}")
-    return name
+    return name, can_buses[name]
 
 
 def _check_new(log: Path) -> None:

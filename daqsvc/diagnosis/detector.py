@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
+
+from daqsvc.acquisition.samples import Window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.record import Diagnosis
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
-    """Consecutive samples handed to a detector.
-
-    Attributes:
-        first_index: absolute index of ``samples[0]``.
-        samples: float32 ``[n, channels]``, a private copy; missing samples are NaN rows.
-        t_end_ns: monotonic time of the last sample.
-        period_ns: time between samples.
-        skipped: samples between the previous window and this one that the detector was too slow
-            for (they were overwritten), or that were withheld from it; 0 in normal operation.
-        snapshot: whether the samples are one block that was taken by itself. Between it and the window before
-            nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
-    """
-
-    first_index: int
-    samples: Samples
-    t_end_ns: int
-    period_ns: float
-    skipped: int = 0
-    snapshot: bool = False
+__all__ = ["Detector", "Window"]
 
 
 class Detector(Protocol):

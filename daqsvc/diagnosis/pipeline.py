@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.kernel_threads import KernelThreads
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.dsp.quality.missing import Patience
@@ -24,9 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from daqsvc.acquisition.clock import Clock
-    from daqsvc.acquisition.ring import Chunk, SampleRing
+    from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.standing import Tell
-    from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.detector import Detector, Window
     from daqsvc.diagnosis.kernel_threads import Job
     from daqsvc.diagnosis.record import Diagnosis
 
@@ -272,7 +271,8 @@ class Pipeline:
         withheld = 0
         while True:
             try:
-                chunk = await reader.take(detector.block, MOST_BLOCKS)
+                skipped_before = reader.samples_skipped
+                window = await reader.read(detector.block, MOST_BLOCKS)
             except RingClosed:
                 return None
             stream, changes = detector.stream, self._changes[detector.stream]
@@ -280,18 +280,18 @@ class Pipeline:
                 break
             # What came before a doubt was over is not to be judged by, either.
             self._seen_changes[detector.name] = changes
-            counters.samples_withheld += len(chunk.samples)
-            withheld += chunk.skipped + len(chunk.samples)
-        if missed := chunk.skipped - chunk.lost:
+            counters.samples_withheld += len(window.samples)
+            withheld += window.skipped + len(window.samples)
+        if missed := reader.samples_skipped - skipped_before:
             counters.samples_skipped += missed
             logger.warning(
                 "detector %s was too slow and has missed %d samples of %r from index %d on",
                 detector.name,
                 missed,
                 detector.stream,
-                chunk.first_index - chunk.skipped,
+                window.first_index - window.skipped,
             )
-        return _window(reader.ring, chunk, withheld)
+        return replace(window, skipped=window.skipped + withheld) if withheld else window
 
     async def _until_made(
         self, detector: Detector, job: Job[Sequence[Diagnosis]], kernels: KernelThreads
@@ -310,18 +310,6 @@ def _part(detector: Detector) -> str:
 
 def _is_closed(ring: SampleRing) -> bool:
     return ring.is_closed
-
-
-def _window(ring: SampleRing, chunk: Chunk, withheld: int) -> Window:
-    last = chunk.first_index + len(chunk.samples) - 1
-    return Window(
-        chunk.first_index,
-        chunk.samples,
-        ring.time_of(last),
-        ring.period_at(last),
-        chunk.skipped + withheld,
-        chunk.snapshot,
-    )
 
 
 def _process(detector: Detector, window: Window, counters: DetectorCounters) -> Sequence[Diagnosis]:

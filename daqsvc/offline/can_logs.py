@@ -19,9 +19,10 @@ from daqsvc.recording.rate import MOST_STRETCHED
 from daqsvc.recording.recording import Recording
 from drivers.base import StreamSpec
 from drivers.can.adapter import batch_of
-from drivers.can.batches import DecodedBatch, FrameDemultiplexer
+from drivers.can.batches import FrameDemultiplexer
 from drivers.can.plugin import frame_layout
 from drivers.can.settings import DbcLayout, PlainLayout
+from drivers.frames import DecodedBatch, joined
 from drivers.replay.can_log import CanLog
 from drivers.replay.files import RecordedLogError as LogError
 
@@ -151,16 +152,13 @@ class _Playing:
         for name, count in piece.unknown.items():
             self.unknown[name] = self.unknown.get(name, 0) + count
         newest_ns = 0
-        for frames in piece.frames:
-            first_ns, last_ns = self.spans_ns.get(frames.stream, (int(frames.arrival_ns[0]), 0))
+        for stream, frames in piece.frames.items():
+            first_ns, last_ns = self.spans_ns.get(stream, (int(frames.arrival_ns[0]), 0))
             # Logs of several interfaces may step back a little; an arrival never does.
             arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns, last_ns))
             newest_ns = max(newest_ns, int(arrival_ns[-1]))
-            self.spans_ns[frames.stream] = first_ns, int(arrival_ns[-1])
-            decoded = frames.decoded
-            self.assemblers[frames.stream].accept(
-                decoded.counter, decoded.samples, decoded.intact, arrival_ns
-            )
+            self.spans_ns[stream] = first_ns, int(arrival_ns[-1])
+            self.assemblers[stream].accept(*frames._replace(arrival_ns=arrival_ns))
         if newest_ns:
             for assembler in self.assemblers.values():
                 assembler.tick(newest_ns)
@@ -254,7 +252,10 @@ class _Log:
                 bus = self._choose(channel, {b.name: b.sorter.sort(batch, 0) for b in self._buses})
             part = (bus or self._buses[0]).sorter.sort(batch, 0)
             if bus is not None:
-                found.frames += part.frames
+                for stream, frames in part.frames.items():
+                    known = found.frames.get(stream)
+                    # Two channels may be the same bus.
+                    found.frames[stream] = frames if known is None else joined(known, frames)
                 self.taken = self.taken or bool(part.frames)
             for name, count in part.unknown.items():
                 found.unknown[name] = found.unknown.get(name, 0) + count
@@ -266,7 +267,7 @@ class _Log:
         Raises:
             RecordingError: it may be several.
         """
-        counts = {name: sum(len(f.arrival_ns) for f in part.frames) for name, part in parts.items()}
+        counts = {name: sum(len(f.arrival_ns) for f in part.frames.values()) for name, part in parts.items()}
         fitting = [bus for bus in self._buses if counts[bus.name]]
         named = [
             bus
@@ -287,7 +288,7 @@ class _Log:
 
 
 def _first_ns(piece: DecodedBatch) -> int:
-    return min((int(frames.arrival_ns[0]) for frames in piece.frames), default=0)
+    return min((int(frames.arrival_ns[0]) for frames in piece.frames.values()), default=0)
 
 
 @dataclass(slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import can
 import numpy as np
@@ -22,9 +22,10 @@ from drivers.can.batches import (
 from drivers.can.errors import ALL_CLASSES, BUS_OFF
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from daqsvc.acquisition.clock import Clock
+    from drivers.can.settings import CanBus
 
 LINUX_ERRORS = frozenset({"unixbus"})
 """Interfaces whose error frames mean what Linux's mean; on others only bus-off is alike."""
@@ -87,29 +88,29 @@ class CanAdapter:
         self._bus.shutdown()
 
 
-def open_adapter(options: Mapping[str, Any], clock: Clock) -> CanAdapter:
+def open_adapter(bus: CanBus, clock: Clock) -> CanAdapter:
     """Open an interface of python-can.
 
     Args:
-        options: the bus's settings: ``interface``, ``channel``, ``fd``, ``bitrate``, ``data_bitrate`` and
-            ``options`` (a table handed to python-can as it is).
+        bus: its table in the machine file.
         clock: what arrivals are told in.
 
     Raises:
         Exception: adapters raise what they like.
     """
-    chosen: dict[str, Any] = dict(options.get("options") or {})
-    for key in ("bitrate", "data_bitrate"):
-        if options.get(key) is not None:
-            chosen[key] = options[key]
-    if options["interface"] == "virtual":
-        chosen["protocol"] = can.CanProtocol.CAN_FD if options.get("fd") else can.CanProtocol.CAN_20
+    chosen = dict(bus.options)
+    if bus.bitrate is not None:
+        chosen["bitrate"] = bus.bitrate
+    if bus.data_bitrate is not None:
+        chosen["data_bitrate"] = bus.data_bitrate
+    if bus.interface == "virtual":
+        chosen["protocol"] = can.CanProtocol.CAN_FD if bus.fd else can.CanProtocol.CAN_20
     else:
-        chosen["fd"] = bool(options.get("fd"))
+        chosen["fd"] = bus.fd
     return CanAdapter(
-        can.Bus(channel=options.get("channel"), interface=options["interface"], **chosen),
+        can.Bus(channel=bus.channel, interface=bus.interface, **chosen),
         clock,
-        ALL_CLASSES if options["interface"] in LINUX_ERRORS else BUS_OFF,
+        ALL_CLASSES if bus.interface in LINUX_ERRORS else BUS_OFF,
     )
 
 

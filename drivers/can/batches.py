@@ -6,12 +6,13 @@ three flags that say what kind of frame it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from drivers.can.errors import ErrorCounts
+from drivers.frames import DecodedBatch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.base import StreamSpec
-    from drivers.frames import Decoded, FrameLayout
+    from drivers.frames import FrameLayout
 
 EXTENDED = 0x8000_0000
 REMOTE = 0x4000_0000
@@ -100,43 +101,6 @@ class CanSource(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamFrames:
-    """Decoded frames of one stream, in their order of arrival."""
-
-    stream: str
-    decoded: Decoded
-    arrival_ns: NDArray[np.int64]
-
-
-@dataclass(slots=True)
-class DecodedBatch:
-    """What a batch held.
-
-    Attributes:
-        frames: decoded frames by stream.
-        notes: what to add to which of the bus's counters.
-        unknown: frames by unknown id, in words.
-        wrong_length: frames by stream, and the length of the last of them.
-        errors: what the error frames say.
-        data_frames: frames that carry data, whosever they are.
-        drained_ns: see `CanBatch`.
-    """
-
-    frames: list[StreamFrames] = field(default_factory=list)
-    notes: dict[str, int] = field(default_factory=dict)
-    unknown: dict[str, int] = field(default_factory=dict)
-    wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
-    errors: ErrorCounts | None = None
-    data_frames: int = 0
-    drained_ns: int | None = None
-
-    def note(self, counter: str, count: int = 1) -> None:
-        """Add to a counter of the bus."""
-        if count:
-            self.notes[counter] = self.notes.get(counter, 0) + count
-
-
-@dataclass(frozen=True, slots=True)
 class IdMatch:
     """Which ids a stream's frames have: those that equal ``id`` wherever ``mask`` has a one.
 
@@ -182,33 +146,33 @@ class FrameDemultiplexer:
             batch: frames as they came.
             error_classes: see `CanSource`.
         """
-        found = DecodedBatch(drained_ns=batch.drained_ns)
-        found.note("frames_overrun", batch.overrun)
-        found.note("frames_malformed", batch.malformed)
+        decoded = DecodedBatch(drained_ns=batch.drained_ns)
+        decoded.note("frames_overrun", batch.overrun)
+        decoded.note("frames_malformed", batch.malformed)
         chosen: dict[int, list[NDArray[np.intp]]] = {}
         for frame_id, rows in _by_id(batch.ids):
             if frame_id & ERROR:
-                found.note("frames_error", len(rows))
+                decoded.note("frames_error", len(rows))
                 counts = ErrorCounts.of(batch.ids[rows] & np.uint32(error_classes), batch.data[rows, :8])
-                found.errors = counts if found.errors is None else found.errors.followed_by(counts)
+                decoded.errors = counts if decoded.errors is None else decoded.errors.followed_by(counts)
                 continue
             if frame_id & REMOTE:
-                found.note("frames_remote", len(rows))
+                decoded.note("frames_remote", len(rows))
                 continue
-            found.data_frames += len(rows)
+            decoded.data_frames += len(rows)
             takers = [k for k, match in enumerate(self._matches) if frame_id in match]
             if not takers:
-                found.note("frames_unknown", len(rows))
-                found.unknown[_id_in_words(frame_id)] = len(rows)
+                decoded.note("frames_unknown", len(rows))
+                decoded.unknown[_id_in_words(frame_id)] = len(rows)
             elif pageless := self._on_no_page(takers, batch, rows):
-                found.note("frames_unknown", pageless)
-                found.unknown[f"{_id_in_words(frame_id)}, a page of no stream"] = pageless
+                decoded.note("frames_unknown", pageless)
+                decoded.unknown[f"{_id_in_words(frame_id)}, a page of no stream"] = pageless
             for k in takers:
                 chosen.setdefault(k, []).append(rows)
         for k, groups in chosen.items():
             rows = groups[0] if len(groups) == 1 else np.sort(np.concatenate(groups))
-            self._decode(self._specs[k], batch, rows, found)
-        return found
+            self._decode(self._specs[k], batch, rows, decoded)
+        return decoded
 
     def _on_no_page(self, takers: Sequence[int], batch: CanBatch, rows: NDArray[np.intp]) -> int:
         """How many of the frames no stream has, though they have the streams' id: pages of a multiplexer."""
@@ -222,19 +186,19 @@ class FrameDemultiplexer:
         return len(left)
 
     def _decode(
-        self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], found: DecodedBatch
+        self, spec: StreamSpec[FrameLayout], batch: CanBatch, rows: NDArray[np.intp], decoded: DecodedBatch
     ) -> None:
         lengths = batch.lengths[rows]
         right = lengths == spec.layout.length
         if not right.all():
             wrong = lengths[~right]
-            found.wrong_length[spec.name] = (len(wrong), int(wrong[-1]))
+            decoded.wrong_length[spec.name] = (len(wrong), int(wrong[-1]))
             rows = rows[right]
         if spec.layout.selectors:
             rows = rows[spec.layout.selects(batch.data[rows, : spec.layout.length])]
         if len(rows):
             payloads = batch.data[rows, : spec.layout.length]
-            found.frames.append(StreamFrames(spec.name, spec.layout.decode(payloads), batch.arrival_ns[rows]))
+            decoded.frames[spec.name] = spec.layout.decode(payloads, batch.arrival_ns[rows])
 
 
 def _by_id(ids: NDArray[np.uint32]) -> Iterator[tuple[int, NDArray[np.intp]]]:

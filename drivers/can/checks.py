@@ -327,11 +327,15 @@ def check_dbc_unit(
         if unit == "" or same_unit(unit, wire_unit):
             continue
         factor = factor_between(unit, wire_unit)
-        said = f'the DBC file gives signal "{signal}" in "{unit}", but this sensor takes it as "{wire_unit}"'
+        statement = (
+            f'the DBC file gives signal "{signal}" in "{unit}", but this sensor takes it as "{wire_unit}"'
+        )
         known = unit_of(unit) is not None and unit_of(wire_unit) is not None
         yield Finding(
             (*at, "unit"),
-            said if factor is None else f"{said}: wrong by a factor of {max(factor, 1 / factor):.4g}",
+            statement
+            if factor is None
+            else f"{statement}: wrong by a factor of {max(factor, 1 / factor):.4g}",
             _unit_remedy(sensor, unit, factor),
             fatal=known,
         )

@@ -32,6 +32,7 @@ def layout_from_dbc(
     counts: Counts,
     channels: Mapping[str, Sequence[str]],
     valid_raw: Mapping[str, tuple[float, float]] | None = None,
+    units: Mapping[str, tuple[float, float]] | None = None,
 ) -> FrameLayout:
     """The layout of one message of a DBC file.
 
@@ -45,6 +46,7 @@ def layout_from_dbc(
         counts: what it counts.
         channels: for each channel the signals of its consecutive samples.
         valid_raw: see `FrameLayout`.
+        units: gain and shift from the unit of the signals, by channel; others stay as they are.
 
     Raises:
         LayoutError: the file, the message or a signal is not there, no frame has all of the signals, or
@@ -85,14 +87,15 @@ def layout_from_dbc(
             "its multiplexer; make a stream for each page"
         )
     rows = list(zip(*channels.values(), strict=True))
+    gain, shift = np.array([(units or {}).get(name, (1.0, 0.0)) for name in channels]).reshape(-1, 2).T
     return FrameLayout(
         frame_id=described.frame_id,
         extended=described.is_extended_frame,
         length=described.length,
         channels=tuple(channels),
         fields=tuple(tuple(cells[name] for name in row) for row in rows),
-        scale=np.array([[float(signals[name].scale) for name in row] for row in rows]),
-        offset=np.array([[float(signals[name].offset) for name in row] for row in rows]),
+        scale=np.array([[float(signals[name].scale) for name in row] for row in rows]) * gain,
+        offset=np.array([[float(signals[name].offset) for name in row] for row in rows]) * gain + shift,
         counter=None if counter is None else cells[counter],
         counts=counts,
         any_priority=described.protocol == "j1939",
@@ -205,9 +208,9 @@ def _see_sizes(text: str) -> None:
     Raises:
         ValueError: it would make lists of what has no end.
     """
-    plain = _STRING.sub(lambda found: "\n" * found[0].count("\n"), text)
-    if (found := _ENDLESS.search(plain)) is not None:
-        line = plain.count("\n", 0, found.start()) + 1
+    plain = _STRING.sub(lambda match: "\n" * match[0].count("\n"), text)
+    if (match := _ENDLESS.search(plain)) is not None:
+        line = plain.count("\n", 0, match.start()) + 1
         raise ValueError(f"line {line} has a number of bits, bytes or pages that no message has")
 
 

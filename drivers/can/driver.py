@@ -13,16 +13,18 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import can
 
 from daqsvc.acquisition.link import Link
 from drivers.can.adapter import open_adapter
-from drivers.can.batches import BusOffError, DecodedBatch, FrameDemultiplexer
+from drivers.can.batches import BusOffError, FrameDemultiplexer
 from drivers.can.errors import BUS_OFF_REASON, EXPLAINED, CanCounters, ErrorCounts
 from drivers.can.record import recorder_of
 from drivers.can.socketcan import open_socketcan
+from drivers.frames import DecodedBatch
 from drivers.reconnect import (
     Attempt,
     CannotOpenError,
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
     from drivers.base import BusPort
     from drivers.can.batches import CanBatch, CanSource
     from drivers.can.record import CanRecorder
+    from drivers.can.record_files import Logs
+    from drivers.can.settings import CanBus
 
 
 logger = logging.getLogger(__name__)
@@ -59,7 +63,7 @@ class CanReader(threading.Thread):
         link_name: what a person calls the bus.
         source: the open bus.
         sorter: what knows the streams.
-        take: called on the event loop with each batch, one in a turn of it.
+        accept: called on the event loop with each batch, one in a turn of it.
         loop: the event loop.
         record: called with each batch as it came, on this thread; must not wait.
     """
@@ -69,7 +73,7 @@ class CanReader(threading.Thread):
         link_name: str,
         source: CanSource,
         sorter: FrameDemultiplexer,
-        take: Callable[[DecodedBatch], None],
+        accept: Callable[[DecodedBatch], None],
         loop: asyncio.AbstractEventLoop,
         record: Callable[[CanBatch], None] | None = None,
     ) -> None:
@@ -78,7 +82,7 @@ class CanReader(threading.Thread):
         self._link_name = link_name
         self._source = source
         self._sorter = sorter
-        self._take = take
+        self._accept = accept
         self._hand = HandOver(loop)
         self._record = record
         self._stopping = threading.Event()
@@ -96,7 +100,7 @@ class CanReader(threading.Thread):
             reason = words(error)
         except BaseException as error:
             logger.exception("the reader of %s failed", self._link_name)
-            self._post(self._take, DecodedBatch(notes={"reader_failures": 1}))
+            self._post(self._accept, DecodedBatch(notes=Counter(reader_failures=1)))
             reason = f"its reader failed: {words(error)}"
         self._post(self._end, reason)
 
@@ -120,29 +124,29 @@ class CanReader(threading.Thread):
             Exception: whatever the adapter raises when it is lost.
         """
         try:
-            batch = self._source.read(POLL_S)
+            raw = self._source.read(POLL_S)
         except BusOffError:
-            self._hand_over(DecodedBatch(notes={"bus_off": 1}))
+            self._hand_over(DecodedBatch(notes=Counter(bus_off=1)))
             raise
         if self._record is not None:
-            self._record(batch)
-        found = self._sorter.sort(batch, self._source.error_classes)
-        self._hand_over(found)
-        if found.errors is not None and found.errors.bus_off and not self._source.recovers:
+            self._record(raw)
+        batch = self._sorter.sort(raw, self._source.error_classes)
+        self._hand_over(batch)
+        if batch.errors is not None and batch.errors.bus_off and not self._source.recovers:
             raise BusOffError
-        if len(batch.ids) and batch.drained_ns is not None:
+        if len(raw.ids) and raw.drained_ns is not None:
             # Let a few frames gather: one turn of the event loop then serves them all.
             self._stopping.wait(self._source.gather_s)
 
-    def _hand_over(self, found: DecodedBatch) -> None:
+    def _hand_over(self, batch: DecodedBatch) -> None:
         while not self._under_way.acquire(timeout=POLL_S):
             if self._stopping.is_set():
                 return
-        self._post(self._taken, found)
+        self._post(self._accepted, batch)
 
-    def _taken(self, found: DecodedBatch) -> None:
+    def _accepted(self, batch: DecodedBatch) -> None:
         self._under_way.release()
-        self._take(found)
+        self._accept(batch)
 
     def _end(self, reason: str) -> None:
         if not self.ended.done():
@@ -169,26 +173,31 @@ REMEMBERED_IDS = 64
 class CanDriver:
     """Reads one CAN bus.
 
-    Options of the bus: ``interface`` and ``channel`` as python-can names them, ``fd``, and optionally
-    ``bitrate``, ``data_bitrate``, ``options`` (a table handed to python-can as it is) and ``record`` (see
-    `drivers.can.record`). With interface ``socketcan`` python-can is left out; see `drivers.can.socketcan`
-    for what can be set there.
+    With interface ``socketcan`` python-can is left out; see `drivers.can.socketcan`.
 
     Args:
-        port: settings, streams, clock and where to deliver.
+        bus: its table in the machine file.
+        port: streams, clock and where to deliver.
         open_source: opens the bus; called on a thread.
+        logs: where the bus is recorded, if not where its table says.
     """
 
     def __init__(
-        self, port: BusPort, open_source: Callable[[BusPort, FrameDemultiplexer], CanSource] | None = None
+        self,
+        bus: CanBus,
+        port: BusPort,
+        open_source: Callable[[BusPort, FrameDemultiplexer], CanSource] | None = None,
+        logs: Logs | None = None,
     ) -> None:
         self.name = port.name
-        self.link = Link(f"CAN bus {port.name!r} ({port.options['interface']} {port.options.get('channel')})")
+        self.link = Link(f"CAN bus {port.name!r} ({bus.interface} {bus.channel})")
         self.counters = CanCounters()
+        self._bus = bus
         self._port = port
+        self._logs = logs
         self._sorter = FrameDemultiplexer(port.streams)
         self._assemblers = {s.name: assembler_of(s, port) for s in port.streams}
-        self._open_source = open_source or _open_source
+        self._open_source = open_source or self._open_bus
         self._said: set[str] = set()
         self._is_fresh = False
         """Whether nothing has come since the bus was opened: what its controller was then, nobody knows."""
@@ -201,7 +210,7 @@ class CanDriver:
 
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
-        self._recorder = recorder_of(self._port, self.link.name, self.counters)
+        self._recorder = recorder_of(self._bus, self._port, self.link.name, self.counters, self._logs)
         if self._recorder is not None:
             self._recorder.start()
         try:
@@ -234,15 +243,21 @@ class CanDriver:
             self.counters.open_failures += 1
             raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
 
+    def _open_bus(self, port: BusPort, sorter: FrameDemultiplexer) -> CanSource:
+        if self._bus.interface != "socketcan":
+            return open_adapter(self._bus, port.clock)
+        recorded = self._recorder is not None
+        return open_socketcan(self._bus, sorter.matches, port.clock, recorded=recorded)
+
     async def _receive(self, source: CanSource) -> str:
         """Read until the link fails; returns why."""
         reader = CanReader(
             self.link.name,
             source,
             self._sorter,
-            self.take,
+            self.accept,
             asyncio.get_running_loop(),
-            None if self._recorder is None else self._recorder.take,
+            None if self._recorder is None else self._recorder.record,
         )
         reader.start()
         try:
@@ -254,44 +269,42 @@ class CanDriver:
             finally:
                 reader.finish()
 
-    def take(self, found: DecodedBatch) -> None:
+    def accept(self, batch: DecodedBatch) -> None:
         """Take in what the reader thread has sorted and decoded; runs on the event loop."""
-        for name, count in found.notes.items():
+        for name, count in batch.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
-        if "frames_overrun" in found.notes:
+        if "frames_overrun" in batch.notes:
             self._say_once(
                 "overrun",
                 "%s: the kernel dropped frames because its receive buffer was full; they are counted from "
                 "now on. Raise receive_buffer_bytes of the bus, or relieve the machine",
                 self.link.name,
             )
-        if found.errors is not None:
-            self._take_errors(found.errors)
-        elif found.data_frames and (
+        if batch.errors is not None:
+            self._count_errors(batch.errors)
+        elif batch.data_frames and (
             self.counters.controller_state == "bus-off"
             or (self._is_fresh and self.counters.controller_state != "error-active")
         ):
             # Whoever receives is on the bus again, even if the frame that said so was missed.
-            self._take_errors(ErrorCounts(state="error-active"))
-        self._is_fresh &= not (found.errors or found.data_frames)
-        for name, count in found.unknown.items():
-            self._take_unknown(name, count)
-        for stream, (count, length) in found.wrong_length.items():
-            self._take_wrong_length(stream, count, length)
-        for frames in found.frames:
-            decoded = frames.decoded
-            assembler = self._assemblers[frames.stream]
-            with sparing_others(self.link, frames.stream, self.counters):
-                assembler.accept(decoded.counter, decoded.samples, decoded.intact, frames.arrival_ns)
-        if found.drained_ns is not None:
+            self._count_errors(ErrorCounts(state="error-active"))
+        self._is_fresh &= not (batch.errors or batch.data_frames)
+        for name, count in batch.unknown.items():
+            self._count_unknown(name, count)
+        for stream, (count, length) in batch.wrong_length.items():
+            self._count_wrong_length(stream, count, length)
+        for stream, frames in batch.frames.items():
+            with sparing_others(self.link, stream, self.counters):
+                self._assemblers[stream].accept(*frames)
+        if batch.drained_ns is not None:
             for name, assembler in self._assemblers.items():
                 with sparing_others(self.link, name, self.counters):
-                    assembler.tick(found.drained_ns)
+                    assembler.tick(batch.drained_ns)
 
-    def _take_errors(self, errors: ErrorCounts) -> None:
+    def _count_errors(self, errors: ErrorCounts) -> None:
         """Count what error frames said; the link goes down with the controller and comes back with it."""
         before = self.counters.controller_state
-        self.counters.take(errors)
+        self.counters.add(errors)
         state = self.counters.controller_state
         if errors.counts.get("rx_overflows"):
             self._say_once(
@@ -308,15 +321,14 @@ class CanDriver:
 
     @property
     def _bus_off_reason(self) -> str:
-        if self._port.options["interface"] != "socketcan":
+        if self._bus.interface != "socketcan":
             return BUS_OFF_REASON
-        channel = self._port.options["channel"]
         return (
-            f"{BUS_OFF_REASON}; unless {channel} has restart-ms set, it comes back by "
-            f"`ip link set {channel} type can restart`"
+            f"{BUS_OFF_REASON}; unless {self._bus.channel} has restart-ms set, it comes back by "
+            f"`ip link set {self._bus.channel} type can restart`"
         )
 
-    def _take_unknown(self, name: str, count: int) -> None:
+    def _count_unknown(self, name: str, count: int) -> None:
         ids = self.counters.unknown_ids
         if name in ids or len(ids) < REMEMBERED_IDS:
             ids[name] = ids.get(name, 0) + count
@@ -328,7 +340,7 @@ class CanDriver:
             name,
         )
 
-    def _take_wrong_length(self, stream: str, count: int, length: int) -> None:
+    def _count_wrong_length(self, stream: str, count: int, length: int) -> None:
         assembler = self._assemblers[stream]
         assembler.counters.frames_wrong_length += count
         spec = next(s for s in self._port.streams if s.name == stream)
@@ -346,9 +358,3 @@ class CanDriver:
         if key not in self._said:
             self._said.add(key)
             logger.warning(message, *arguments)
-
-
-def _open_source(port: BusPort, sorter: FrameDemultiplexer) -> CanSource:
-    if port.options["interface"] == "socketcan":
-        return open_socketcan(port.options, sorter.matches, port.clock)
-    return open_adapter(port.options, port.clock)

@@ -109,14 +109,14 @@ class CanCounters(BusCounters):
         """See `drivers.base.BusCounters`: frames that the kernel dropped, and overflows before it."""
         return self.frames_overrun + self.rx_overflows
 
-    def take(self, found: ErrorCounts) -> None:
+    def add(self, errors: ErrorCounts) -> None:
         """Add what error frames said."""
-        for name, count in found.counts.items():
+        for name, count in errors.counts.items():
             setattr(self, name, getattr(self, name) + count)
-        if found.state is not None:
-            self.controller_state = found.state
-        if found.error_counters is not None:
-            self.tx_errors, self.rx_errors = found.error_counters
+        if errors.state is not None:
+            self.controller_state = errors.state
+        if errors.error_counters is not None:
+            self.tx_errors, self.rx_errors = errors.error_counters
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +152,8 @@ class ErrorCounts:
         counts["tx_overflows"] = int(((status & _TX_OVERFLOW) != 0).sum())
         counts["error_warnings"] = int(((status & _WARNING) != 0).sum())
         counts["error_passives"] = int(((status & _PASSIVE) != 0).sum())
-        told = np.flatnonzero(classes & ERROR_COUNTERS)
-        last = None if not len(told) else (int(data[told[-1], 6]), int(data[told[-1], 7]))
+        counting = np.flatnonzero(classes & ERROR_COUNTERS)
+        last = None if not len(counting) else (int(data[counting[-1], 6]), int(data[counting[-1], 7]))
         return cls({name: n for name, n in counts.items() if n}, _state(classes, status), last)
 
     def followed_by(self, later: ErrorCounts) -> ErrorCounts:

@@ -25,7 +25,7 @@ from drivers.can.checks import (
 )
 from drivers.can.dbc import check_dbc, layout_from_dbc
 from drivers.can.settings import CanBus, DbcLayout, PlainLayout
-from drivers.plugin import DriverPlugin, packed_layout, units_of
+from drivers.plugin import DriverPlugin, in_units, packed_layout, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -90,19 +90,18 @@ class CanPlugin(DriverPlugin[CanBus]):
         """See `DriverPlugin.stream_layout`."""
         return frame_layout(machine, stream)
 
-    def options(self, machine: MachineFile, bus: CanBus) -> dict[str, Any]:
-        """See `DriverPlugin.options`."""
-        options = bus.model_dump()
-        if bus.record is not None:
-            options["record"]["folder"] = machine.resolve(bus.record.folder)
-        return options
+    def absolute(self, machine: MachineFile, bus: CanBus) -> CanBus:
+        """See `DriverPlugin.absolute`."""
+        if bus.record is None:
+            return bus
+        record = bus.record.model_copy(update={"folder": machine.resolve(bus.record.folder)})
+        return bus.model_copy(update={"record": record})
 
     def build(self, bus: CanBus, port: BusPort) -> Driver:
         """See `DriverPlugin.build`."""
         from drivers.can.driver import CanDriver  # noqa: PLC0415 - brings python-can
 
-        del bus
-        return CanDriver(port)
+        return CanDriver(bus, port)
 
 
 def bus_words(machine: MachineFile, name: str) -> str:
@@ -160,24 +159,23 @@ def frame_layout(machine: MachineFile, stream: str) -> FrameLayout:
         AssemblyError: the stream does not come in CAN frames.
         LayoutError: the DBC file does not hold what the machine file says.
     """
-    given = machine.streams[stream].layout
-    if isinstance(given, DbcLayout):
-        layout = layout_from_dbc(
-            machine.resolve(given.dbc),
-            given.message,
-            counter=None if given.counter is None else given.counter.signal,
-            counts="frames" if given.counter is None else given.counter.counts,
-            channels={channel.name: channel.signals for channel in given.channels},
-            valid_raw={c.name: c.valid_raw for c in given.channels if c.valid_raw is not None},
+    layout = machine.streams[stream].layout
+    if isinstance(layout, DbcLayout):
+        return layout_from_dbc(
+            machine.resolve(layout.dbc),
+            layout.message,
+            counter=None if layout.counter is None else layout.counter.signal,
+            counts="frames" if layout.counter is None else layout.counter.counts,
+            channels={channel.name: channel.signals for channel in layout.channels},
+            valid_raw={c.name: c.valid_raw for c in layout.channels if c.valid_raw is not None},
+            units=units_of(machine, stream),
         )
-    elif isinstance(given, PlainLayout):
-        layout = packed_layout(
-            given,
-            given.length,
-            frame_id=given.id,
-            extended=given.extended,
-            any_priority=given.any_priority,
+    if isinstance(layout, PlainLayout):
+        return packed_layout(
+            in_units(layout, machine, stream),
+            layout.length,
+            frame_id=layout.id,
+            extended=layout.extended,
+            any_priority=layout.any_priority,
         )
-    else:
-        raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames")
-    return layout.in_units(units_of(machine, stream))
+    raise AssemblyError(f"{machine.path}: stream {stream!r} does not come in CAN frames")

@@ -10,12 +10,11 @@ import logging
 import queue
 import re
 import threading
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.can.kernel_time import monotonic_minus_wall_ns
-from drivers.can.record_files import LogFile, LogFolder, OneLog, encoder_for
+from drivers.can.record_files import LogFile, LogFolder, encoder_for
 from drivers.reconnect import words
 
 if TYPE_CHECKING:
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from drivers.can.batches import CanBatch
     from drivers.can.errors import CanCounters
     from drivers.can.record_files import Logs
+    from drivers.can.settings import CanBus
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class CanRecorder:
         """Begin; the first file is made when the first frame comes."""
         self._thread.start()
 
-    def take(self, batch: CanBatch) -> None:
+    def record(self, batch: CanBatch) -> None:
         """Record frames; called by the thread that reads the bus, and never waits."""
         frames = len(batch.ids)
         if not frames:
@@ -253,36 +253,34 @@ class CanRecorder:
             logger.info("%s: closing %s: %s; what is in it stays", self._link_name, log.path, words(error))
 
 
-def recorder_of(port: BusPort, link_name: str, counters: CanCounters) -> CanRecorder | None:
+def recorder_of(
+    bus: CanBus, port: BusPort, link_name: str, counters: CanCounters, logs: Logs | None = None
+) -> CanRecorder | None:
     """The recorder of a bus; None if it is not to be recorded.
 
     Args:
-        port: the bus. Its option ``record`` is a table: ``folder``, ``format``, ``file_mb`` and ``keep_mb``
-            (see `LogFolder`), or ``file`` for one file (see `OneLog`).
+        bus: its table in the machine file.
+        port: its name and the clock.
         link_name: what a person calls it.
         counters: where recorded frames are counted.
+        logs: where the recording goes, if not where the table says.
     """
-    wanted: dict[str, Any] | None = port.options.get("record")
-    if not wanted:
-        return None
-    logs: Logs
-    if "file" in wanted:
-        logs = OneLog(Path(wanted["file"]))
-    else:
+    if logs is None:
+        if bus.record is None:
+            return None
         logs = LogFolder(
-            Path(wanted["folder"]),
+            bus.record.folder,
             port.name,
-            wanted["format"],
-            file_bytes=wanted["file_mb"] * _BYTES_PER_MB,
-            keep_bytes=wanted["keep_mb"] * _BYTES_PER_MB,
+            bus.record.format,
+            file_bytes=bus.record.file_mb * _BYTES_PER_MB,
+            keep_bytes=bus.record.keep_mb * _BYTES_PER_MB,
         )
-    if not port.options.get("fd") and port.options["interface"] != "socketcan":
+    if not bus.fd and bus.interface != "socketcan":
         logger.warning(
             "%s: CAN FD frames are neither read nor recorded, and not counted as unrecorded: the machine "
             "file says fd = false. Set fd = true if the bus carries any",
             link_name,
         )
-    channel = str(port.options.get("channel"))
     # Virtual buses are called by a path, which is no word of a log.
-    interface = channel if _INTERFACE.fullmatch(channel) else port.name
+    interface = bus.channel if _INTERFACE.fullmatch(bus.channel) else port.name
     return CanRecorder(link_name, interface, logs, port.clock, counters)

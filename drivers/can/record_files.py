@@ -58,7 +58,7 @@ class LogEncoder(Protocol):
         """Add frames, with their times in microseconds since the epoch, which never step back."""
         ...
 
-    def take(self) -> bytes:
+    def drain(self) -> bytes:
         """What is to be appended to the file for all that was added."""
         ...
 
@@ -109,8 +109,8 @@ class CandumpEncoder:
             seconds, us = divmod(t, 1_000_000)
             self._lines.append(f"({seconds:010d}.{us:06d}) {self._interface} {name}#{payload}\n")
 
-    def take(self) -> bytes:
-        """See `LogEncoder.take`."""
+    def drain(self) -> bytes:
+        """See `LogEncoder.drain`."""
         lines, self._lines = self._lines, []
         return "".join(lines).encode()
 
@@ -141,8 +141,8 @@ class AscEncoder:
         for message in messages_of(frames, t_us):
             self._writer.on_message_received(message)
 
-    def take(self) -> bytes:
-        """See `LogEncoder.take`."""
+    def drain(self) -> bytes:
+        """See `LogEncoder.drain`."""
         text = self._text.getvalue()
         self._text.seek(0)
         self._text.truncate()
@@ -176,8 +176,8 @@ class BlfEncoder(can.BLFWriter):
         for message in messages_of(frames, t_us):
             self.on_message_received(message)
 
-    def take(self) -> bytes:
-        """See `LogEncoder.take`."""
+    def drain(self) -> bytes:
+        """See `LogEncoder.drain`."""
         while self._buffer_size:
             self._flush()
         taken = self._emptied()
@@ -352,7 +352,7 @@ class LogFile:
         Raises:
             OSError: the disk refuses; the file ends where it ended before.
         """
-        piece = self._encoder.take()
+        piece = self._encoder.drain()
         if not piece:
             return
         try:

@@ -23,7 +23,7 @@ import select
 import socket
 import struct
 import sys
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,12 +32,13 @@ from drivers.can.errors import ALL_CLASSES
 from drivers.can.kernel_time import KernelTime
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.clock import Clock
     from drivers.can.batches import IdMatch
+    from drivers.can.settings import CanBus
 
 
 logger = logging.getLogger(__name__)
@@ -159,49 +160,43 @@ class SocketCan:
             return self._buffer.receive(self._socket.fileno())
 
 
-def open_socketcan(options: Mapping[str, Any], matches: Sequence[IdMatch], clock: Clock) -> SocketCan:
+def open_socketcan(
+    bus: CanBus, matches: Sequence[IdMatch], clock: Clock, *, recorded: bool = False
+) -> SocketCan:
     """Open a CAN interface of the Linux kernel.
 
     Args:
-        options: the bus's settings: ``channel``, ``fd``, ``receive_buffer_bytes``, ``filter``, ``record``.
+        bus: its table in the machine file.
         matches: ids that some stream has.
         clock: what arrivals are told in.
+        recorded: whether the bus is recorded: what is read of it then does not depend on what the streams
+            are, unless its table says so.
 
     Raises:
         OSError: the kernel has no CAN, or the interface is absent or down.
     """
-    if options.get("options"):
+    if bus.options:
         raise OSError(
             errno.EINVAL,
-            f"options {sorted(options['options'])} mean nothing to SocketCAN; remove them, "
+            f"options {sorted(bus.options)} mean nothing to SocketCAN; remove them, "
             "set the interface up with `ip link` instead",
         )
     sock = _raw_socket()
     try:
-        # A recording is of the whole bus: what is sent on it does not depend on what the streams are.
-        if options.get("fd") or options.get("record"):
+        if bus.fd or recorded:
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
         sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ALL_CLASSES)
-        if _filtered(options) and len(matches) <= _MOST_FILTERS:
+        filtered = not recorded if bus.filter is None else bus.filter
+        if filtered and len(matches) <= _MOST_FILTERS:
             filters = b"".join(struct.pack("=II", match.id, match.mask) for match in matches)
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
-        source = SocketCan(
-            sock,
-            clock,
-            receive_buffer_bytes=options.get("receive_buffer_bytes") or RECEIVE_BUFFER_BYTES,
-        )
-        sock.bind((options["channel"],))
-        _raise_first_error(sock, options["channel"])
+        source = SocketCan(sock, clock, receive_buffer_bytes=bus.receive_buffer_bytes)
+        sock.bind((bus.channel,))
+        _raise_first_error(sock, bus.channel)
     except BaseException:
         sock.close()
         raise
     return source
-
-
-def _filtered(options: Mapping[str, Any]) -> bool:
-    """Whether only frames of some stream are wanted: a recording is of the whole bus unless it is said."""
-    asked = options.get("filter")
-    return not options.get("record") if asked is None else bool(asked)
 
 
 def dropped_frames(sock: socket.socket) -> int:

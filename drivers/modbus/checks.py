@@ -117,7 +117,7 @@ def _check_room(layout: ModbusLayout, path: KeyPath) -> Iterator[Finding]:
         yield from _check_forbidden(layout, path)
         return
     width = layout.sample_registers
-    room = FIFO_REGISTERS - layout.count.bits // 16 if isinstance(layout, FifoLayout) else MAX_REGISTERS
+    room = FIFO_REGISTERS - layout.count.registers if isinstance(layout, FifoLayout) else MAX_REGISTERS
     if width > room and not isinstance(layout, WaveformLayout):
         yield Finding(
             (*path, "channels"),
@@ -163,7 +163,7 @@ def _check_writes(
 ) -> Iterator[Finding]:
     needed: list[tuple[tuple[str, ...], int, int]] = []
     if isinstance(layout, FifoLayout) and layout.acknowledge is not None:
-        needed.append((("acknowledge",), layout.acknowledge, layout.count.bits // 16))
+        needed.append((("acknowledge",), layout.acknowledge, layout.count.registers))
     if isinstance(layout, WaveformLayout):
         if layout.page is not None:
             needed.append((("page", "select"), layout.page.select, 1))
@@ -199,7 +199,7 @@ def check_channel_overlaps(layout: ModbusLayout, path: KeyPath) -> Iterator[Find
     """No register is a part of two numbers, but where each takes its own bits of it."""
     key = "address" if isinstance(layout, RegistersLayout) else "place"
     channels: Sequence[RegisterChannel | SampleChannel] = layout.channels
-    placed = [(_first(channel), index, channel) for index, channel in enumerate(channels)]
+    placed = [(channel.first, index, channel) for index, channel in enumerate(channels)]
     widest: tuple[int, SampleChannel | RegisterChannel] | None = None
     for first, index, other in sorted(placed, key=lambda item: item[:2]):
         if widest is not None:
@@ -232,10 +232,6 @@ def _clash(
         f"so the next number begins at {end} or later",
         fatal=not whole and (floats or not within),
     )
-
-
-def _first(channel: RegisterChannel | SampleChannel) -> int:
-    return channel.address if isinstance(channel, RegisterChannel) else channel.place
 
 
 def _apart(one: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -316,12 +312,12 @@ def _controls(layout: ModbusLayout, path: KeyPath) -> Iterator[tuple[str, _Block
     if isinstance(layout, RingLayout):
         count = layout.count
         at = (*path, "count", "address")
-        yield layout.table, _Block(count.address, count.bits // 16, "the count of the ring", at)
+        yield layout.table, _Block(count.address, count.registers, "the count of the ring", at)
     elif isinstance(layout, FifoLayout) and layout.acknowledge is not None:
         at = (*path, "acknowledge")
         yield (
             "holding",
-            _Block(layout.acknowledge, layout.count.bits // 16, "where a queue is acknowledged", at),
+            _Block(layout.acknowledge, layout.count.registers, "where a queue is acknowledged", at),
         )
     elif isinstance(layout, WaveformLayout):
         yield layout.table, _Block(layout.block_id, 1, "the id of the block", (*path, "block_id"))

@@ -11,9 +11,8 @@ import contextlib
 import logging
 import socket
 import termios
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU
@@ -25,7 +24,6 @@ from pymodbus.pdu.register_message import (
 )
 from pymodbus.transport import CommParams, CommType, ModbusProtocol
 
-from daqsvc.acquisition.clock import NS_PER_S
 from drivers.modbus.replies import (
     FAULTY,
     READ_HOLDING,
@@ -40,6 +38,7 @@ from drivers.modbus.replies import (
     judge_tcp,
     register_bytes,
 )
+from drivers.modbus.settings import ModbusRtuBus, ModbusTcpBus
 from drivers.tty import why_not_open
 
 if TYPE_CHECKING:
@@ -48,56 +47,17 @@ if TYPE_CHECKING:
     from pymodbus.pdu import ModbusPDU
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.tty import Parity
+    from drivers.modbus.settings import ModbusBus
 
 
 logging.getLogger("pymodbus.logging").setLevel(
     logging.CRITICAL
 )  # every fault is counted, and told once, here
 
-BITS_PER_CHARACTER = 11
-"""Start, eight data, parity and stop bits, or a second stop bit without parity."""
-
 LEAST_CONNECT_S = 1.0
+MS_PER_S = 1000.0
 _BUFFER_BYTES = 4096
 _LAST_TRANSACTION = 0xFFFF
-
-
-@dataclass(frozen=True, slots=True)
-class LineOptions:
-    """How to open a line, and how long to wait on it.
-
-    Attributes:
-        transport: Modbus TCP, or RTU on a serial port.
-        host: of a TCP server.
-        tcp_port: of a TCP server.
-        serial_port: device file of a serial port.
-        baud: bit/s of a serial port.
-        parity: of a serial port.
-        stop_bits: of a serial port.
-        timeout_ns: how long a unit may take to answer.
-    """
-
-    transport: Literal["tcp", "rtu"]
-    host: str = ""
-    tcp_port: int = 502
-    serial_port: str = ""
-    baud: int = 19_200
-    parity: Parity = "even"
-    stop_bits: Literal[1, 2] = 1
-    timeout_ns: int = NS_PER_S // 2
-
-    @property
-    def where(self) -> str:
-        """What a person calls the other end."""
-        return f"{self.host}:{self.tcp_port}" if self.transport == "tcp" else self.serial_port
-
-    @property
-    def gap_ns(self) -> int:
-        """Silence between serial frames: t3.5, at least 1.75 ms (Modbus over serial line 1.02, 2.5.1.1)."""
-        if self.transport == "tcp":
-            return 0
-        return max(round(3.5 * BITS_PER_CHARACTER * NS_PER_S / self.baud), 1_750_000)
 
 
 class ModbusRequest(NamedTuple):
@@ -121,7 +81,7 @@ class ModbusWire(ModbusProtocol):
     without counting them, and take a turn of the event loop more for each request.
 
     Args:
-        options: what to open.
+        bus: its table in the machine file.
         clock: stamps when bytes last arrived.
         counters: where faults are counted.
 
@@ -130,13 +90,13 @@ class ModbusWire(ModbusProtocol):
         why_lost: why there is no connection, if there is none.
     """
 
-    def __init__(self, options: LineOptions, clock: Clock, counters: ModbusCounters) -> None:
-        super().__init__(_transport_of(options), is_server=False)
+    def __init__(self, bus: ModbusBus, clock: Clock, counters: ModbusCounters) -> None:
+        super().__init__(_transport_of(bus), is_server=False)
         self.last_byte_ns = 0
-        self.why_lost = f"{options.where} is closed"
-        self._options = options
-        self._serial = options.transport == "rtu"
-        self._timeout_s = options.timeout_ns / NS_PER_S
+        self.why_lost = f"{bus.where} is closed"
+        self._bus = bus
+        self._serial = isinstance(bus, ModbusRtuBus)
+        self._timeout_s = bus.timeout_ms / MS_PER_S
         self._framer = (FramerRTU if self._serial else FramerSocket)(DecodePDU(False))
         self._clock = clock
         self._counters = counters
@@ -172,7 +132,7 @@ class ModbusWire(ModbusProtocol):
             NoReplyError: no sound reply came in time.
         """
         if self._waits:
-            raise RuntimeError(f"{self._options.where} is asked twice at once; wait for the first reply")
+            raise RuntimeError(f"{self._bus.where} is asked twice at once; wait for the first reply")
         if not self._serial:
             self._transaction = self._transaction % _LAST_TRANSACTION + 1
         unit, pdu, data_bytes = request
@@ -209,7 +169,7 @@ class ModbusWire(ModbusProtocol):
 
     def callback_disconnected(self, exc: Exception | None) -> None:
         """Let nobody wait for a reply that cannot come any more."""
-        self.why_lost = f"{self._options.where} has closed the connection" + (f" ({exc})" if exc else "")
+        self.why_lost = f"{self._bus.where} has closed the connection" + (f" ({exc})" if exc else "")
         self._fail(LineLostError(self.why_lost))
 
     def callback_connected(self) -> None:
@@ -221,13 +181,13 @@ class ModbusWire(ModbusProtocol):
 
     def callback_new_connection(self) -> ModbusProtocol:
         """Never called: this end connects, and does not listen."""
-        raise RuntimeError(f"{self._options.where} is a client's end and accepts no connection")
+        raise RuntimeError(f"{self._bus.where} is a client's end and accepts no connection")
 
     def _why_not_open(self, error: Exception, patience_s: float) -> str:
-        if self._serial:
-            return why_not_open(error, self._options.serial_port, "serial_port")
+        if isinstance(self._bus, ModbusRtuBus):
+            return why_not_open(error, self._bus.serial_port, "serial_port")
         if isinstance(error, socket.gaierror):
-            return f"no address of {self._options.host!r} is known ({error.strerror}); correct host"
+            return f"no address of {self._bus.host!r} is known ({error.strerror}); correct host"
         if isinstance(error, ConnectionRefusedError):
             return "nobody listens there; start the server, or correct host and tcp_port"
         if isinstance(error, TimeoutError):
@@ -266,10 +226,10 @@ class ModbusWire(ModbusProtocol):
                 self._reply.set_result(verdict.pdu)
         elif verdict.fault == "wrong_protocol":
             # Where the next frame begins is not known any more.
-            where = self._options.where
+            where = self._bus.where
             self._lose(f"{where} does not speak Modbus TCP; compare host and tcp_port with the device's")
         elif self._expected is not None and verdict.fault is not None:
-            who = f"unit {self._expected.unit} at {self._options.where}"
+            who = f"unit {self._expected.unit} at {self._bus.where}"
             self._fail(
                 NoReplyError(
                     f"{who} answers with {FAULTY[verdict.fault]}; compare its register map with the layout"
@@ -303,7 +263,7 @@ class ModbusWire(ModbusProtocol):
         if self._expected is None:
             return
         self._counters.timeouts += 1
-        unit, where = self._expected.unit, self._options.where
+        unit, where = self._expected.unit, self._bus.where
         if self._serial or not self.recv_buffer:
             self._fail(
                 NoReplyError(f"unit {unit} at {where} has not answered within {1e3 * self._timeout_s:g} ms")
@@ -328,18 +288,18 @@ class ModbusWire(ModbusProtocol):
             self._reply.set_exception(error)
 
 
-def _transport_of(options: LineOptions) -> CommParams:
+def _transport_of(bus: ModbusBus) -> CommParams:
     """What pymodbus is to open; it neither tries again nor keeps time."""
-    if options.transport == "tcp":
-        return CommParams(options.where, CommType.TCP, host=options.host, port=options.tcp_port)
+    if isinstance(bus, ModbusTcpBus):
+        return CommParams(bus.where, CommType.TCP, host=bus.host, port=bus.tcp_port)
     return CommParams(
-        options.where,
+        bus.where,
         CommType.SERIAL,
-        host=options.serial_port,
-        baudrate=options.baud,
+        host=bus.serial_port,
+        baudrate=bus.baud,
         bytesize=8,
-        parity=options.parity[0].upper(),
-        stopbits=options.stop_bits,
+        parity=bus.parity[0].upper(),
+        stopbits=bus.stop_bits,
     )
 
 
@@ -360,13 +320,13 @@ class ModbusClient:
     """One connection, one request at a time. Connect again with a new client.
 
     Args:
-        options: what to open.
+        bus: its table in the machine file.
         clock: stamps when bytes last arrived.
         counters: where faults are counted.
     """
 
-    def __init__(self, options: LineOptions, clock: Clock, counters: ModbusCounters) -> None:
-        self._wire = ModbusWire(options, clock, counters)
+    def __init__(self, bus: ModbusBus, clock: Clock, counters: ModbusCounters) -> None:
+        self._wire = ModbusWire(bus, clock, counters)
         self._counters = counters
 
     @property

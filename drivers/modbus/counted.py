@@ -13,8 +13,9 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding
 from daqsvc.acquisition.timebase import TimeBase
-from drivers.modbus.layouts import Fifo, Ring
 from drivers.modbus.reading import PollingReader
+from drivers.modbus.registers import RegisterRecord
+from drivers.modbus.settings import FifoLayout, RingLayout
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,7 +43,7 @@ LEAST_SLACK = 16
 SURE = 4
 """Looks in a row by which a count is believed that neither its past nor the clock explains."""
 
-CountedT = TypeVar("CountedT", Fifo, Ring)
+CountedT = TypeVar("CountedT", FifoLayout, RingLayout)
 
 
 class SampleClock:
@@ -83,14 +84,14 @@ class CountedRows:
     def __init__(self, spec: StreamSpec[CountedT], port: BusPort) -> None:
         self.counters = StreamCounters()
         self._name = spec.name
-        self._record = spec.layout.record
+        self._record = RegisterRecord.of(spec.layout)
         self._deliver = port.deliver
         self._time = TimeBase(
             spec.rate_hz, spec.layout.count.bits, samples_per_frame=1, counts_per_frame=1, reorder_window_ns=0
         )
         self._next: int | None = None
         self._standing = StreamStanding(spec.name, port.tell)
-        looks_ns = max(round(NS_PER_S / spec.rate_hz), spec.layout.poll_ns)
+        looks_ns = max(round(NS_PER_S / spec.rate_hz), spec.layout.poll_ns(spec.rate_hz))
         self._still_ns = max(STANDSTILL_NS, STILL_PERIODS * looks_ns)
         self._still = ""
         self._count: int | None = None
@@ -123,7 +124,7 @@ class CountedRows:
 
     def _stand(self, now_ns: int) -> None:
         doubt = self._still or self._time.rate_doubt
-        self._standing.take(doubt, now_ns, known=self._time.rate_known)
+        self._standing.update(doubt, now_ns, known=self._time.rate_known)
 
     def hand_on(self, first: int, rows: bytes, seen_ns: int, *, restarted: bool) -> None:
         """Make a block of consecutive samples.
@@ -179,6 +180,9 @@ class CountedReader(PollingReader, Generic[CountedT]):
         super().__init__([spec.name], port.clock)
         self._name = spec.name
         self._layout: CountedT = spec.layout
+        self._poll_ns = spec.layout.poll_ns(spec.rate_hz)
+        self._sample_bytes = 2 * spec.layout.sample_registers
+        self._per_read = spec.layout.samples_per_read
         self._modulus = spec.layout.count.modulus
         self._sample_clock = SampleClock(spec.rate_hz)
         self._rows = CountedRows(spec, port)
@@ -197,7 +201,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
         """See `Reader.flush`."""
 
     async def _pause_after_failure(self) -> None:
-        await self._clock.sleep_ns(self._layout.poll_ns)
+        await self._clock.sleep_ns(self._poll_ns)
 
     def _begin_again(self, index: int) -> None:
         """Go on at an index that is estimated from the clock, since the count tells it no more."""
@@ -215,7 +219,7 @@ class CountedReader(PollingReader, Generic[CountedT]):
     def _hand_on(self, rows: bytes, seen_ns: int) -> None:
         """Hand on the next samples."""
         assert self._next is not None  # noqa: S101 - there is a next sample once one has been placed
-        taken = len(rows) // (2 * self._layout.record.registers)
+        taken = len(rows) // self._sample_bytes
         self._rows.hand_on(self._index, rows, seen_ns, restarted=self._restarted)
         self._restarted = False
         self._skip(taken)

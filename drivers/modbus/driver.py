@@ -9,18 +9,16 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import defaultdict
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Link
-from drivers.modbus.client import LineOptions, ModbusClient
+from drivers.modbus.client import ModbusClient
 from drivers.modbus.fifo import FifoReader
-from drivers.modbus.layouts import Fifo, Ring, TrendLayout, shared_runs
-from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByEnquiry, WritableRun
-from drivers.modbus.registers import RegisterRun
+from drivers.modbus.line import ModbusLine, RetryPolicy, SparingByEnquiry
+from drivers.modbus.registers import shared_runs
 from drivers.modbus.replies import LineLostError, ModbusCounters
 from drivers.modbus.ring import DeviceRingReader
+from drivers.modbus.settings import FifoLayout, ModbusRtuBus, ModbusTcpBus, RegistersLayout, RingLayout
 from drivers.modbus.trend import TrendReader
 from drivers.modbus.waveform import WaveformReader
 from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
@@ -33,24 +31,25 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import BusPort, StreamSpec
     from drivers.modbus.reading import Reader
+    from drivers.modbus.settings import ModbusBus
 
 
 logger = logging.getLogger(__name__)
 
 
-def readers_for(port: BusPort, counters: ModbusCounters) -> list[Reader]:
+def readers_for(bus: ModbusBus, port: BusPort, counters: ModbusCounters) -> list[Reader]:
     """A reader for each stream, by the way its device hands out samples; one for all that share requests."""
     readers: list[Reader] = []
     polled: dict[tuple[int, str, float], list[StreamSpec[Any]]] = {}
     windows: dict[int, asyncio.Lock] = defaultdict(asyncio.Lock)
-    checked = port.options.get("transport") == "rtu"  # each frame with its CRC
+    checked = isinstance(bus, ModbusRtuBus)  # each frame with its CRC
     for spec in port.streams:
         layout = spec.layout
-        if isinstance(layout, TrendLayout):
+        if isinstance(layout, RegistersLayout):
             polled.setdefault((layout.unit, layout.table, spec.rate_hz), []).append(spec)
-        elif isinstance(layout, Fifo):
+        elif isinstance(layout, FifoLayout):
             readers.append(FifoReader(spec, port, checked=checked))
-        elif isinstance(layout, Ring):
+        elif isinstance(layout, RingLayout):
             readers.append(DeviceRingReader(spec, port, counters, checked=checked))
         else:
             readers.append(WaveformReader(spec, port, counters, windows[layout.unit]))
@@ -68,30 +67,24 @@ _NS_PER_MS = 1_000_000
 class ModbusDriver:
     """Polls the streams of one Modbus line.
 
-    Options of the bus: ``transport`` (``"tcp"`` or ``"rtu"``); ``host`` and ``tcp_port``, or
-    ``serial_port``, ``baud``, ``parity`` and ``stop_bits``; optionally ``timeout_ms``, ``quiet_ms``,
-    ``demote_after``, ``demotion_s``, and ``writes``: tables of ``unit``, ``address`` and ``count``.
-
-    The layouts of the streams are those of `drivers.modbus.layouts`.
+    The layouts of the streams are those of `drivers.modbus.settings`.
 
     Args:
-        port: settings, streams, clock and where to deliver.
+        bus: its table in the machine file.
+        port: streams, clock and where to deliver.
     """
 
-    def __init__(self, port: BusPort) -> None:
+    def __init__(self, bus: ModbusBus, port: BusPort) -> None:
         self.name = port.name
         self.counters = ModbusCounters()
+        self._bus = bus
         self._port = port
-        self._options = _line_options(port.options)
-        self._patience = _patience(port.options, self._options)
-        self._writable = [
-            WritableRun(entry["unit"], RegisterRun(entry["address"], entry.get("count", 1)))
-            for entry in port.options.get("writes") or ()
-        ]
-        kind = "Modbus TCP" if self._options.transport == "tcp" else "Modbus RTU"
-        self.link = Link(f"{kind} bus {port.name!r} ({self._options.where})")
-        self._characters = CharacterFormat(self.link.name, Character(8, self._options.parity))
-        self._readers = readers_for(port, self.counters)
+        self._patience = RetryPolicy.of(bus)
+        kind = "Modbus TCP" if isinstance(bus, ModbusTcpBus) else "Modbus RTU"
+        self.link = Link(f"{kind} bus {port.name!r} ({bus.where})")
+        parity = "none" if isinstance(bus, ModbusTcpBus) else bus.parity
+        self._characters = CharacterFormat(self.link.name, Character(8, parity))
+        self._readers = readers_for(bus, port, self.counters)
         self._line: ModbusLine | None = None
         self._sparing: SparingByEnquiry = {}
 
@@ -137,9 +130,10 @@ class ModbusDriver:
 
     async def _session(self) -> str:
         """Open the line and read until it is lost; returns why."""
-        character = self._characters.on(self._options.serial_port)
-        options = replace(self._options, parity=character.parity)
-        client = ModbusClient(options, self._port.clock, self.counters)
+        bus = self._bus
+        if isinstance(bus, ModbusRtuBus):
+            bus = bus.model_copy(update={"parity": self._characters.on(bus.serial_port).parity})
+        client = ModbusClient(bus, self._port.clock, self.counters)
         reading: list[asyncio.Task[None]] = []
         try:
             try:
@@ -152,7 +146,7 @@ class ModbusDriver:
                 self.counters,
                 self._patience,
                 units=sorted({spec.layout.unit for spec in self._port.streams}),
-                writable=self._writable,
+                may_write=bus.may_write,
                 heard=self._heard,
                 sparing=self._sparing,
             )
@@ -187,23 +181,3 @@ class ModbusDriver:
     def _heard(self) -> None:
         if self.link.state == "down":
             self.link.up()
-
-
-def _line_options(options: Mapping[str, Any]) -> LineOptions:
-    names = ("transport", "host", "tcp_port", "serial_port", "baud", "parity", "stop_bits")
-    given = {name: options[name] for name in names if options.get(name) is not None}
-    return LineOptions(**given, timeout_ns=round(options.get("timeout_ms", 500.0) * _NS_PER_MS))
-
-
-def _patience(options: Mapping[str, Any], line: LineOptions) -> RetryPolicy:
-    quiet_ms = options.get("quiet_ms")
-    quiet_ns = 0 if line.transport == "tcp" else max(line.timeout_ns, line.gap_ns)
-    if line.transport == "rtu" and quiet_ms is not None:
-        quiet_ns = max(quiet_ns, round(quiet_ms * _NS_PER_MS))
-    return RetryPolicy(
-        quiet_ns=quiet_ns,
-        gap_ns=line.gap_ns,
-        demote_after=options.get("demote_after", 3),
-        demotion_ns=round(options.get("demotion_s", 10.0) * NS_PER_S),
-        timeout_ns=line.timeout_ns,
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.modbus.counted import SURE, CountedReader
-from drivers.modbus.layouts import Fifo
+from drivers.modbus.settings import FifoLayout
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +42,7 @@ class _Emptied(NamedTuple):
     seen_ns: int
 
 
-class FifoReader(CountedReader[Fifo]):
+class FifoReader(CountedReader[FifoLayout]):
     """Empties a queue, and acknowledges what it has taken if the device waits for that.
 
     The count at the head of a reply tells what is missing before it, and what has come before. A count that
@@ -56,7 +56,7 @@ class FifoReader(CountedReader[Fifo]):
         checked: whether a checksum goes with each reply, so that none is damaged unnoticed.
     """
 
-    def __init__(self, spec: StreamSpec[Fifo], port: BusPort, *, checked: bool) -> None:
+    def __init__(self, spec: StreamSpec[FifoLayout], port: BusPort, *, checked: bool) -> None:
         super().__init__(spec, port)
         self._checked = checked
         self._drops = spec.layout.acknowledge is None
@@ -76,16 +76,16 @@ class FifoReader(CountedReader[Fifo]):
         reply = await self._read(line)
         if reply is not None and self._take(reply) and self._layout.acknowledge is not None:
             await self._acknowledge(line, self._layout.acknowledge)
-        if reply is None or reply.taken < self._layout.samples_per_read:
-            await self._clock.sleep_ns(self._layout.poll_ns)
+        if reply is None or reply.taken < self._per_read:
+            await self._clock.sleep_ns(self._poll_ns)
 
     async def _read(self, line: ModbusLine) -> _Reply | None:
         """What the queue hands out; None if that is nothing, or no whole samples."""
         layout = self._layout
         asked_ns = self._clock.monotonic_ns()
         raw = await line.read_fifo(layout.unit, layout.address, f"stream {self._name!r}")
-        head = 2 * layout.count.run.count
-        taken, left_over = divmod(max(len(raw) - head, 0), 2 * layout.record.registers)
+        head = 2 * layout.count.registers
+        taken, left_over = divmod(max(len(raw) - head, 0), self._sample_bytes)
         if left_over or 0 < len(raw) < head:
             self._rows.counters.frames_wrong_length += 1
             return None
@@ -97,8 +97,8 @@ class FifoReader(CountedReader[Fifo]):
 
     async def _acknowledge(self, line: ModbusLine, address: int) -> None:
         """Tell the device how far its queue has been taken."""
-        told = self._layout.count.encode(self._following)
-        words = [int.from_bytes(told[k : k + 2], "big") for k in range(0, len(told), 2)]
+        count_bytes = self._layout.count.encode(self._following)
+        words = [int.from_bytes(count_bytes[k : k + 2], "big") for k in range(0, len(count_bytes), 2)]
         await line.write(self._layout.unit, address, words)
         self._unacknowledged = 0
 
@@ -147,7 +147,7 @@ class FifoReader(CountedReader[Fifo]):
     def _repeated(self, reply: _Reply) -> int:
         """How many samples at the head of a reply have been taken before."""
         behind = (self._following - reply.first) % self._modulus
-        repeatable = 0 if self._drops else max(self._unacknowledged, self._layout.samples_per_read)
+        repeatable = 0 if self._drops else max(self._unacknowledged, self._per_read)
         return min(behind, reply.taken) if behind <= repeatable else 0
 
     def _is_explained(self, reply: _Reply) -> bool:
@@ -213,7 +213,7 @@ class FifoReader(CountedReader[Fifo]):
         The head of a queue moves on as samples are taken out, or as the queue is full and new ones come.
         """
         since_ns = reply.seen_ns - (self._last or reply).asked_ns
-        popped = REPLIES_LOST_AT_ONCE * self._layout.samples_per_read
+        popped = REPLIES_LOST_AT_ONCE * self._per_read
         most = self._sample_clock.most(since_ns) + self._sample_clock.at_once + popped
         ahead = (reply.first - self._following) % self._modulus
         return ahead + int((most - ahead) // self._modulus) * self._modulus if ahead <= most else None
@@ -223,13 +223,13 @@ class FifoReader(CountedReader[Fifo]):
         if repeated < reply.taken:
             new = reply.taken - repeated
             self._check_standstill(reply, new)
-            self._hand_on(reply.rows[repeated * 2 * self._layout.record.registers :], reply.seen_ns)
+            self._hand_on(reply.rows[repeated * self._sample_bytes :], reply.seen_ns)
             self._unacknowledged += 0 if self._drops else new
         self._last = reply
 
     def _check_standstill(self, reply: _Reply, new: int) -> None:
         """See whether the device has counted as long as the clock has run; an emptied queue shows that."""
-        if reply.taken == self._layout.samples_per_read:
+        if reply.taken == self._per_read:
             return
         index = self._index + new
         if self._emptied is not None:

@@ -28,6 +28,7 @@ from drivers.modbus.replies import (
     NoReplyError,
     RequestRefusedError,
 )
+from drivers.modbus.settings import ModbusRtuBus
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -36,11 +37,16 @@ if TYPE_CHECKING:
     from drivers.modbus.client import ModbusClient
     from drivers.modbus.registers import RegisterRun
     from drivers.modbus.replies import ModbusCounters
+    from drivers.modbus.settings import ModbusBus
 
 
 logger = logging.getLogger(__name__)
 
+NS_PER_MS = 1_000_000
 LONGEST_DEMOTION_NS = 60 * NS_PER_S
+
+BITS_PER_CHARACTER = 11
+"""Start, eight data, parity and stop bits, or a second stop bit without parity."""
 
 
 class UnitSetAsideError(NoReplyError):
@@ -65,6 +71,19 @@ class RetryPolicy:
     demote_after: int = 3
     demotion_ns: int = 10 * NS_PER_S
     timeout_ns: int = 0
+
+    @classmethod
+    def of(cls, bus: ModbusBus) -> RetryPolicy:
+        """What the table of a bus asks for."""
+        timeout_ns = round(bus.timeout_ms * NS_PER_MS)
+        quiet_ns = gap_ns = 0
+        if isinstance(bus, ModbusRtuBus):
+            # t3.5, at least 1.75 ms (Modbus over serial line 1.02, 2.5.1.1).
+            gap_ns = max(round(3.5 * BITS_PER_CHARACTER * NS_PER_S / bus.baud), 1_750_000)
+            asked_ns = 0 if bus.quiet_ms is None else round(bus.quiet_ms * NS_PER_MS)
+            quiet_ns = max(timeout_ns, gap_ns, asked_ns)
+        demotion_ns = round(bus.demotion_s * NS_PER_S)
+        return cls(quiet_ns, gap_ns, bus.demote_after, demotion_ns, timeout_ns)
 
     @property
     def hold_ns(self) -> int:
@@ -272,14 +291,6 @@ class WriteRefusedError(PermissionError):
     """The machine file does not allow to write these registers."""
 
 
-@dataclass(frozen=True, slots=True)
-class WritableRun:
-    """Holding registers of a unit that may be written."""
-
-    unit: int
-    run: RegisterRun
-
-
 class RegisterValues(NamedTuple):
     """Registers, and when they were read.
 
@@ -303,7 +314,7 @@ class ModbusLine:
         counters: of the bus.
         patience: see there.
         units: the units that are asked.
-        writable: what may be written; nothing else ever is.
+        may_write: whether registers may be written: unit, first register, how many.
         heard: called when a unit has answered.
         sparing: what has been said of its units, also while it was open before.
     """
@@ -316,7 +327,7 @@ class ModbusLine:
         patience: RetryPolicy,
         *,
         units: Sequence[int],
-        writable: Sequence[WritableRun] = (),
+        may_write: Callable[[int, int, int], bool] = lambda _unit, _address, _count: False,
         heard: Callable[[], None] = lambda: None,
         sparing: SparingByEnquiry | None = None,
     ) -> None:
@@ -327,7 +338,7 @@ class ModbusLine:
         self._patience = patience
         self._sparing: SparingByEnquiry = {} if sparing is None else sparing
         self._units = {unit: UnitSilence(unit, patience, counters, self._sparing) for unit in units}
-        self._writable = writable
+        self._may_write = may_write
         self._heard = heard
         self._lock = asyncio.Lock()
         self._quiet_until_ns = clock.monotonic_ns() + patience.opening_ns
@@ -374,7 +385,7 @@ class ModbusLine:
             WriteRefusedError: the machine file does not allow it; nothing has been sent.
         """
         _check_values(values)
-        if not may_write(self._writable, unit, address, len(values)):
+        if not self._may_write(unit, address, len(values)):
             raise WriteRefusedError(
                 f"registers {address} to {address + len(values) - 1} of unit {unit} must not be written; add "
                 f"{{ unit = {unit}, address = {address}, count = {len(values)} }} to writes of the bus if "
@@ -482,8 +493,3 @@ def _check_values(values: Sequence[int]) -> None:
             raise ValueError(
                 f"value {value!r} to be written; a register holds whole numbers 0 to {MOST_VALUE}"
             )
-
-
-def may_write(writable: Sequence[WritableRun], unit: int, address: int, count: int) -> bool:
-    """Whether one entry of the allow-list holds all these registers."""
-    return any(w.unit == unit and w.run.address <= address and address + count <= w.run.end for w in writable)

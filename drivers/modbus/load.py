@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.settings.section import UnusableValueError
 from drivers.modbus.settings import (
-    FIFO_REGISTERS,
     MAX_REGISTERS,
     FifoLayout,
     ModbusRtuBus,
@@ -132,9 +131,8 @@ def _runs(channels: Sequence[RegisterChannel], max_gap: int, max_count: int) -> 
 
 def _samples(layout: FifoLayout | RingLayout, rate_hz: float) -> Iterable[_Asked]:
     """Counted samples, as many in a reply as it has room for."""
-    count = layout.count.bits // 16
-    room = FIFO_REGISTERS - count if isinstance(layout, FifoLayout) else MAX_REGISTERS
-    at_once = max(room // layout.sample_registers, 1)
+    count = layout.count.registers
+    at_once = max(layout.samples_per_read, 1)
     registers = at_once * layout.sample_registers
     if isinstance(layout, RingLayout):
         # The count is read before and after, once in all the room of the ring at least.

@@ -8,7 +8,7 @@ from daqsvc.settings.buses import percent
 from drivers.modbus.checks import check_line_load, check_modbus, check_writes_and_samples
 from drivers.modbus.load import line_load
 from drivers.modbus.settings import WAYS, ModbusRtuBus, ModbusTcpBus, RegistersLayout
-from drivers.plugin import DriverPlugin
+from drivers.plugin import DriverPlugin, in_units
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import Finding, KeyPath
     from drivers.base import BusPort, Driver
-    from drivers.modbus.layouts import ModbusLayout
     from drivers.modbus.settings import ModbusBus
 
 
@@ -60,15 +59,12 @@ class ModbusPlugin(DriverPlugin["ModbusBus"]):
         load = line_load(machine, name, bus)
         return f"{bus.summary}, load about {percent(load.least, load.usual)} of the line"
 
-    def stream_layout(self, machine: MachineFile, stream: str) -> ModbusLayout:
+    def stream_layout(self, machine: MachineFile, stream: str) -> Layout:
         """See `DriverPlugin.stream_layout`."""
-        from drivers.modbus.build import modbus_layout  # noqa: PLC0415 - only the service needs it
-
-        return modbus_layout(machine, stream)
+        return in_units(machine.streams[stream].layout, machine, stream)
 
     def build(self, bus: ModbusBus, port: BusPort) -> Driver:
         """See `DriverPlugin.build`."""
         from drivers.modbus.driver import ModbusDriver  # noqa: PLC0415 - brings pymodbus
 
-        del bus
-        return ModbusDriver(port)
+        return ModbusDriver(bus, port)

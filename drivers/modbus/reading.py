@@ -68,10 +68,10 @@ class PollingReader(ABC):
             error: what is refused.
             who: gets no sample of it; all streams if left out.
         """
-        if (said := f"{who or self._who}: {error}") not in self._said:
-            self._said.add(said)
+        if (message := f"{who or self._who}: {error}") not in self._said:
+            self._said.add(message)
             remedy = REMEDIES.get(error.code, OTHER_REMEDY)
-            logger.warning("%s, which is counted from now on; %s", said, remedy)
+            logger.warning("%s, which is counted from now on; %s", message, remedy)
 
     @abstractmethod
     async def _look(self, line: ModbusLine) -> None:

@@ -9,26 +9,26 @@ of 16 bits knows only the one of bytes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
 from drivers.frames import LayoutError
+from drivers.modbus.settings import RegisterChannel, RegistersLayout, SampleChannel
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.samples import Samples
+    from drivers.modbus.settings import ModbusLayout, RegisterType
 
-RegisterType: TypeAlias = Literal[
-    "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"
-]
-Order: TypeAlias = Literal["ABCD", "CDAB", "BADC", "DCBA"]
+RegisterNumber: TypeAlias = RegisterChannel | SampleChannel
+"""One quantity in registers: physical = raw * scale + offset."""
 
 _DTYPES: dict[RegisterType, str] = {
     "int16": ">i2",
@@ -69,6 +69,12 @@ class RunLimits:
     max_count: int = 125
     forbidden: tuple[RegisterRun, ...] = ()
 
+    @classmethod
+    def of(cls, layout: RegistersLayout) -> RunLimits:
+        """What the requests for a layout may do."""
+        forbidden = tuple(RegisterRun(first, last - first + 1) for first, last in layout.forbidden)
+        return cls(layout.max_gap, layout.max_count, forbidden)
+
     def both(self, other: RunLimits) -> RunLimits:
         """What these and the other limits allow."""
         return RunLimits(
@@ -81,66 +87,43 @@ class RunLimits:
 ANY_RUN = RunLimits()
 
 
-@dataclass(frozen=True, slots=True)
-class RegisterField:
-    """One quantity in registers: physical = raw * scale + offset.
+def run_of(channel: RegisterNumber) -> RegisterRun:
+    """The registers of a quantity."""
+    return RegisterRun(channel.first, channel.registers)
 
-    Attributes:
-        name: name of the channel.
-        address: its first register, counted from 0 as on the wire.
-        type: what the registers hold.
-        order: how words and bytes are ordered; see the module.
-        bits: lowest bit and number of bits, for a part of an unsigned number; all of it if None.
-        scale: worth of one count.
-        offset: physical value of the raw value 0.
-    """
 
-    name: str
-    address: int
-    type: RegisterType
-    order: Order = "ABCD"
-    bits: tuple[int, int] | None = None
-    scale: float = 1.0
-    offset: float = 0.0
+def dtype_of(channel: RegisterNumber) -> np.dtype[np.generic]:
+    """Type of a number in registers, big-endian."""
+    return np.dtype(_DTYPES[channel.type])
 
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """Type of the number, big-endian."""
-        return np.dtype(_DTYPES[self.type])
 
-    @property
-    def run(self) -> RegisterRun:
-        """Its registers."""
-        return RegisterRun(self.address, self.dtype.itemsize // 2)
+def byte_places(channel: RegisterNumber) -> NDArray[np.int64]:
+    """Places of a number's bytes among those of its registers, highest byte of the number first."""
+    places = np.arange(2 * channel.registers).reshape(-1, 2)
+    if channel.order in {"CDAB", "DCBA"}:
+        places = places[::-1]
+    if channel.order in {"BADC", "DCBA"}:
+        places = places[:, ::-1]
+    return places.reshape(-1)
 
-    @property
-    def byte_places(self) -> NDArray[np.int64]:
-        """Places of its bytes among those of its registers, highest byte of the number first."""
-        places = np.arange(self.dtype.itemsize).reshape(-1, 2)
-        if self.order in {"CDAB", "DCBA"}:
-            places = places[::-1]
-        if self.order in {"BADC", "DCBA"}:
-            places = places[:, ::-1]
-        return places.reshape(-1)
 
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Smallest and greatest raw value."""
-        if self.bits is not None:
-            return 0.0, float(2 ** self.bits[1] - 1)
-        if self.dtype.kind == "f":
-            most = float(np.finfo(self.type).max)
-            return -most, most
-        info = np.iinfo(self.type)
-        # The greatest float that a cast still turns into the integer: 2**63 - 1 itself is not a float.
-        most = float(info.max)
-        return float(info.min), most if int(most) <= info.max else float(np.nextafter(most, 0.0))
+def raw_limits(channel: RegisterNumber) -> tuple[float, float]:
+    """Smallest and greatest raw value."""
+    if channel.bits is not None:
+        return 0.0, float(2 ** channel.bits[1] - 1)
+    if dtype_of(channel).kind == "f":
+        most = float(np.finfo(channel.type).max)
+        return -most, most
+    info = np.iinfo(channel.type)
+    # The greatest float that a cast still turns into the integer: 2**63 - 1 itself is not a float.
+    most = float(info.max)
+    return float(info.min), most if int(most) <= info.max else float(np.nextafter(most, 0.0))
 
 
 class _Group(NamedTuple):
     """Fields of one type, taken out of all replies in one go."""
 
-    fields: list[RegisterField]
+    channels: list[RegisterNumber]
     columns: list[int]
     places: NDArray[np.int64]
     dtype: np.dtype[np.generic]
@@ -151,55 +134,44 @@ class RegisterRecord:
     """Quantities in the registers of a few runs, which are given side by side.
 
     Attributes:
-        fields: the quantities, one a channel.
+        channels: the quantities, one a channel.
         runs: the registers that a row holds, in its order.
 
     Raises:
-        LayoutError: a field is not in the runs as a whole, or its bits are not in its number.
+        LayoutError: a quantity is not in the runs as a whole, or its bits are not in its number.
     """
 
-    fields: tuple[RegisterField, ...]
+    channels: tuple[RegisterNumber, ...]
     runs: tuple[RegisterRun, ...]
 
     def __post_init__(self) -> None:
-        for field in self.fields:
-            self._place(field)
-            if field.bits is None:
+        for channel in self.channels:
+            self._place(channel)
+            if channel.bits is None:
                 continue
-            lowest, width = field.bits
-            if (
-                field.dtype.kind != "u"
-                or lowest < 0
-                or width < 1
-                or lowest + width > 8 * field.dtype.itemsize
-            ):
+            lowest, width = channel.bits
+            unsigned = dtype_of(channel).kind == "u"
+            if not unsigned or lowest < 0 or width < 1 or lowest + width > 16 * channel.registers:
                 raise LayoutError(
-                    f"channel {field.name!r}: bits {lowest} to {lowest + width - 1} are no part of "
-                    f"{field.type}; take bits of an unsigned type that holds them"
+                    f"channel {channel.name!r}: bits {lowest} to {lowest + width - 1} are no part of "
+                    f"{channel.type}; take bits of an unsigned type that holds them"
                 )
 
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the channels."""
-        return tuple(field.name for field in self.fields)
+    @classmethod
+    def of(cls, layout: ModbusLayout) -> RegisterRecord:
+        """What one sample of a layout holds; each of its runs is a request, or part of one.
+
+        Raises:
+            LayoutError: a channel's registers are forbidden, or what must stay together is too long.
+        """
+        if isinstance(layout, RegistersLayout):
+            return cls(layout.channels, plan_runs(map(run_of, layout.channels), RunLimits.of(layout)))
+        return cls(layout.channels, (RegisterRun(0, layout.sample_registers),))
 
     @property
     def registers(self) -> int:
         """Registers in a row."""
         return sum(run.count for run in self.runs)
-
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> RegisterRecord:
-        """The same record with each channel's value ``v`` turned into ``gain * v + shift``.
-
-        Args:
-            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
-        """
-        pairs = [conversion.get(field.name, (1.0, 0.0)) for field in self.fields]
-        turned = tuple(
-            replace(field, scale=field.scale * gain, offset=field.offset * gain + shift)
-            for field, (gain, shift) in zip(self.fields, pairs, strict=True)
-        )
-        return replace(self, fields=turned)
 
     def decode(self, raw: NDArray[np.uint8]) -> Samples:
         """Decode rows of registers.
@@ -210,14 +182,14 @@ class RegisterRecord:
         Returns:
             float32 ``[n, channels]`` in physical units.
         """
-        values = np.empty((len(raw), len(self.fields)), np.float64)
+        values = np.empty((len(raw), len(self.channels)), np.float64)
         with np.errstate(over="ignore", invalid="ignore"):  # a device may send any float, NaN among them
             for group in self._groups:
                 numbers = np.take(raw, group.places, axis=1).view(group.dtype)
-                for k, (field, column) in enumerate(zip(group.fields, group.columns, strict=True)):
+                for k, (channel, column) in enumerate(zip(group.channels, group.columns, strict=True)):
                     number = numbers[:, k]
-                    if field.bits is not None:
-                        lowest, width = field.bits
+                    if channel.bits is not None:
+                        lowest, width = channel.bits
                         wide = number.astype(np.uint64)
                         number = (wide >> np.uint64(lowest)) & np.uint64(2**width - 1)
                     values[:, column] = number
@@ -226,7 +198,7 @@ class RegisterRecord:
     def encode(
         self, samples: NDArray[np.float64] | NDArray[np.float32], *, clip: bool = False
     ) -> NDArray[np.uint8]:
-        """Put samples into registers, as the device would; registers without a field are 0.
+        """Put samples into registers, as the device would; registers without a channel are 0.
 
         Args:
             samples: ``[n, channels]`` in physical units.
@@ -241,65 +213,65 @@ class RegisterRecord:
         rows = np.zeros((len(samples), 2 * self.registers), np.uint8)
         raw = (np.asarray(samples, np.float64) - self._offset) / self._scale
         for group in self._groups:
-            for k, (field, column) in enumerate(zip(group.fields, group.columns, strict=True)):
-                fitting = _fit(field, raw[:, column], clip=clip)
-                # Fields of a few bits share their registers: those of the others stay.
-                places = group.places[k * field.dtype.itemsize :][: field.dtype.itemsize]
-                rows[:, places] |= _bytes_of(field, fitting)
+            for k, (channel, column) in enumerate(zip(group.channels, group.columns, strict=True)):
+                fitting = _fit(channel, raw[:, column], clip=clip)
+                # Numbers of a few bits share their registers: those of the others stay.
+                places = group.places[k * group.dtype.itemsize :][: group.dtype.itemsize]
+                rows[:, places] |= _bytes_of(channel, fitting)
         return rows
 
     @cached_property
     def _scale(self) -> NDArray[np.float64]:
-        return np.array([field.scale for field in self.fields])
+        return np.array([channel.scale for channel in self.channels])
 
     @cached_property
     def _offset(self) -> NDArray[np.float64]:
-        return np.array([field.offset for field in self.fields])
+        return np.array([channel.offset for channel in self.channels])
 
     @cached_property
     def _groups(self) -> list[_Group]:
         groups = []
-        for name in dict.fromkeys(field.type for field in self.fields):
-            columns = [k for k, field in enumerate(self.fields) if field.type == name]
-            fields = [self.fields[k] for k in columns]
-            places = np.concatenate([2 * self._place(field) + field.byte_places for field in fields])
-            groups.append(_Group(fields, columns, places, fields[0].dtype))
+        for name in dict.fromkeys(channel.type for channel in self.channels):
+            columns = [k for k, channel in enumerate(self.channels) if channel.type == name]
+            channels = [self.channels[k] for k in columns]
+            places = np.concatenate([2 * self._place(channel) + byte_places(channel) for channel in channels])
+            groups.append(_Group(channels, columns, places, np.dtype(_DTYPES[name])))
         return groups
 
-    def _place(self, field: RegisterField) -> int:
-        """Where a field's first register lies in a row."""
-        before = 0
+    def _place(self, channel: RegisterNumber) -> int:
+        """Where a channel's first register lies in a row."""
+        before, own = 0, run_of(channel)
         for run in self.runs:
-            if run.address <= field.address and field.run.end <= run.end:
-                return before + field.address - run.address
+            if run.address <= own.address and own.end <= run.end:
+                return before + own.address - run.address
             before += run.count
         raise LayoutError(
-            f"channel {field.name!r}: registers {field.address} to {field.run.end - 1} are not among those "
+            f"channel {channel.name!r}: registers {own.address} to {own.end - 1} are not among those "
             f"that are read ({', '.join(f'{run.address} to {run.end - 1}' for run in self.runs)})"
         )
 
 
-def _fit(field: RegisterField, raw: NDArray[np.float64], *, clip: bool) -> NDArray[np.float64]:
-    low, high = field.limits
-    values = raw if field.dtype.kind == "f" else np.rint(raw)
+def _fit(channel: RegisterNumber, raw: NDArray[np.float64], *, clip: bool) -> NDArray[np.float64]:
+    low, high = raw_limits(channel)
+    values = raw if dtype_of(channel).kind == "f" else np.rint(raw)
     outside = ~((values >= low) & (values <= high))
     if np.isnan(values).any() or (outside.any() and not clip):
-        value = float(raw[int(np.argmax(outside))]) * field.scale + field.offset
-        what = field.type if field.bits is None else f"{field.bits[1]} bits of {field.type}"
-        raise LayoutError(f"channel {field.name!r}: {value:g} does not fit {what}; choose a larger scale")
+        value = float(raw[int(np.argmax(outside))]) * channel.scale + channel.offset
+        what = channel.type if channel.bits is None else f"{channel.bits[1]} bits of {channel.type}"
+        raise LayoutError(f"channel {channel.name!r}: {value:g} does not fit {what}; choose a larger scale")
     return np.clip(values, low, high)
 
 
-def _bytes_of(field: RegisterField, values: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _bytes_of(channel: RegisterNumber, values: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Bytes ``[n, bytes]`` of whole numbers or floats that fit, highest first."""
-    if field.bits is not None:
-        numbers = (values.astype(np.uint64) << np.uint64(field.bits[0])).astype(field.dtype)
+    if channel.bits is not None:
+        numbers = (values.astype(np.uint64) << np.uint64(channel.bits[0])).astype(dtype_of(channel))
     else:
-        numbers = values.astype(field.dtype)
+        numbers = values.astype(dtype_of(channel))
     return np.ascontiguousarray(numbers).view(np.uint8).reshape(len(values), -1)
 
 
-def plan_runs(wanted: Sequence[RegisterRun], limits: RunLimits = ANY_RUN) -> tuple[RegisterRun, ...]:
+def plan_runs(wanted: Iterable[RegisterRun], limits: RunLimits = ANY_RUN) -> tuple[RegisterRun, ...]:
     """Few requests that read every wanted register exactly once.
 
     Neighbours are merged where the limits allow it. What lies together (registers of one number, or of
@@ -354,3 +326,23 @@ def _refuse_forbidden(run: RegisterRun, forbidden: Sequence[RegisterRun]) -> Non
                 f"registers {run.address} to {run.end - 1} are wanted, but {other.address} to "
                 f"{other.end - 1} are forbidden; drop the channel, or allow the registers"
             )
+
+
+def shared_runs(layouts: Sequence[RegistersLayout]) -> tuple[RegisterRun, ...] | None:
+    """The requests that read the registers of several streams of one unit and table together.
+
+    Args:
+        layouts: of the streams; what one of them must not read is not read for the others either.
+
+    Returns:
+        None if that saves no request, or cannot be.
+    """
+    if len(layouts) < 2:
+        return None
+    wanted = [run_of(channel) for layout in layouts for channel in layout.channels]
+    try:
+        runs = plan_runs(wanted, reduce(RunLimits.both, map(RunLimits.of, layouts)))
+    except LayoutError:  # one stream reads what another one must not, or together it is too much at once
+        return None
+    apart = sum(len(RegisterRecord.of(layout).runs) for layout in layouts)
+    return runs if len(runs) < apart else None

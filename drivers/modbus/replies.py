@@ -11,9 +11,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from drivers.base import BusCounters
+from drivers.modbus.settings import FIFO_REGISTERS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+
+    from drivers.modbus.settings import Table
 
 
 Fault: TypeAlias = Literal[
@@ -23,6 +26,8 @@ Fault: TypeAlias = Literal[
 READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
 WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS = 5, 6, 15, 16
 READ_FIFO = 24
+FUNCTIONS: Mapping[Table, int] = {"holding": READ_HOLDING, "input": READ_INPUT}
+"""Which function reads which table."""
 
 EXCEPTIONS = {
     1: "illegal function",
@@ -67,8 +72,6 @@ _MBAP = struct.Struct(">HHHB")
 MBAP_BYTES = _MBAP.size
 MAX_TCP_BYTES = 260
 MAX_RTU_BYTES = 256
-FIFO_REGISTERS = 31
-"""Registers that a FIFO reply can hold (Modbus Application Protocol, 6.18)."""
 
 _EXCEPTION_BIT = 0x80
 _WRITES = (WRITE_COIL, WRITE_REGISTER, WRITE_COILS, WRITE_REGISTERS)
@@ -217,10 +220,10 @@ def _judge_fifo(pdu: bytes) -> Fault | None:
     return _length_fault(stated, 2 + 2 * registers) or _length_fault(len(pdu), 3 + stated)
 
 
-def _length_fault(found: int, wanted: int) -> Fault | None:
-    if found == wanted:
+def _length_fault(actual: int, wanted: int) -> Fault | None:
+    if actual == wanted:
         return None
-    return "truncated" if found < wanted else "oversized"
+    return "truncated" if actual < wanted else "oversized"
 
 
 class LineLostError(Exception):

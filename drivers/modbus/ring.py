@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.modbus.counted import SURE, CountedReader
-from drivers.modbus.layouts import FUNCTIONS, Ring
 from drivers.modbus.registers import RegisterRun
+from drivers.modbus.replies import FUNCTIONS
+from drivers.modbus.settings import RingLayout
 
 if TYPE_CHECKING:
     from drivers.base import BusPort, StreamSpec
@@ -31,7 +32,7 @@ class _Look(NamedTuple):
     seen_ns: int
 
 
-class DeviceRingReader(CountedReader[Ring]):
+class DeviceRingReader(CountedReader[RingLayout]):
     """Follows the write counter of a ring.
 
     What was written between two looks at the counter is read, and the look after that tells whether any of
@@ -44,7 +45,7 @@ class DeviceRingReader(CountedReader[Ring]):
     """
 
     def __init__(
-        self, spec: StreamSpec[Ring], port: BusPort, counters: ModbusCounters, *, checked: bool
+        self, spec: StreamSpec[RingLayout], port: BusPort, counters: ModbusCounters, *, checked: bool
     ) -> None:
         """Begin with the next look.
 
@@ -77,7 +78,7 @@ class DeviceRingReader(CountedReader[Ring]):
             self._counters.counts_doubted += 1
             self._seen = None
         if self._seen is None:
-            await self._clock.sleep_ns(self._layout.poll_ns)
+            await self._clock.sleep_ns(self._poll_ns)
 
     async def _believable(self, line: ModbusLine) -> _Look | None:
         """The next look at the counter; None if another one contradicts it."""
@@ -101,7 +102,7 @@ class DeviceRingReader(CountedReader[Ring]):
         self._place(look)
         assert self._next is not None  # noqa: S101 - `_place` has set it
         layout, start = self._layout, self._next
-        due = min((look.written - start) % self._modulus, REQUESTS_PER_LOOK * layout.samples_per_read)
+        due = min((look.written - start) % self._modulus, REQUESTS_PER_LOOK * self._per_read)
         if not due:
             return True
         rows = b""
@@ -117,16 +118,15 @@ class DeviceRingReader(CountedReader[Ring]):
             self._counters.ring_overruns += 1
             self._skip(overwritten)
         if overwritten < due:
-            sample_bytes = 2 * layout.record.registers
             self._rows.counters.frames_received += due - overwritten
-            self._hand_on(rows[overwritten * sample_bytes :], look.seen_ns)
+            self._hand_on(rows[overwritten * self._sample_bytes :], look.seen_ns)
         unread = (after.written - self._next) % self._modulus
         since_look = (after.written - look.written) % self._modulus
         lately = self._sample_clock.most(after.seen_ns - look.asked_ns)
         if since_look <= lately + self._sample_clock.standstill:
             # Of two looks in order the later one is nearer to the truth, if the first was too low.
             self._known = after, self._index + unread
-        if unread >= layout.samples_per_read:
+        if unread >= self._per_read:
             self._seen = after  # there is more already
         return True
 
@@ -136,7 +136,8 @@ class DeviceRingReader(CountedReader[Ring]):
 
     async def _count(self, line: ModbusLine) -> _Look:
         layout = self._layout
-        reading = await line.poll(layout.unit, FUNCTIONS[layout.table], layout.count.run, self._what)
+        run = RegisterRun(layout.count.address, layout.count.registers)
+        reading = await line.poll(layout.unit, FUNCTIONS[layout.table], run, self._what)
         written = layout.count.decode(reading.registers)
         self._rows.look(written, reading.answered_ns)
         return _Look(written, reading.asked_ns, reading.answered_ns)
@@ -184,11 +185,11 @@ class DeviceRingReader(CountedReader[Ring]):
 
     def _runs(self, start: int, due: int) -> list[RegisterRun]:
         """The requests for ``due`` samples from ``start`` on; the ring may end in between."""
-        width, depth = self._layout.record.registers, self._layout.depth
+        width, depth = self._sample_bytes // 2, self._layout.depth
         runs = []
         while due:
             place = start % depth
-            count = min(due, depth - place, self._layout.samples_per_read)
+            count = min(due, depth - place, self._per_read)
             runs.append(RegisterRun(self._layout.address + place * width, count * width))
             start, due = start + count, due - count
         return runs

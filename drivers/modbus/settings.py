@@ -15,6 +15,11 @@ from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, Wait
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+_NS_PER_MS = 1_000_000
+_POLL_MS = 100.0
+_LOOKS_PER_FILL = 4
+"""How often a store of samples in a device is looked at while it fills once."""
+
 _REGISTER_BYTES = 2
 _SAMPLE_BYTES = 4
 
@@ -100,9 +105,14 @@ class ModbusTcpBus(_ModbusBus):
     tcp_port: Annotated[int, Field(ge=1, le=65_535)] = 502
 
     @property
+    def where(self) -> str:
+        """What a person calls the other end."""
+        return f"{self.host}:{self.tcp_port}"
+
+    @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        return f"Modbus TCP, {self.host}:{self.tcp_port}, time-out {self.timeout_ms:g} ms"
+        return f"Modbus TCP, {self.where}, time-out {self.timeout_ms:g} ms"
 
 
 class ModbusRtuBus(_ModbusBus):
@@ -119,6 +129,11 @@ class ModbusRtuBus(_ModbusBus):
         default=None,
         description="silence after a request without reply, at least timeout_ms; that longer after opening",
     )
+
+    @property
+    def where(self) -> str:
+        """What a person calls the other end."""
+        return self.serial_port
 
     @property
     def summary(self) -> str:
@@ -157,6 +172,11 @@ class RegisterChannel(_Quantity):
 
     address: Annotated[Address, Field(description="its first register, from 0", examples=[0])]
 
+    @property
+    def first(self) -> int:
+        """Its first register."""
+        return self.address
+
 
 class SampleChannel(_Quantity):
     """One quantity in a sample of several registers."""
@@ -164,6 +184,11 @@ class SampleChannel(_Quantity):
     place: Annotated[int, Field(ge=0, lt=MAX_REGISTERS)] = Field(
         description="its first register within a sample, from 0", examples=[0]
     )
+
+    @property
+    def first(self) -> int:
+        """Its first register within a sample."""
+        return self.place
 
 
 def _range(channels: Sequence[_Quantity], name: str) -> WireRange | None:
@@ -210,6 +235,17 @@ class _Sampled(_ModbusLayout):
     def sample_registers(self) -> int:
         """Registers of one sample of every channel."""
         return max(channel.place + channel.registers for channel in self.channels)
+
+    @property
+    def room(self) -> int:
+        """Samples after which the device, or a reply, can hold no more."""
+        raise NotImplementedError
+
+    def poll_ns(self, rate_hz: float) -> int:
+        """How long to wait before looking again, once there was nothing more to read."""
+        fill_s = self.room / rate_hz
+        by_room_ms = min(1000.0 * fill_s / _LOOKS_PER_FILL, _POLL_MS)
+        return max(round((by_room_ms if self.poll_ms is None else self.poll_ms) * _NS_PER_MS), _NS_PER_MS)
 
     def wire_range(self, channel: str, facts: Any) -> WireRange | None:
         """See `Layout.wire_range`."""
@@ -272,6 +308,27 @@ class FifoCount(Section):
     bits: CountBits = 16
     low_word_first: bool = False
 
+    @property
+    def registers(self) -> int:
+        """Registers that hold it."""
+        return self.bits // 16
+
+    @property
+    def modulus(self) -> int:
+        """Counts after which it begins again."""
+        return 65_536 if self.bits == 16 else 4_294_967_296
+
+    def decode(self, raw: bytes) -> int:
+        """The count in its registers, high byte of each first."""
+        if self.low_word_first and self.bits == 32:
+            raw = raw[2:4] + raw[:2]
+        return int.from_bytes(raw[: self.bits // 8], "big")
+
+    def encode(self, count: int) -> bytes:
+        """The registers of a count, high byte of each first."""
+        raw = (count % self.modulus).to_bytes(self.bits // 8, "big")
+        return raw[2:] + raw[:2] if self.low_word_first and self.bits == 32 else raw
+
 
 class RegisterCount(FifoCount):
     """A running count of samples in registers."""
@@ -296,9 +353,22 @@ class FifoLayout(_Sampled):
         """What a person should know about it, in a few words."""
         return f"{len(self.channels)} channels from a FIFO, {self.count.bits} bit count"
 
+    @property
+    def samples_per_read(self) -> int:
+        """Samples in a reply, at most."""
+        return (FIFO_REGISTERS - self.count.registers) // self.sample_registers
+
+    @property
+    def room(self) -> int:
+        """See `_Sampled.room`."""
+        return self.samples_per_read
+
 
 class RingLayout(_Sampled):
-    """A ring of samples in registers, with a count of all samples written so far."""
+    """A ring of samples in registers, with a count of all samples written so far.
+
+    Sample ``i`` is written to place ``i % depth``, and then the count becomes ``i + 1``.
+    """
 
     kind: ClassVar[str] = 'a layout with way = "ring"'
 
@@ -316,6 +386,16 @@ class RingLayout(_Sampled):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         return f"{len(self.channels)} channels from a ring of {self.depth}, {self.count.bits} bit count"
+
+    @property
+    def samples_per_read(self) -> int:
+        """Samples in a reply, at most."""
+        return MAX_REGISTERS // self.sample_registers
+
+    @property
+    def room(self) -> int:
+        """See `_Sampled.room`."""
+        return self.depth
 
 
 class BlockPage(Section):
@@ -354,6 +434,11 @@ class WaveformLayout(_Sampled):
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
         return f"{len(self.channels)} channels in blocks of {self.samples} samples"
+
+    @property
+    def room(self) -> int:
+        """See `_Sampled.room`."""
+        return self.samples
 
     @property
     def block(self) -> Block:

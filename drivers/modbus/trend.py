@@ -19,18 +19,18 @@ from daqsvc.acquisition.assembler import StreamCounters, note_gap, note_received
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import RECENT_DELAYS, TimeBaseState
-from drivers.modbus.layouts import FUNCTIONS
 from drivers.modbus.reading import PollingReader, streams_in_words
-from drivers.modbus.replies import NoReplyError, RequestRefusedError
+from drivers.modbus.registers import RegisterRecord, run_of
+from drivers.modbus.replies import FUNCTIONS, NoReplyError, RequestRefusedError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daqsvc.acquisition.samples import Samples
     from drivers.base import BusPort, StreamSpec
-    from drivers.modbus.layouts import TrendLayout
     from drivers.modbus.line import ModbusLine, RegisterValues
     from drivers.modbus.registers import RegisterRun
+    from drivers.modbus.settings import RegistersLayout
 
 logger = logging.getLogger(__name__)
 
@@ -83,11 +83,11 @@ class _TrendStream:
     from even steps as its polls were from the schedule: that is in the block's error, too.
     """
 
-    def __init__(self, spec: StreamSpec[TrendLayout], port: BusPort) -> None:
+    def __init__(self, spec: StreamSpec[RegistersLayout], port: BusPort) -> None:
         self.name = spec.name
-        self.own_runs = spec.layout.record.runs
         self.counters = StreamCounters()
-        self._record = spec.layout.record
+        self._record = RegisterRecord.of(spec.layout)
+        self.own_runs = self._record.runs
         self._deliver = port.deliver
         self._period_ns = NS_PER_S / spec.rate_hz
         self._places: tuple[int, ...] = ()
@@ -105,20 +105,20 @@ class _TrendStream:
 
     def places_in(self, runs: Sequence[RegisterRun]) -> tuple[int, ...]:
         """Places of those runs that its quantities lie in."""
-        wanted = [field.run for field in self._record.fields]
+        wanted = [run_of(channel) for channel in self._record.channels]
         return tuple(
             place
             for place, run in enumerate(runs)
             if any(run.address <= one.address and one.end <= run.end for one in wanted)
         )
 
-    def take_from(self, runs: Sequence[RegisterRun], places: Sequence[int]) -> None:
+    def read_from(self, runs: Sequence[RegisterRun], places: Sequence[int]) -> None:
         """Say which runs are read from now on, and which of them are for this stream."""
         self.flush()
         self._places = tuple(places)
         self._record = replace(self._record, runs=tuple(runs[place] for place in places))
 
-    def take(self, slot: int, start_ns: int, readings: Sequence[RegisterValues | None]) -> None:
+    def append(self, slot: int, start_ns: int, readings: Sequence[RegisterValues | None]) -> None:
         """Take the sample of a slot, from what each run holds; without one of its own it is lost.
 
         Args:
@@ -182,7 +182,7 @@ class TrendReader(PollingReader):
 
     def __init__(
         self,
-        specs: Sequence[StreamSpec[TrendLayout]],
+        specs: Sequence[StreamSpec[RegistersLayout]],
         port: BusPort,
         runs: Sequence[RegisterRun] | None = None,
     ) -> None:
@@ -223,7 +223,7 @@ class TrendReader(PollingReader):
         if failure is not None and failure.of_sharing:
             self._part(failure)
             readings, failure = await self._ask(line)
-        self._take(slot, readings)
+        self._append(slot, readings)
         if failure is not None:
             self._fail(failure)
 
@@ -243,7 +243,7 @@ class TrendReader(PollingReader):
             readings.append(reading)
         return readings, failure
 
-    def _take(self, slot: int, readings: Sequence[RegisterValues | None]) -> None:
+    def _append(self, slot: int, readings: Sequence[RegisterValues | None]) -> None:
         """Hand the sample to the streams; its place in the schedule is told by when the request went out."""
         asked_ns = next((reading.asked_ns for reading in readings if reading is not None), None)
         if asked_ns is None:
@@ -253,28 +253,28 @@ class TrendReader(PollingReader):
         else:
             self._begun, self._start_ns, self._done = True, asked_ns, 0
         for stream in self._streams:
-            stream.take(self._done, self._start_ns, readings)
+            stream.append(self._done, self._start_ns, readings)
 
     def _part(self, failure: _Failure) -> None:
         """Read the streams apart: the unit has not all that they share. Sooner or later try again."""
         self._read_apart()
         self._together_at_ns = self._clock.monotonic_ns() + self._apart_ns
         self._apart_ns = min(2 * self._apart_ns, APART_MOST_NS)
-        if (said := f"{failure.error} ({_words(failure.run)})") not in self._said:
-            self._said.add(said)
+        if (message := f"{failure.error} ({_words(failure.run)})") not in self._said:
+            self._said.add(message)
             logger.warning(
                 "%s: %s; each stream is polled by itself, and they are tried together only now and then. A "
                 "smaller max_gap, or forbidden, says so from the start",
                 self._who,
-                said,
+                message,
             )
 
     def _fail(self, failure: _Failure) -> None:
         """Tell a refusal with whom it concerns; whoever is silent is told by the line."""
         if not isinstance(failure.error, RequestRefusedError):
             raise failure.error
-        told = RequestRefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
-        self._tell(told, streams_in_words(sorted(stream.name for stream in failure.takers)))
+        refusal = RequestRefusedError(f"{failure.error} ({_words(failure.run)})", failure.error.code)
+        self._tell(refusal, streams_in_words(sorted(stream.name for stream in failure.takers)))
 
     async def _pause_after_failure(self) -> None:
         """The schedule itself is the pause."""
@@ -293,7 +293,7 @@ class TrendReader(PollingReader):
 
     def _read_from(self, runs: Sequence[RegisterRun], places: Mapping[_TrendStream, Sequence[int]]) -> None:
         for stream in self._streams:
-            stream.take_from(runs, places[stream])
+            stream.read_from(runs, places[stream])
         self._plan = [
             (run, _words(run), frozenset(stream for stream in self._streams if place in places[stream]))
             for place, run in enumerate(runs)

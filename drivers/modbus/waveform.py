@@ -13,18 +13,19 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.timebase import TimeBaseState
 from drivers.modbus.counted import SURE, SampleClock
-from drivers.modbus.layouts import FUNCTIONS
 from drivers.modbus.reading import PollingReader
-from drivers.modbus.registers import RegisterRun
+from drivers.modbus.registers import RegisterRecord, RegisterRun
+from drivers.modbus.replies import FUNCTIONS
+from drivers.modbus.settings import MAX_REGISTERS
 
 if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable, Mapping
 
     from drivers.base import BusPort, StreamSpec
-    from drivers.modbus.layouts import Waveform
     from drivers.modbus.line import ModbusLine
     from drivers.modbus.replies import ModbusCounters
+    from drivers.modbus.settings import WaveformLayout
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +47,23 @@ class _Ended(NamedTuple):
         if after_ns is None:
             return cls(by_ns, math.inf)
         return cls((after_ns + by_ns) // 2, (by_ns - after_ns) / 2)
+
+
+def pages_of(layout: WaveformLayout) -> tuple[tuple[RegisterRun, ...], ...]:
+    """The requests that read each page of a block; without a window on it there is one page."""
+    left = layout.samples * layout.sample_registers
+    window = left if layout.page is None else layout.page.registers
+    pages = []
+    while left:
+        inside = min(left, window)
+        pages.append(
+            tuple(
+                RegisterRun(layout.address + start, min(MAX_REGISTERS, inside - start))
+                for start in range(0, inside, MAX_REGISTERS)
+            )
+        )
+        left -= inside
+    return tuple(pages)
 
 
 class WaveformReader(PollingReader):
@@ -71,11 +89,14 @@ class WaveformReader(PollingReader):
     """
 
     def __init__(
-        self, spec: StreamSpec[Waveform], port: BusPort, counters: ModbusCounters, window: asyncio.Lock
+        self, spec: StreamSpec[WaveformLayout], port: BusPort, counters: ModbusCounters, window: asyncio.Lock
     ) -> None:
         super().__init__([spec.name], port.clock)
         self._name = spec.name
         self._layout = spec.layout
+        self._record = RegisterRecord.of(spec.layout)
+        self._pages = pages_of(spec.layout)
+        self._poll_ns = spec.layout.poll_ns(spec.rate_hz)
         self._counters = counters
         self._window = window
         self._stream_counters = StreamCounters()
@@ -109,7 +130,7 @@ class WaveformReader(PollingReader):
         if block_id == NO_BLOCK:
             self._note_no_block()
         if block_id in {NO_BLOCK, self._last_id}:
-            await self._clock.sleep_ns(self._layout.poll_ns)
+            await self._clock.sleep_ns(self._poll_ns)
             return
         ended = self._ended
         rows = await self._read_block(line, block_id)
@@ -125,7 +146,7 @@ class WaveformReader(PollingReader):
         """Read all pages of a block; None if another block has taken its place meanwhile."""
         layout = self._layout
         rows = b""
-        for page, runs in enumerate(layout.pages):
+        for page, runs in enumerate(self._pages):
             async with self._window:  # else another stream of the unit might turn the page
                 if layout.page is not None:
                     await line.write(layout.unit, layout.page.select, [page])
@@ -140,7 +161,7 @@ class WaveformReader(PollingReader):
         return f"stream {self._name!r}"
 
     async def _pause_after_failure(self) -> None:
-        await self._clock.sleep_ns(self._layout.poll_ns)
+        await self._clock.sleep_ns(self._poll_ns)
 
     async def _trigger(self, line: ModbusLine) -> None:
         """Make the device take a block, if one is due."""
@@ -148,7 +169,7 @@ class WaveformReader(PollingReader):
         if trigger is None:
             return
         now_ns = self._clock.monotonic_ns()
-        if self._triggered_ns is None or now_ns - self._triggered_ns >= trigger.every_ns:
+        if self._triggered_ns is None or now_ns - self._triggered_ns >= trigger.every_s * NS_PER_S:
             self._triggered_ns = now_ns
             await line.write(self._layout.unit, trigger.address, [trigger.value])
 
@@ -172,7 +193,7 @@ class WaveformReader(PollingReader):
                 self._shown, self._asked_ns = block_id, again.asked_ns
                 break
             self._counters.counts_doubted += 1
-            await self._clock.sleep_ns(layout.poll_ns)
+            await self._clock.sleep_ns(self._poll_ns)
         if block_id == self._last_id:
             self._last_seen_ns = self._asked_ns
         return block_id
@@ -213,7 +234,7 @@ class WaveformReader(PollingReader):
     def _hand_on(self, rows: bytes, ended: _Ended) -> None:
         raw = np.frombuffer(rows, np.uint8).reshape(self._layout.samples, -1)
         samples = note_received(
-            self._stream_counters, self._name, np.ascontiguousarray(self._layout.record.decode(raw))
+            self._stream_counters, self._name, np.ascontiguousarray(self._record.decode(raw))
         )
         span_ns = round(len(samples) * self._period_ns)
         t_first_ns = ended.t_ns - span_ns

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from can.io.generic import MessageReader
     from numpy.typing import NDArray
 
-    from drivers.can.batches import DecodedBatch
+    from drivers.frames import DecodedBatch
 
     Sort = Callable[[list[can.Message], NDArray[np.int64]], DecodedBatch]
 
@@ -133,10 +133,10 @@ class CanLog:
             if self._damage is not None:
                 raise self._damage
             return None
-        found = self._sort(messages, np.array(t_ns, np.int64))
-        found.note("frames_malformed", malformed - self._malformed)
+        decoded = self._sort(messages, np.array(t_ns, np.int64))
+        decoded.note("frames_malformed", malformed - self._malformed)
         self._malformed = malformed
-        return found
+        return decoded
 
     def _next(self) -> can.Message | None:
         try:

@@ -10,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -29,13 +28,13 @@ from drivers.replay.can_log import STEP_BACK_NS, CanLog
 from drivers.replay.channel import ChannelChoice
 from drivers.replay.files import (
     TABLE_COUNTER_BITS,
-    ColumnLayout,
     RecordedLogError,
     SampleTable,
     kind_of,
     words,
 )
 from drivers.replay.growing import GrowingCandump, Place
+from drivers.stream_driver import assembler_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,8 +45,9 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
-    from drivers.can.batches import DecodedBatch
+    from drivers.frames import DecodedBatch
     from drivers.replay.files import RecordedLog
+    from drivers.replay.settings import ReplayBus, TableLayout
 
 logger = logging.getLogger(__name__)
 
@@ -98,36 +98,33 @@ class Ending(NamedTuple):
 class ReplayDriver:
     """Plays one recording.
 
-    Options of the bus: ``file``; ``channel``, which one of a CAN log that holds several (the first one in it
-    if left out); ``at_end``, what to do at its end: ``"stop"`` (the link is down from then on, with the
-    reason "end of file"), ``"loop"`` (play it again) or ``"wait"`` (for more: another process is writing the
-    file, a candump log); ``pace``: ``"recorded"``, or ``"unpaced"`` for as fast as the receiver takes it,
-    where the samples' times run ahead of the clock; ``max_memory_gb``, what reading a table may take (half of
-    the machine's memory, at most 4 GB, if left out).
+    Once it has been played to its end and is not to be played again, the link is down with the reason "end of
+    file". Played as fast as the receiver takes it, the samples' times run ahead of the clock.
 
     A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
-    `ColumnLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
+    `TableLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
     be read of one that is damaged is played, and that is its end.
 
     Args:
-        port: settings, streams, clock and where to deliver.
+        bus: its table in the machine file.
+        port: streams, clock and where to deliver.
     """
 
-    def __init__(self, port: BusPort) -> None:
+    def __init__(self, bus: ReplayBus, port: BusPort) -> None:
         self.name = port.name
-        self._path = Path(port.options["file"])
-        self._at_end = port.options.get("at_end", "stop")
-        self._paced = port.options.get("pace", "recorded") == "recorded"
+        self._path = bus.file
+        self._at_end = bus.at_end
+        self._paced = bus.pace == "recorded"
         self.link = Link(f"replayed bus {port.name!r} ({self._path})")
         self.counters = ReplayCounters()
         self._port = port
         self._assemblers = {spec.name: _assembler(spec, port) for spec in port.streams}
         frames = [spec for spec in port.streams if isinstance(spec.layout, FrameLayout)]
         self._sorter = FrameDemultiplexer(frames)
-        self._channel = ChannelChoice(self.link.name, port.options.get("channel"))
+        self._channel = ChannelChoice(self.link.name, bus.channel)
         self._place = Place()
         self._reader = ConfinedProcess()
-        memory_gb = port.options.get("max_memory_gb")
+        memory_gb = bus.max_memory_gb
         self._limits = ResourceLimits() if memory_gb is None else ResourceLimits(round(memory_gb * GIGABYTE))
         self._first_index: dict[str, int] = {}
         self._to_its_end = False
@@ -197,9 +194,9 @@ class ReplayDriver:
     def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> DecodedBatch:
         chosen = self._channel.of(messages)
         batch = batch_of([messages[k] for k in chosen], t_ns[chosen].tolist())
-        found = self._sorter.sort(batch, 0)
-        found.note("frames_other_channel", len(messages) - len(chosen))
-        return found
+        decoded = self._sorter.sort(batch, 0)
+        decoded.note("frames_other_channel", len(messages) - len(chosen))
+        return decoded
 
     async def _play(self, recording: RecordedLog) -> Ending:
         """Play until there is no more; returns why."""
@@ -217,7 +214,7 @@ class ReplayDriver:
                         f"what is no frame in {self._path} is counted (frames_malformed) and left out, first "
                         f"{recording.first_malformed}"
                     )
-                await self._take(piece)
+                await self._accept(piece)
         except RecordedLogError as error:
             if self._at_end != "wait":
                 self.counters.passes_damaged += 1
@@ -243,7 +240,7 @@ class ReplayDriver:
         self._to_its_end = False
         self._shift_ns = None
 
-    async def _take(self, piece: DecodedBatch) -> None:
+    async def _accept(self, piece: DecodedBatch) -> None:
         clock = self._port.clock
         for name, count in piece.notes.items():
             setattr(self.counters, name, getattr(self.counters, name) + count)
@@ -264,8 +261,8 @@ class ReplayDriver:
         """Deliver a piece, when its last frame is due."""
         clock = self._port.clock
         now_ns = clock.monotonic_ns()
-        first_ns = min(int(frames.arrival_ns[0]) for frames in piece.frames)
-        last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames)
+        first_ns = min(int(frames.arrival_ns[0]) for frames in piece.frames.values())
+        last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames.values())
         if (
             self._shift_ns is None
             or (self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS)
@@ -278,13 +275,10 @@ class ReplayDriver:
             await clock.sleep_ns(due_ns - now_ns)
         else:
             await asyncio.sleep(0)
-        for frames in piece.frames:
-            decoded = frames.decoded
+        for stream, frames in piece.frames.items():
             # Logs of several interfaces may step back a little; an arrival never does.
             arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns + self._shift_ns, floor_ns))
-            self._assemblers[frames.stream].accept(
-                decoded.counter, decoded.samples, decoded.intact, arrival_ns
-            )
+            self._assemblers[stream].accept(*frames._replace(arrival_ns=arrival_ns))
 
     def _leaps(self, due_ns: int) -> bool:
         """Whether the recorded time has leapt, and what comes now is to be played at once."""
@@ -312,25 +306,21 @@ class ReplayDriver:
         return next_ns if now_ns - next_ns < REMAP_NS else now_ns
 
 
-def _frame_ns(spec: StreamSpec[FrameLayout | ColumnLayout]) -> int:
+def _frame_ns(spec: StreamSpec[FrameLayout | TableLayout]) -> int:
     """Nominal time from frame to frame."""
     samples = spec.layout.samples_per_frame if isinstance(spec.layout, FrameLayout) else 1
     return round(samples * NS_PER_S / spec.rate_hz)
 
 
-def _assembler(spec: StreamSpec[FrameLayout | ColumnLayout], port: BusPort) -> StreamAssembler:
-    layout = spec.layout
-    bits: int | None
-    if isinstance(layout, ColumnLayout):
-        bits, per_frame, counts = TABLE_COUNTER_BITS, 1, 1
-    else:
-        bits, per_frame, counts = layout.counter_bits, layout.samples_per_frame, layout.counts_per_frame
+def _assembler(spec: StreamSpec[FrameLayout | TableLayout], port: BusPort) -> StreamAssembler:
+    if isinstance(spec.layout, FrameLayout):
+        return assembler_of(cast("StreamSpec[FrameLayout]", spec), port)
     return StreamAssembler(
         spec.name,
         spec.rate_hz,
-        counter_bits=bits,
-        samples_per_frame=per_frame,
-        counts_per_frame=counts,
+        counter_bits=TABLE_COUNTER_BITS,
+        samples_per_frame=1,
+        counts_per_frame=1,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
         tell=port.tell,

@@ -6,25 +6,24 @@ at the pace at which it was recorded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import ResourceLimits
-from drivers.can.batches import DecodedBatch, StreamFrames
-from drivers.frames import Decoded
+from drivers.frames import DecodedBatch, DecodedFrames
 from drivers.replay.table import TableError, read_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from daqsvc.confined.process import ConfinedProcess
     from drivers.base import StreamSpec
+    from drivers.replay.settings import TableLayout
 
 PIECE_SAMPLES = 65_536
 TABLE_COUNTER_BITS = 32
@@ -60,40 +59,12 @@ class RecordedLog(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class ColumnLayout:
-    """Samples as columns of a table.
-
-    Attributes:
-        channels: names of the channels, in the order of a sample.
-        columns: name of each channel's column: of the CSV file's header, or of an array of the NPZ file.
-        scale: physical value of one unit of the column, float64 ``[channels]``.
-        offset: physical value of the column's zero, same shape.
-    """
-
-    channels: tuple[str, ...]
-    columns: tuple[str, ...]
-    scale: NDArray[np.float64]
-    offset: NDArray[np.float64]
-
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> ColumnLayout:
-        """The same columns with each channel's value ``v`` turned into ``gain * v + shift``.
-
-        Args:
-            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
-        """
-        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
-        gain = np.array([g for g, _ in pairs])
-        shift = np.array([s for _, s in pairs])
-        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
-
-
 class SampleTable:
     """Samples in an NPZ file (an array per column) or a CSV file with a header; read into memory whole.
 
     Args:
         path: the file.
-        specs: the streams; their layouts are `ColumnLayout`.
+        specs: the streams; their layouts are `TableLayout`.
         first_index: where each stream's count of samples goes on, by name; kept up to date.
         limits: what reading the file may take.
         reader: reads it, and can be told to stop; unless given, one of its own.
@@ -110,19 +81,20 @@ class SampleTable:
     def __init__(
         self,
         path: Path,
-        specs: Sequence[StreamSpec[ColumnLayout]],
+        specs: Sequence[StreamSpec[TableLayout]],
         first_index: dict[str, int],
         limits: ResourceLimits | None = None,
         reader: ConfinedProcess | None = None,
     ) -> None:
         self._first_index = first_index
-        wanted = [column for spec in specs for column in spec.layout.columns]
+        wanted = [column.column for spec in specs for column in spec.layout.columns]
         table = _table(path, wanted, limits or ResourceLimits(), reader)
-        self._streams: list[tuple[StreamSpec[ColumnLayout], NDArray[np.float32]]] = []
+        self._streams: list[tuple[StreamSpec[TableLayout], NDArray[np.float32]]] = []
         for spec in specs:
-            columns = [table[name] for name in spec.layout.columns]
+            named = spec.layout.columns
+            columns = [table[column.column] for column in named]
             if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
-                shapes = {n: list(c.shape) for n, c in zip(spec.layout.columns, columns, strict=True)}
+                shapes = {n.column: list(c.shape) for n, c in zip(named, columns, strict=True)}
                 raise RecordedLogError(
                     f"{path}: the columns of stream {spec.name!r} have the shapes {shapes}; "
                     "they must have one dimension and one length"
@@ -130,7 +102,7 @@ class SampleTable:
             values = np.empty((len(columns[0]), len(columns)), np.float32)
             with np.errstate(over="ignore", invalid="ignore"):
                 for i, column in enumerate(columns):
-                    values[:, i] = column * spec.layout.scale[i] + spec.layout.offset[i]
+                    values[:, i] = column * named[i].scale + named[i].offset
             self._streams.append((spec, values))
         self._t_ns = 0
         self.seamless = len({len(values) / spec.rate_hz for spec, values in self._streams}) == 1
@@ -148,7 +120,7 @@ class SampleTable:
             first, last = (min(round(t * spec.rate_hz / NS_PER_S), len(values)) for t in (self._t_ns, end_ns))
             left = left or last < len(values)
             if last > first:
-                found.frames.append(self._frames(spec, values, first, last))
+                found.frames[spec.name] = self._frames(spec, values, first, last)
         self._t_ns = end_ns
         if found.frames or left:
             return found
@@ -157,13 +129,13 @@ class SampleTable:
         return None
 
     def _frames(
-        self, spec: StreamSpec[ColumnLayout], values: NDArray[np.float32], first: int, last: int
-    ) -> StreamFrames:
+        self, spec: StreamSpec[TableLayout], values: NDArray[np.float32], first: int, last: int
+    ) -> DecodedFrames:
         row = np.arange(first, last)
         counter = (row + self._first_index.get(spec.name, 0)) % 2**TABLE_COUNTER_BITS
         t_ns = np.rint(row * (NS_PER_S / spec.rate_hz)).astype(np.int64)
         intact = np.ones(len(row), np.bool_)
-        return StreamFrames(spec.name, Decoded(counter, values[first:last, None, :], intact), t_ns)
+        return DecodedFrames(counter, values[first:last, None, :], intact, t_ns)
 
     def close(self) -> None:
         """See `RecordedLog.close`."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     import can
 
-    from drivers.can.batches import DecodedBatch
+    from drivers.frames import DecodedBatch
     from drivers.replay.can_log import Sort
 
 CHUNK_BYTES = 1 << 20
@@ -79,10 +79,10 @@ class GrowingCandump:
             min(len(self._pending), PIECE_FRAMES),
         )
         messages, self._pending = self._pending[:n], self._pending[n:]
-        found = self._sort(messages, np.array([recorded_ns(m) for m in messages], np.int64))
-        found.note("frames_malformed", self._malformed)
+        decoded = self._sort(messages, np.array([recorded_ns(m) for m in messages], np.int64))
+        decoded.note("frames_malformed", self._malformed)
         self._malformed = 0
-        return found
+        return decoded
 
     def _read_on(self) -> None:
         try:

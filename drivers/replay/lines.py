@@ -143,8 +143,8 @@ class _Lines:
         return self._ERROR_FRAME.sub(self._as_bus_error, line, count=1)
 
     @staticmethod
-    def _as_bus_error(found: re.Match[str]) -> str:
-        return f" {int(found[1], 16) | BUS_ERROR:08X}#"
+    def _as_bus_error(match: re.Match[str]) -> str:
+        return f" {int(match[1], 16) | BUS_ERROR:08X}#"
 
 
 def whole(message: can.Message) -> can.Message:

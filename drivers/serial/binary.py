@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from cobs import cobs
 
-from drivers.frames import LayoutError
-from drivers.serial.framing import DelimitedFraming, Found, Frames
-from drivers.serial.kernels import CRC_BYTES, SyncSearch, crcs_match, gather, hunt, in_units, unstuff
+from drivers.frames import DecodedBatch, LayoutError
+from drivers.serial.framing import DelimitedFraming, in_place
+from drivers.serial.kernels import CRC_BYTES, SyncSearch, crcs_match, gather, hunt, scaled, unstuff
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from drivers.frames import FrameLayout
-    from drivers.serial.framing import Pieces
+    from drivers.serial.framing import ArrivalsOf, Pieces
     from drivers.serial.kernels import Hunted
 
 CrcName = Literal["none", "ibm-3740", "xmodem"]
@@ -48,14 +48,14 @@ class Bodies(NamedTuple):
         starts: int64 ``[n]``, where each begins in the buffer.
         lengths: int64 ``[n]``, bytes of each; 0 or less for what is no frame.
         intact: bool ``[n]``, whether its CRC matches.
-        ends: int64 ``[n]``, see `Frames`.
+        arrival_ns: int64 ``[n]``, when each arrived.
     """
 
     buffer: NDArray[np.uint8]
     starts: NDArray[np.int64]
     lengths: NDArray[np.int64]
     intact: NDArray[np.bool_]
-    ends: NDArray[np.int64]
+    arrival_ns: NDArray[np.int64]
 
 
 class BodyCodec:
@@ -142,34 +142,36 @@ class BodyCodec:
         crcs = map(binascii.crc_hqx, bodies, repeat(self._initial))
         return [body + crc.to_bytes(CRC_BYTES, order) for body, crc in zip(bodies, crcs, strict=True)]
 
-    def sort(self, bodies: Bodies, found: Found) -> NDArray[np.bool_]:
-        """Decode bodies into ``found``, by stream.
+    def sort(self, bodies: Bodies, batch: DecodedBatch) -> NDArray[np.bool_]:
+        """Decode bodies into ``batch``, by stream.
 
         Args:
             bodies: as they came.
-            found: where to put frames, unknown ids and wrong lengths.
+            batch: where to put frames, unknown ids and wrong lengths.
 
         Returns:
             bool ``[n]``, False for bodies that are no frame at all: neither length nor CRC speak for them.
         """
-        buffer, starts, lengths, intact, ends = bodies
-        sound = intact & (lengths > 0) if self.checked else np.zeros(len(ends), np.bool_)
-        ids = np.where(lengths > 0, buffer[starts], -1) if self._ids else np.zeros(len(ends), np.int64)
-        strays = np.ones(len(ends), np.bool_)
+        buffer, starts, lengths, intact, arrival_ns = bodies
+        sound = intact & (lengths > 0) if self.checked else np.zeros(len(starts), np.bool_)
+        ids = np.where(lengths > 0, buffer[starts], -1) if self._ids else np.zeros(len(starts), np.int64)
+        strays = np.ones(len(starts), np.bool_)
         for key, name in self._by_id.items():
             layout = self._layouts[name]
             mine = (ids == key) & (lengths == self.length(name))
             if not mine.any():
                 continue
             strays &= ~mine
-            decoded = layout.decode(gather(buffer, starts[mine] + self._head, layout.length), in_units)
-            found.frames[name] = Frames(decoded._replace(intact=decoded.intact & intact[mine]), ends[mine])
+            payloads = gather(buffer, starts[mine] + self._head, layout.length)
+            frames = layout.decode(payloads, arrival_ns[mine], scaling=scaled)
+            batch.frames[name] = frames._replace(intact=frames.intact & intact[mine])
         for k in np.flatnonzero(strays & sound).tolist():
             owner = self._by_id.get(int(ids[k]))
             if owner is None:
-                found.note_unknown(f"{ids[k]:#04x}")
+                batch.unknown[f"{ids[k]:#04x}"] += 1
             else:
-                found.note_wrong_length(owner, int(lengths[k]))
+                before, _ = batch.wrong_length.get(owner, (0, 0))
+                batch.wrong_length[owner] = before + 1, int(lengths[k])
         return ~strays | sound
 
 
@@ -218,11 +220,11 @@ class CobsFraming(_BinaryFraming, DelimitedFraming):
         stuffed: bytes = cobs.encode(body)
         return stuffed + DELIMITER
 
-    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
+    def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         buffer, starts, stops, ends = pieces
         lengths = unstuff(buffer, starts, stops)
         intact = self._codec.intact(buffer, starts + 1, lengths)
-        return self._codec.sort(Bodies(buffer, starts + 1, lengths, intact, ends), found)
+        return self._codec.sort(Bodies(buffer, starts + 1, lengths, intact, arrivals_of(ends)), batch)
 
 
 class SyncFraming(_BinaryFraming):
@@ -253,16 +255,20 @@ class SyncFraming(_BinaryFraming):
     def _wrap(self, body: bytes) -> bytes:
         return self._sync.tobytes() + body
 
-    def cut(self, data: bytes) -> Found:
+    def cut(self, data: bytes, arrivals_of: ArrivalsOf = in_place) -> DecodedBatch:
         """See `Framing.cut`."""
         kept = len(self._rest)
         buffer = np.concatenate([self._rest, np.frombuffer(data, np.uint8)])
         hunted = self._codec.hunt(buffer, self._sync, self._step)
-        found = Found(garbage_bytes=hunted.garbage_bytes, malformed=hunted.malformed, resyncs=hunted.resyncs)
-        taken, tried, *state = hunted.step
-        start = min(taken, tried)
-        self._rest, self._step = buffer[start:].copy(), SyncSearch(taken - start, tried - start, *state)
+        batch = DecodedBatch()
+        batch.note("bytes_garbage", hunted.garbage_bytes)
+        batch.note("frames_malformed", hunted.malformed)
+        batch.note("resyncs", hunted.resyncs)
+        placed, tried, *state = hunted.step
+        start = min(placed, tried)
+        self._rest, self._step = buffer[start:].copy(), SyncSearch(placed - start, tried - start, *state)
         if len(hunted.ends):
             lengths = hunted.ends - hunted.starts
-            self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, hunted.ends - kept), found)
-        return found
+            arrival_ns = arrivals_of(hunted.ends - kept)
+            self._codec.sort(Bodies(buffer, hunted.starts, lengths, hunted.intact, arrival_ns), batch)
+        return batch

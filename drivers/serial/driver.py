@@ -22,8 +22,10 @@ from daqsvc.acquisition.link import Link
 from drivers.base import BusCounters, BusPort
 from drivers.reconnect import Attempt, CannotOpenError, ended, in_thread, run_with_reconnect, sparing_others
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming, TextLayout
-from drivers.serial.reader import SHUTDOWN_S, ReceivedBytes, SerialReader, close_port
+from drivers.serial.lines import TIME_COUNTER_BITS, LineFraming
+from drivers.serial.reader import SHUTDOWN_S, SerialReader, close_port
+from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SyncBus
+from drivers.stream_driver import assembler_of
 from drivers.tty import Character, CharacterFormat, why_not_open
 
 if TYPE_CHECKING:
@@ -32,8 +34,9 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.acquisition.timebase import TimeBaseState
     from drivers.base import StreamSpec
-    from drivers.frames import FrameLayout
+    from drivers.frames import DecodedBatch, FrameLayout
     from drivers.serial.framing import Framing
+    from drivers.serial.settings import SerialBus
 
 logger = logging.getLogger(__name__)
 
@@ -72,29 +75,26 @@ class SerialCounters(BusCounters):
 class SerialDriver:
     """Reads one serial port.
 
-    Options of the bus, all but ``port`` and ``framing`` with a default: ``port`` (path of the device),
-    ``baud``, ``data_bits``, ``parity``, ``stop_bits``, ``flow_control``, ``low_latency``; ``framing``, and
-    what that framing needs: ``crc``, ``crc_order`` and ``stream_ids`` for ``"cobs"`` and ``"sync"``, the
-    ``sync_word`` in hexadecimal, ``checksum`` and ``delimiter`` for ``"lines"``. The layouts of its streams
-    are `FrameLayout`, or `TextLayout` for lines.
+    The layouts of its streams are `FrameLayout`, or `LineLayout` for lines.
 
     Args:
-        port: settings, streams, clock and where to deliver.
+        bus: its table in the machine file.
+        port: streams, clock and where to deliver.
 
     Raises:
         LayoutError: the streams do not fit the framing.
     """
 
-    def __init__(self, port: BusPort) -> None:
+    def __init__(self, bus: SerialBus, port: BusPort) -> None:
         self.name = port.name
-        self.link = Link(f"serial port {port.name!r} ({port.options['port']})")
+        self.link = Link(f"serial port {port.name!r} ({bus.port})")
         self.counters = SerialCounters()
+        self._bus = bus
         self._port = port
-        self._framing = framing_of(port.options, port.streams)
+        self._framing = framing_of(bus, port.streams)
         self._assemblers = {s.name: _assembler(s, port) for s in port.streams}
         self._said: set[str] = set()
-        asked = Character(port.options.get("data_bits", 8), port.options.get("parity", "none"))
-        self._characters = CharacterFormat(self.link.name, asked)
+        self._characters = CharacterFormat(self.link.name, Character(bus.data_bits, bus.parity))
 
     @property
     def streams(self) -> Mapping[str, tuple[StreamCounters, TimeBaseState]]:
@@ -104,7 +104,7 @@ class SerialDriver:
     async def run(self) -> None:
         """See `drivers.base.Driver.run`."""
         try:
-            await in_thread(_warm, self._port.options, self._port.streams, patience_s=SHUTDOWN_S)
+            await in_thread(_warm, self._bus, self._port.streams, patience_s=SHUTDOWN_S)
             await run_with_reconnect(self.link, self._port, self._attempt)
         finally:
             self.link.stop()
@@ -125,11 +125,11 @@ class SerialDriver:
     async def _open(self) -> serial.Serial:
         try:
             return await in_thread(
-                _open_port, self._port.options, self._characters, undo=close_port, patience_s=SHUTDOWN_S
+                _open_port, self._bus, self._characters, undo=close_port, patience_s=SHUTDOWN_S
             )
         except (OSError, ValueError, termios.error) as error:  # pyserial's own is an OSError
             self.counters.open_failures += 1
-            why = why_not_open(error, self._port.options["port"], "port")
+            why = why_not_open(error, self._bus.port, "port")
             raise CannotOpenError(f"it cannot be opened: {why}") from error
 
     async def _receive(self, device: serial.Serial) -> str:
@@ -147,24 +147,20 @@ class SerialDriver:
             finally:
                 reader.finish()
 
-    def take(self, batch: ReceivedBytes) -> None:
+    def accept(self, batch: DecodedBatch) -> None:
         """Take in what the reader thread has found; runs on the event loop."""
-        found = batch.found
-        counters = self.counters
-        counters.bytes_received += batch.bytes_read
-        counters.bytes_garbage += found.garbage_bytes
-        counters.frames_malformed += found.malformed
-        counters.resyncs += found.resyncs
-        if found.malformed:
+        for name, count in batch.notes.items():
+            self.note(name, count)
+        if "frames_malformed" in batch.notes:
             self._say_once(
                 "malformed",
                 "%s carries bytes that are no frame; they are counted and left out. If it is all of them, "
                 "compare baud, parity, framing and checksum with the device's",
                 self.link.name,
             )
-        for name, count in found.unknown.items():
-            self._take_unknown(name, count)
-        for stream, (count, length) in found.wrong_length.items():
+        for name, count in batch.unknown.items():
+            self._count_unknown(name, count)
+        for stream, (count, length) in batch.wrong_length.items():
             self._assemblers[stream].counters.frames_wrong_length += count
             self._say_once(
                 f"length of {stream}",
@@ -174,12 +170,9 @@ class SerialDriver:
                 stream,
                 length,
             )
-        for stream, frames in found.frames.items():
-            decoded = frames.decoded
-            with sparing_others(self.link, stream, counters):
-                self._assemblers[stream].accept(
-                    decoded.counter, decoded.samples, decoded.intact, batch.arrivals_ns[stream]
-                )
+        for stream, frames in batch.frames.items():
+            with sparing_others(self.link, stream, self.counters):
+                self._assemblers[stream].accept(*frames)
 
     def tick(self, drained_ns: int) -> None:
         """Nothing more is under way that was sent before ``drained_ns``; runs on the event loop."""
@@ -191,7 +184,7 @@ class SerialDriver:
         """Add to one of the bus's counters; runs on the event loop."""
         setattr(self.counters, counter, getattr(self.counters, counter) + count)
 
-    def _take_unknown(self, name: str, count: int) -> None:
+    def _count_unknown(self, name: str, count: int) -> None:
         self.counters.frames_unknown += count
         ids = self.counters.unknown_ids
         if name in ids or len(ids) < REMEMBERED_IDS:
@@ -210,33 +203,28 @@ class SerialDriver:
             logger.warning(message, *arguments)
 
 
-def framing_of(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> Framing:
-    """The framing that a bus's options name, for its streams.
+def framing_of(bus: SerialBus, streams: Sequence[StreamSpec[Any]]) -> Framing:
+    """The framing of a port, for its streams.
 
     Raises:
         LayoutError: the streams do not fit it.
     """
-    if options["framing"] == "lines":
-        lines: dict[str, TextLayout] = {s.name: s.layout for s in streams}
+    if isinstance(bus, LinesBus):
+        lines: dict[str, LineLayout] = {s.name: s.layout for s in streams}
         rates_hz = {s.name: s.rate_hz for s in streams}
-        delimiter = options.get("delimiter", "\n").encode("ascii")
         windows_ns = {s.name: s.reorder_window_ns for s in streams}
-        return LineFraming(lines, rates_hz, options.get("checksum", "none"), delimiter, windows_ns)
+        return LineFraming(lines, rates_hz, bus.checksum, bus.delimiter.encode("ascii"), windows_ns)
+    assert isinstance(bus, CobsBus | SyncBus)  # noqa: S101 - there are no others
     layouts: dict[str, FrameLayout] = {s.name: s.layout for s in streams}
-    codec = BodyCodec(
-        layouts,
-        ids=options.get("stream_ids", False),
-        crc=options.get("crc", "ibm-3740"),
-        crc_order=options.get("crc_order", "big"),
-    )
-    if options["framing"] == "sync":
-        return SyncFraming(codec, bytes.fromhex(options["sync_word"]))
+    codec = BodyCodec(layouts, ids=bus.stream_ids, crc=bus.crc, crc_order=bus.crc_order)
+    if isinstance(bus, SyncBus):
+        return SyncFraming(codec, bytes.fromhex(bus.sync_word))
     return CobsFraming(codec)
 
 
-def _warm(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> None:
+def _warm(bus: SerialBus, streams: Sequence[StreamSpec[Any]]) -> None:
     """Have the loops that the streams need compiled, before their data come in."""
-    framing = framing_of(options, streams)
+    framing = framing_of(bus, streams)
     for spec in streams:
         shape = (3, spec.layout.samples_per_frame, len(spec.layout.channels))
         frames = framing.encode(spec.name, np.zeros(3, np.int64), np.zeros(shape), clip=True)
@@ -244,41 +232,41 @@ def _warm(options: Mapping[str, Any], streams: Sequence[StreamSpec[Any]]) -> Non
 
 
 def _assembler(spec: StreamSpec[Any], port: BusPort) -> StreamAssembler:
-    layout: FrameLayout | TextLayout = spec.layout
-    timed = isinstance(layout, TextLayout) and layout.time is not None
+    layout: FrameLayout | LineLayout = spec.layout
+    if not isinstance(layout, LineLayout):
+        return assembler_of(spec, port)
     return StreamAssembler(
         spec.name,
         spec.rate_hz,
-        counter_bits=TIME_COUNTER_BITS if timed else layout.counter_bits,
-        samples_per_frame=layout.samples_per_frame,
-        counts_per_frame=layout.counts_per_frame,
+        counter_bits=TIME_COUNTER_BITS if layout.counter is None else layout.counter.bits,
+        samples_per_frame=1,
+        counts_per_frame=1,
         deliver=port.deliver,
         reorder_window_ns=spec.reorder_window_ns,
-        stamped=timed,
+        stamped=layout.time is not None,
         tell=port.tell,
     )
 
 
-def _open_port(options: Mapping[str, Any], characters: CharacterFormat) -> serial.Serial:
-    flow = options.get("flow_control", "none")
-    character = characters.on(options["port"])
+def _open_port(bus: SerialBus, characters: CharacterFormat) -> serial.Serial:
+    character = characters.on(bus.port)
     device = serial.Serial(
-        options["port"],
-        baudrate=options.get("baud", 115_200),
+        bus.port,
+        baudrate=bus.baud,
         bytesize=character.data_bits,
         parity=_PARITY[character.parity],
-        stopbits=options.get("stop_bits", 1),
-        rtscts=flow == "rts-cts",
-        xonxoff=flow == "xon-xoff",
+        stopbits=bus.stop_bits,
+        rtscts=bus.flow_control == "rts-cts",
+        xonxoff=bus.flow_control == "xon-xoff",
         timeout=0,
         write_timeout=0,
         # VMIN = 1: a read that finds nothing then fails with EAGAIN, and nothing at all means hung up.
         inter_byte_timeout=0,
         exclusive=True,
     )
-    if options.get("low_latency", False):
+    if bus.low_latency:
         try:
             device.set_low_latency_mode(True)
         except (OSError, ValueError) as error:
-            logger.info("%s has no low-latency mode: %s", options["port"], error)
+            logger.info("%s has no low-latency mode: %s", bus.port, error)
     return device

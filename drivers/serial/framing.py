@@ -8,78 +8,54 @@ runs per frame that is of a known stream. The virtual bus wraps its frames with 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
+from drivers.frames import DecodedBatch
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
-    from drivers.frames import Decoded
+
+ArrivalsOf: TypeAlias = "Callable[[NDArray[np.int64]], NDArray[np.int64]]"
+"""When frames arrived (int64 ``[n]``, ns), by where each ends in the bytes that are being cut."""
 
 
-class Frames(NamedTuple):
-    """Frames of one stream, in their order of arrival.
+def in_place(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where frames end stands for when they arrived."""
+    return ends
 
-    Attributes:
-        decoded: their counters and samples; not intact where the checksum does not match.
-        ends: int64 ``[n]``, where each frame ends in the bytes given to `Framing.cut`.
+
+def count_steps(batch: DecodedBatch, in_step: NDArray[np.bool_], *, astray: bool) -> bool:
+    """Count what is malformed, and how often frames were found again after that.
+
+    Args:
+        batch: where to count.
+        in_step: bool ``[n]``, False where something was no frame.
+        astray: whether the last thing before these was no frame.
+
+    Returns:
+        Whether the last of these was no frame.
     """
-
-    decoded: Decoded
-    ends: NDArray[np.int64]
-
-
-@dataclass(slots=True)
-class Found:
-    """What a run of bytes held.
-
-    Attributes:
-        frames: by stream.
-        garbage_bytes: bytes that belong to no frame.
-        malformed: pieces between delimiters, or stretches between sync words, that are no frame.
-        resyncs: how often a frame was found again after something malformed.
-        unknown: sound frames of streams that nobody asked for, by id in words.
-        wrong_length: sound frames whose length is not that of their stream: how many, and the last length.
-    """
-
-    frames: dict[str, Frames] = field(default_factory=dict)
-    garbage_bytes: int = 0
-    malformed: int = 0
-    resyncs: int = 0
-    unknown: dict[str, int] = field(default_factory=dict)
-    wrong_length: dict[str, tuple[int, int]] = field(default_factory=dict)
-
-    def note_unknown(self, name: str) -> None:
-        """Count a sound frame of an unknown stream."""
-        self.unknown[name] = self.unknown.get(name, 0) + 1
-
-    def keep_step(self, in_step: NDArray[np.bool_], astray: bool) -> bool:  # noqa: FBT001 - a state handed on
-        """Count what is malformed, and how often frames were found again after that.
-
-        Args:
-            in_step: bool ``[n]``, False where something was no frame.
-            astray: whether the last thing before these was no frame.
-
-        Returns:
-            Whether the last of these was no frame.
-        """
-        before = np.concatenate(([astray], ~in_step))
-        self.malformed += int((~in_step).sum())
-        self.resyncs += int((in_step & before[:-1]).sum())
-        return bool(before[-1])
-
-    def note_wrong_length(self, stream: str, length: int) -> None:
-        """Count a sound frame of the wrong length."""
-        self.wrong_length[stream] = (self.wrong_length.get(stream, (0, 0))[0] + 1, length)
+    before = np.concatenate(([astray], ~in_step))
+    batch.note("frames_malformed", int((~in_step).sum()))
+    batch.note("resyncs", int((in_step & before[:-1]).sum()))
+    return bool(before[-1])
 
 
 class Framing(Protocol):
     """Cuts a stream of bytes into frames. Whatever the bytes are, it raises nothing."""
 
-    def cut(self, data: bytes) -> Found:
-        """Take in the next bytes; what is incomplete at their end is kept for the next call."""
+    def cut(self, data: bytes, arrivals_of: ArrivalsOf = in_place) -> DecodedBatch:
+        """Take in the next bytes; what is incomplete at their end is kept for the next call.
+
+        Args:
+            data: the bytes.
+            arrivals_of: tells when the frames in them arrived.
+        """
         ...
 
     def encode(
@@ -156,37 +132,37 @@ class DelimitedFraming(ABC):
         self._cut_off = True
         self._astray = False
 
-    def cut(self, data: bytes) -> Found:
+    def cut(self, data: bytes, arrivals_of: ArrivalsOf = in_place) -> DecodedBatch:
         """See `Framing.cut`."""
-        found = Found()
-        pieces, cut_off = self._split(data, found)
-        overlong = found.malformed > 0
+        batch = DecodedBatch()
+        pieces, cut_off = self._split(data, batch)
+        overlong = batch.notes["frames_malformed"] > 0
         if cut_off and not self._whole:
-            found.garbage_bytes += int((pieces.lengths[:1] + 1).sum())
+            batch.note("bytes_garbage", int((pieces.lengths[:1] + 1).sum()))
             pieces, cut_off = pieces.keep(slice(1, None)), False
         full = pieces.lengths > 0
         if not full.all():  # delimiters side by side
             cut_off &= bool(full[0])
             pieces = pieces.keep(full)
         if len(pieces.ends):
-            in_step = self._sort(pieces, found)
-            found.garbage_bytes += int((pieces.lengths[~in_step] + 1).sum())
+            in_step = self._sort(pieces, batch, arrivals_of)
+            batch.note("bytes_garbage", int((pieces.lengths[~in_step] + 1).sum()))
             # The end of a frame that began before the port was opened is no fault.
             skipped = int(cut_off and not in_step[0])
-            self._astray = found.keep_step(in_step[skipped:], self._astray)
+            self._astray = count_steps(batch, in_step[skipped:], astray=self._astray)
         self._astray |= overlong
-        return found
+        return batch
 
     @abstractmethod
-    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
-        """Put the frames in pieces, none of them empty, into ``found``.
+    def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
+        """Put the frames in pieces, none of them empty, into ``batch``.
 
         Returns:
             bool ``[n]``, which pieces are frames at all, be they corrupt.
         """
 
-    def _split(self, data: bytes, found: Found) -> tuple[Pieces, bool]:
-        """The pieces that are complete now; what is not is kept, or counted in ``found`` if it is overlong.
+    def _split(self, data: bytes, batch: DecodedBatch) -> tuple[Pieces, bool]:
+        """The pieces that are complete now; what is not is kept, or counted in ``batch`` if it is overlong.
 
         Returns:
             The pieces, and whether the first one's beginning may be missing.
@@ -199,8 +175,8 @@ class DelimitedFraming(ABC):
         cut_off = self._cut_off
         self._cut_off = cut_off and not len(ends)
         if len(self._rest) > self._longest:
-            found.garbage_bytes += len(self._rest)
-            found.malformed += not self._cut_off
+            batch.note("bytes_garbage", len(self._rest))
+            batch.note("frames_malformed", int(not self._cut_off))
             self._rest = self._rest[:0]
             self._cut_off = True
         stops = ends - 1

@@ -153,9 +153,7 @@ def gather(buffer: Bytes, starts: Places, length: int) -> Bytes:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def in_units(
-    raw: NDArray[Any], scale: NDArray[np.float64], offset: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def scaled(raw: NDArray[Any], scale: NDArray[np.float64], offset: NDArray[np.float64]) -> NDArray[np.float32]:
     """Raw numbers ``[n, fields]`` in physical units, float32 ``[n, fields]``; see `FrameLayout.decode`."""
     values = np.empty(raw.shape, np.float32)
     for k in range(raw.shape[0]):
@@ -283,7 +281,13 @@ def hunt(
         malformed += not fresh and not astray
         astray |= not fresh
         taken = at
-    found = starts[:n].copy(), ends[:n].copy(), intact[:n].copy()
+    bodies = starts[:n].copy(), ends[:n].copy(), intact[:n].copy()
     return Hunted(
-        found[0], found[1], found[2], SyncSearch(taken, at, fresh, astray), garbage_bytes, malformed, resyncs
+        bodies[0],
+        bodies[1],
+        bodies[2],
+        SyncSearch(taken, at, fresh, astray),
+        garbage_bytes,
+        malformed,
+        resyncs,
     )

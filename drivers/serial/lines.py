@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import binascii
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import reduce
 from operator import xor
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.frames import Decoded, LayoutError
-from drivers.serial.framing import DelimitedFraming, Frames
+from drivers.frames import DecodedFrames, LayoutError
+from drivers.serial.framing import DelimitedFraming
 from drivers.serial.line_kernels import HARD, KNOWN, OTHER, READ, check_lines, count_stamps, read_lines
 
 if TYPE_CHECKING:
@@ -26,18 +25,18 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from drivers.serial.framing import Found, Pieces
+    from drivers.frames import DecodedBatch
+    from drivers.serial.framing import ArrivalsOf, Pieces
     from drivers.serial.settings import LineLayout
 
 Checksum = Literal["none", "xor", "crc16"]
-TimeUnit = Literal["s", "ms", "us"]
 
 NEWLINE = b"\n"
 RETURN = b"\r"
 LONGEST_LINE = 1024
 """Bytes; a line that is longer is garbage."""
 
-UNITS_PER_S: Mapping[TimeUnit, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
+UNITS_PER_S: Mapping[str, float] = {"s": 1.0, "ms": 1e3, "us": 1e6}
 TIME_COUNTER_BITS = 32
 LATEST_S = 1e12
 """A device's time in s that is later than this is no time."""
@@ -70,106 +69,65 @@ class Lines(NamedTuple):
     samples: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class TextLayout:
-    """Which column of a line is what.
+class LineCodec:
+    """The numbers of a line, read and written as the layout of its stream says.
 
-    Attributes:
-        columns: names in their order, without the prefix; those named nowhere else are left out.
-        channels: names, in the order of the sample columns; each is a column.
-        scale: physical value of a written 1, float64 ``[channels]``.
-        offset: physical value of a written 0, same shape.
-        counter: the column that counts lines (and so samples); None if there is a time.
-        counter_bits: its width: 8, 16 or 32.
-        time: the column with the device's time; None if there is a counter.
-        time_unit: its unit.
-        prefix: the first field of every line of this stream; None if there is no such field.
-        separator: between fields, one character.
-        decimals: digits behind the point when lines are written.
+    Args:
+        layout: which column is what; its scale and offset lead to the physical units.
+
+    Raises:
+        LayoutError: the line has no counter and no time, or both; or a named column is not there once.
     """
 
-    columns: tuple[str, ...]
-    channels: tuple[str, ...]
-    scale: NDArray[np.float64]
-    offset: NDArray[np.float64]
-    counter: str | None = None
-    counter_bits: int = 32
-    time: str | None = None
-    time_unit: TimeUnit = "ms"
-    prefix: str | None = None
-    separator: str = ","
-    decimals: int = 6
-
-    def __post_init__(self) -> None:
-        if (self.counter is None) == (self.time is None):
+    def __init__(self, layout: LineLayout) -> None:
+        if (layout.counter is None) == (layout.time is None):
             raise LayoutError(
                 "a line needs a counter or a time, and not both: without it loss cannot be told"
             )
-        for name in (self._place, *self.channels):
-            if self.columns.count(name) != 1:
+        place = layout.counter or layout.time
+        assert place is not None  # noqa: S101 - there is one, as above
+        for name in (place.column, *layout.channel_names):
+            if layout.line.count(name) != 1:
                 raise LayoutError(
-                    f"column {name!r} is there {self.columns.count(name)} times among "
-                    f"{', '.join(self.columns)}; name it once"
+                    f"column {name!r} is there {layout.line.count(name)} times among "
+                    f"{', '.join(layout.line)}; name it once"
                 )
-
-    @property
-    def _place(self) -> str:
-        """The column that tells where a sample belongs."""
-        name = self.counter if self.time is None else self.time
-        assert name is not None  # noqa: S101 - `__post_init__` has seen to it
-        return name
-
-    @property
-    def samples_per_frame(self) -> int:
-        """One line, one sample."""
-        return 1
-
-    @property
-    def counts_per_frame(self) -> int:
-        """One line, one count."""
-        return 1
-
-    def in_units(self, conversion: Mapping[str, tuple[float, float]]) -> TextLayout:
-        """The same layout with each channel's value ``v`` turned into ``gain * v + shift``.
-
-        Args:
-            conversion: ``(gain, shift)`` by channel name; channels not named stay as they are.
-        """
-        pairs = [conversion.get(name, (1.0, 0.0)) for name in self.channels]
-        gain = np.array([g for g, _ in pairs])
-        shift = np.array([s for _, s in pairs])
-        return replace(self, scale=self.scale * gain, offset=self.offset * gain + shift)
-
-    @cached_property
-    def _picks(self) -> NDArray[np.int64]:
-        return np.array([self.columns.index(name) for name in (self._place, *self.channels)], np.int64)
+        self._layout = layout
+        self._place = place.column
+        self._counts = 2.0 ** (TIME_COUNTER_BITS if layout.counter is None else layout.counter.bits)
+        self._units_per_s = None if layout.time is None else UNITS_PER_S[layout.time.unit]
+        self._scale = np.array([channel.scale for channel in layout.channels])
+        self._offset = np.array([channel.offset for channel in layout.channels])
+        names = (self._place, *layout.channel_names)
+        self._picks = np.array([layout.line.index(name) for name in names], np.int64)
+        self._prefix = np.frombuffer((layout.prefix or "").encode("ascii"), np.uint8).copy()
 
     def read(self, lines: Pieces) -> Lines:
         """Read lines of any streams."""
         buffer, starts, stops, _ = lines
-        prefix = np.frombuffer((self.prefix or "").encode("ascii"), np.uint8).copy()
+        layout = self._layout
         states, values = read_lines(
             buffer,
             starts,
             stops,
-            prefix,
-            ord(self.separator),
-            len(self.columns),
+            self._prefix,
+            ord(layout.separator),
+            len(layout.line),
             self._picks,
-            self.time is None,
+            self._units_per_s is None,
         )
         for k in np.flatnonzero(states == HARD).tolist():
-            fields = buffer[starts[k] : stops[k]].tobytes().split(self.separator.encode("ascii"))
-            values[k] = [float(fields[pick + bool(self.prefix)]) for pick in self._picks.tolist()]
+            fields = buffer[starts[k] : stops[k]].tobytes().split(layout.separator.encode("ascii"))
+            values[k] = [float(fields[pick + bool(layout.prefix)]) for pick in self._picks.tolist()]
         places = values[:, 0]
-        if self.time is None:
-            fits = (places >= 0) & (places < 2**self.counter_bits)
+        if self._units_per_s is None:
+            fits = (places >= 0) & (places < self._counts)
         else:
-            places = places / UNITS_PER_S[self.time_unit]
+            places = places / self._units_per_s
             fits = abs(places) <= LATEST_S
         good = (states >= READ) & fits
         with np.errstate(over="ignore"):
-            samples = (values[good, 1:] * self.scale + self.offset).astype(np.float32)[:, None, :]
+            samples = (values[good, 1:] * self._scale + self._offset).astype(np.float32)[:, None, :]
         return Lines(states != OTHER, good, places[good], samples)
 
     def write(self, place: float, sample: NDArray[np.float64]) -> bytes:
@@ -179,16 +137,18 @@ class TextLayout:
             place: the counter, or the device's time in s.
             sample: float64 ``[channels]`` in physical units.
         """
-        values = dict(zip(self.channels, ((sample - self.offset) / self.scale).tolist(), strict=True))
-        fields = [] if self.prefix is None else [self.prefix]
-        for name in self.columns:
-            if name == self.time:
-                fields.append(f"{place * UNITS_PER_S[self.time_unit]:.4f}")
-            elif name == self.counter:
-                fields.append(str(int(place) % 2**self.counter_bits))
+        layout = self._layout
+        raw = ((sample - self._offset) / self._scale).tolist()
+        values = dict(zip(layout.channel_names, raw, strict=True))
+        fields = [] if layout.prefix is None else [layout.prefix]
+        for name in layout.line:
+            if name != self._place:
+                fields.append(f"{values.get(name, 0.0):.6f}")
+            elif self._units_per_s is None:
+                fields.append(str(int(place) % int(self._counts)))
             else:
-                fields.append(f"{values.get(name, 0.0):.{self.decimals}f}")
-        return self.separator.join(fields).encode("ascii")
+                fields.append(f"{place * self._units_per_s:.4f}")
+        return layout.separator.join(fields).encode("ascii")
 
 
 class DeviceTime:
@@ -238,13 +198,13 @@ class LineFraming(DelimitedFraming):
 
     def __init__(
         self,
-        layouts: Mapping[str, TextLayout],
+        layouts: Mapping[str, LineLayout],
         rates_hz: Mapping[str, float],
         checksum: Checksum = "none",
         delimiter: bytes = NEWLINE,
         reorder_windows_ns: Mapping[str, int] | None = None,
     ) -> None:
-        self._layouts = dict(layouts)
+        self._codecs = {name: LineCodec(layout) for name, layout in layouts.items()}
         self._rates_hz = dict(rates_hz)
         self._checksum: Checksum = checksum
         self._by_prefix: dict[bytes | None, str] = {}
@@ -277,12 +237,12 @@ class LineFraming(DelimitedFraming):
         clip: bool = False,  # noqa: ARG002 - any finite number can be written
     ) -> list[bytes]:
         """See `drivers.serial.framing.Framing.encode`; a device that sends its time began at index 0."""
-        layout = self._layouts[stream]
+        codec = self._codecs[stream]
         places = first_index / self._rates_hz[stream] if stream in self._times else first_index
         rows = np.asarray(samples, np.float64)[:, 0, :]
         if not np.isfinite(rows).all():
             raise LayoutError("a sample to be written is not finite; a line carries finite numbers only")
-        lines = [layout.write(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
+        lines = [codec.write(place, row) for place, row in zip(places.tolist(), rows, strict=True)]
         if self._checksum == "none":
             return [line + self._end for line in lines]
         sums = map(_SUMS[self._checksum], [line[line[:1] in {b"$", b"!"} :] for line in lines])
@@ -290,7 +250,7 @@ class LineFraming(DelimitedFraming):
         ends = [b"*%0*X" % (digits, value) + self._end for value in sums]
         return [line + end for line, end in zip(lines, ends, strict=True)]
 
-    def _sort(self, pieces: Pieces, found: Found) -> NDArray[np.bool_]:
+    def _sort(self, pieces: Pieces, batch: DecodedBatch, arrivals_of: ArrivalsOf) -> NDArray[np.bool_]:
         intact = np.ones(len(pieces.ends), np.bool_)
         if self._checksum != "none":
             digits = DIGITS[self._checksum]
@@ -298,8 +258,8 @@ class LineFraming(DelimitedFraming):
             pieces = pieces._replace(stops=texts)
         in_step = np.zeros(len(pieces.ends), np.bool_)
         strays = intact.copy()
-        for name, layout in self._layouts.items():
-            mine, good, places, samples = layout.read(pieces)
+        for name, codec in self._codecs.items():
+            mine, good, places, samples = codec.read(pieces)
             strays &= ~mine
             in_step |= good
             if not good.any():
@@ -311,27 +271,12 @@ class LineFraming(DelimitedFraming):
                 counter[sound] = self._times[name].count(places[sound])
             else:
                 counter = places.astype(np.int64)
-            found.frames[name] = Frames(Decoded(counter, samples, sound), pieces.ends[good])
+            arrival_ns = arrivals_of(pieces.ends[good])
+            batch.frames[name] = DecodedFrames(counter, samples, sound, arrival_ns)
         for k in np.flatnonzero(strays).tolist():
             text = pieces.buffer[pieces.starts[k] : pieces.stops[k]].tobytes()
             prefix = text.partition(self._separator)[0]
             if prefix.isascii() and prefix.decode("ascii").isprintable():
-                found.note_unknown(prefix.decode("ascii"))
+                batch.unknown[prefix.decode("ascii")] += 1
                 in_step[k] = True
         return in_step
-
-
-def text_layout(given: LineLayout) -> TextLayout:
-    """The columns of a line as the machine file names them, in the units that are written."""
-    return TextLayout(
-        columns=given.line,
-        channels=given.channel_names,
-        scale=np.array([channel.scale for channel in given.channels]),
-        offset=np.array([channel.offset for channel in given.channels]),
-        counter=None if given.counter is None else given.counter.column,
-        counter_bits=32 if given.counter is None else given.counter.bits,
-        time=None if given.time is None else given.time.column,
-        time_unit="ms" if given.time is None else given.time.unit,
-        prefix=given.prefix,
-        separator=given.separator,
-    )

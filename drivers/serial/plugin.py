@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from daqsvc.settings.problems import AssemblyError
 from drivers.frames import FrameLayout
-from drivers.plugin import DriverPlugin, packed, raw_limits, units_of
+from drivers.plugin import DriverPlugin, in_units, packed, raw_limits
 from drivers.serial.checks import check_serial, check_serial_ports
 from drivers.serial.settings import FRAMINGS, CobsBus, LineLayout, LinesBus, SerialBus, SerialLayout, SyncBus
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.problems import Finding, KeyPath
     from drivers.base import BusPort, Driver
-    from drivers.serial.lines import TextLayout
 
 
 class SerialPlugin(DriverPlugin[SerialBus]):
@@ -45,45 +44,28 @@ class SerialPlugin(DriverPlugin[SerialBus]):
         yield check_serial(draft, stream, at)
         del facts
 
-    def stream_layout(self, machine: MachineFile, stream: str) -> FrameLayout | TextLayout:
+    def stream_layout(self, machine: MachineFile, stream: str) -> FrameLayout | LineLayout:
         """See `DriverPlugin.stream_layout`."""
-        return serial_layout(machine, stream)
+        layout = in_units(machine.streams[stream].layout, machine, stream)
+        if isinstance(layout, LineLayout):
+            return layout
+        if not isinstance(layout, SerialLayout):
+            raise AssemblyError(f"{machine.path}: stream {stream!r} does not come over a serial port")
+        return FrameLayout.plain(
+            frame_id=layout.stream_id or 0,
+            length=layout.payload_length,
+            channels=packed(layout.channels),
+            samples_per_frame=layout.samples_per_frame,
+            counter_byte=layout.counter.byte,
+            counter_bits=layout.counter.bits,
+            counts=layout.counter.counts,
+            first_byte=layout.first_byte,
+            byte_order=layout.byte_order,
+            valid_raw=raw_limits(layout.channels),
+        )
 
     def build(self, bus: SerialBus, port: BusPort) -> Driver:
         """See `DriverPlugin.build`."""
         from drivers.serial.driver import SerialDriver  # noqa: PLC0415 - brings compiled kernels
 
-        del bus
-        return SerialDriver(port)
-
-
-def serial_layout(machine: MachineFile, stream: str) -> FrameLayout | TextLayout:
-    """The layout of a stream on a serial port, decoding straight to the physical units of its sensors.
-
-    Raises:
-        AssemblyError: the stream does not come over one.
-    """
-    given = machine.streams[stream].layout
-    units = units_of(machine, stream)
-    if isinstance(given, SerialLayout):
-        return _frame_layout(given).in_units(units)
-    if isinstance(given, LineLayout):
-        from drivers.serial.lines import text_layout  # noqa: PLC0415 - brings compiled kernels
-
-        return text_layout(given).in_units(units)
-    raise AssemblyError(f"{machine.path}: stream {stream!r} does not come over a serial port")
-
-
-def _frame_layout(given: SerialLayout) -> FrameLayout:
-    return FrameLayout.plain(
-        frame_id=given.stream_id or 0,
-        length=given.payload_length,
-        channels=packed(given.channels),
-        samples_per_frame=given.samples_per_frame,
-        counter_byte=given.counter.byte,
-        counter_bits=given.counter.bits,
-        counts=given.counter.counts,
-        first_byte=given.first_byte,
-        byte_order=given.byte_order,
-        valid_raw=raw_limits(given.channels),
-    )
+        return SerialDriver(bus, port)

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.serial.framing import Found, Framing
+    from drivers.frames import DecodedBatch
+    from drivers.serial.framing import Framing
 
 logger = logging.getLogger(__name__)
 
@@ -50,24 +51,10 @@ TIOCGICOUNT = 0x545D
 GONE = {errno.EIO, errno.ENXIO, errno.ENODEV, errno.EBADF}
 
 
-class ReceivedBytes(NamedTuple):
-    """What one batch of bytes held.
-
-    Attributes:
-        bytes_read: how many bytes it was.
-        found: the frames.
-        arrivals_ns: by stream, int64 ``[n]``, host monotonic arrival of each frame's last byte.
-    """
-
-    bytes_read: int
-    found: Found
-    arrivals_ns: dict[str, NDArray[np.int64]]
-
-
-class Taker(Protocol):
+class Receiver(Protocol):
     """Who is given what the reader finds; called on the event loop, once in a turn of it."""
 
-    def take(self, batch: ReceivedBytes) -> None:
+    def accept(self, batch: DecodedBatch) -> None:
         """Take in a batch."""
         ...
 
@@ -103,9 +90,9 @@ class SerialReader(threading.Thread):
         name: what a person calls the port.
         device: the open port, in non-blocking mode.
         framing: cuts what is read into frames; used by the cutting thread alone.
-        taker: who is given the frames.
+        receiver: who is given the frames.
         clock: stamps arrivals.
-        loop: where the taker lives.
+        loop: where the receiver lives.
 
     Attributes:
         ended: what becomes the reason why the reading has ended.
@@ -117,7 +104,7 @@ class SerialReader(threading.Thread):
         name: str,
         device: serial.Serial,
         framing: Framing,
-        taker: Taker,
+        receiver: Receiver,
         clock: Clock,
         loop: asyncio.AbstractEventLoop,
     ) -> None:
@@ -128,7 +115,7 @@ class SerialReader(threading.Thread):
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         self._framing = framing
-        self._taker = taker
+        self._receiver = receiver
         self._clock = clock
         self._hand = HandOver(loop)
         self._stopping = threading.Event()
@@ -183,7 +170,7 @@ class SerialReader(threading.Thread):
 
     def _failed(self, error: BaseException) -> str:
         """Count a failure of one of the threads, and say it in words."""
-        self._post(self._taker.note, "reader_failures")
+        self._post(self._receiver.note, "reader_failures")
         return f"its reader failed: {error or type(error).__name__}"
 
     def _drain(self) -> None:
@@ -196,7 +183,7 @@ class SerialReader(threading.Thread):
         if not self._poll.poll(POLL_MS):
             # Asked before the port was: whatever came until then has been seen by now.
             self._look_at_line(asked_ns)
-            self._jobs.put(partial(self._post, self._taker.tick, asked_ns))
+            self._jobs.put(partial(self._post, self._receiver.tick, asked_ns))
             return
         chunks: list[bytes] = []
         arrival_ns: list[int] = []
@@ -242,15 +229,17 @@ class SerialReader(threading.Thread):
 
     def _cut(self, chunks: list[bytes], arrival_ns: list[int]) -> None:
         """Find and decode the frames in what was read, and hand them to the event loop."""
-        found = self._framing.cut(b"".join(chunks))
-        ends = np.cumsum([len(chunk) for chunk in chunks])
-        at = np.array(arrival_ns, np.int64)
-        # A frame is there when its last byte is.
-        arrivals = {
-            name: at[np.searchsorted(ends, frames.ends, "left").clip(0, len(at) - 1)]
-            for name, frames in found.frames.items()
-        }
-        self._post(self._take, ReceivedBytes(int(ends[-1]), found, arrivals))
+        chunk_ends = np.cumsum([len(chunk) for chunk in chunks])
+        chunk_ns = np.array(arrival_ns, np.int64)
+
+        def arrivals_of(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+            # A frame is there when its last byte is.
+            chunk = np.searchsorted(chunk_ends, ends, "left").clip(0, len(chunk_ns) - 1)
+            return np.take(chunk_ns, chunk)
+
+        batch = self._framing.cut(b"".join(chunks), arrivals_of)
+        batch.note("bytes_received", int(chunk_ends[-1]))
+        self._post(self._accept, batch)
 
     def _look_at_line(self, now_ns: int) -> None:
         """Count what the UART has found wrong since the last look."""
@@ -263,21 +252,21 @@ class SerialReader(threading.Thread):
         self._line_errors = now
         for name, earlier, later in zip(LineErrors._fields, before, now, strict=True):
             if later != earlier:
-                self._post(self._taker.note, name, (later - earlier) % 2**32)
+                self._post(self._receiver.note, name, (later - earlier) % 2**32)
 
     def _may_hand_over(self) -> bool:
         """Wait until the event loop has room for another batch; False if the wait was ended by `close`."""
         if self._under_way.acquire(blocking=False):
             return True
-        self._post(self._taker.note, "stalls")
+        self._post(self._receiver.note, "stalls")
         while not self._under_way.acquire(timeout=POLL_MS / 1000):
             if self._stopping.is_set():
                 return False
         return True
 
-    def _take(self, batch: ReceivedBytes) -> None:
+    def _accept(self, batch: DecodedBatch) -> None:
         self._under_way.release()
-        self._taker.take(batch)
+        self._receiver.accept(batch)
 
     def _end(self, reason: str) -> None:
         if not self.ended.done():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import contextlib
 import json
@@ -9,15 +10,14 @@ import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from daqsvc.commands.arguments import EXIT_FAILED
 from daqsvc.recording.channels import channel_map, sampling_rate_hz
-from sim_hw.arguments import add_random, add_recording, add_speed, positive
-from sim_hw.demo.arguments import broker_url, misuse
+from sim_hw.arguments import add_random, add_recording, add_speed, given, misplaced, positive
 from sim_hw.demo.errors import DemoError
 
 if TYPE_CHECKING:
-    import argparse
     from collections.abc import Callable, Coroutine, Iterator, Mapping
     from types import FrameType
 
@@ -280,9 +280,8 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
 
 def _from_recording(arguments: argparse.Namespace) -> Script:
     from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
-    from sim_hw.demo.baseline import setpoints  # noqa: PLC0415
+    from sim_hw.demo.baseline import playable, setpoints  # noqa: PLC0415
     from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
-    from sim_hw.demo.playable import playable  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
     set_memory(arguments.max_memory)
@@ -329,3 +328,52 @@ def _load(path: Path, channels: Mapping[str, str] | None, rate_hz: float | None,
     for note in recording.notes:
         _say(f"warning: {path}: {note}")
     return recording
+
+
+OF_RECORDINGS = (
+    "map",
+    "fs",
+    "max_memory",
+    "unit",
+    "baseline",
+    "baseline_map",
+    "baseline_fs",
+    "bearing",
+    "speed_rpm",
+)
+OF_SCENARIOS = ("scenario", "seed", "snr_db")
+OF_BASELINES = ("baseline_map", "baseline_fs")
+
+
+def misuse(arguments: argparse.Namespace) -> str | None:
+    """What is wrong with arguments that are valid each for itself; None if nothing is."""
+    if wrong := misplaced(arguments, OF_RECORDINGS, OF_SCENARIOS):
+        return wrong
+    if arguments.baseline is None and (option := given(arguments, OF_BASELINES)):
+        return f"{option} goes with a baseline; give that with --baseline, or leave {option} out"
+    if (arguments.bearing is None) != (arguments.speed_rpm is None):
+        return "--bearing and --speed-rpm go together: its lines lie at multiples of the speed; give both"
+    if arguments.bearing is not None and arguments.unit not in {None, "g", "m/s2"}:
+        return f"--bearing needs accelerometers, and --unit is {arguments.unit}; leave one of the two out"
+    return None
+
+
+def broker_url(text: str) -> str:
+    """``mqtt://HOST[:PORT]``; the text is kept out of the messages where it may hold a password."""
+    form = "write mqtt://HOST or mqtt://HOST:PORT"
+    try:
+        parts = urlsplit(text)
+        port = parts.port
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"the port must be a number from 1 to 65535; {form}") from None
+    if parts.scheme in {"mqtts", "ssl", "tls"}:
+        raise argparse.ArgumentTypeError(f"the demo does not speak TLS ({parts.scheme}://); {form}")
+    if parts.username is not None or parts.password is not None:
+        raise argparse.ArgumentTypeError(f"the demo does not log in with a user and a password; {form}")
+    if parts.scheme != "mqtt" or not parts.hostname:
+        raise argparse.ArgumentTypeError(f"{text!r} is not the address of a broker; {form}")
+    if port == 0:
+        raise argparse.ArgumentTypeError(f"the port must be a number from 1 to 65535; {form}")
+    if parts.path not in {"", "/"} or parts.query or parts.fragment:
+        raise argparse.ArgumentTypeError(f"{text!r} has something after host and port; {form}")
+    return text

@@ -223,12 +223,12 @@ deadband = {0.05 * alert!r}
 
 def _in_words(error: MachineFileError, recording: Recording) -> DemoError:
     """What is wrong with the file made of a recording, as the recording's and the options' fault."""
-    told: list[str] = []
+    messages: list[str] = []
     remedies: dict[str, None] = {}
     for problem in error.problems:
         of_levels = problem.key.startswith("pipeline")
         key = problem.key.rpartition(".")[2]
-        told.append(problem.message if of_levels or not problem.value else f"{key} {problem.message}")
+        messages.append(problem.message if of_levels or not problem.value else f"{key} {problem.message}")
         remedies |= dict.fromkeys(
             [
                 "correct the sampling rate (--fs)"
@@ -240,7 +240,7 @@ def _in_words(error: MachineFileError, recording: Recording) -> DemoError:
         )
     return DemoError(
         f"{recording.source} cannot be played at {recording.rate_hz:g} Hz as {', '.join(recording.names)}: "
-        f"{'; '.join(told)}. Remedy: {', or '.join(remedies)}"
+        f"{'; '.join(messages)}. Remedy: {', or '.join(remedies)}"
     )
 
 

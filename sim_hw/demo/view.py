@@ -237,8 +237,8 @@ class View:
             console.print(f"{left:,} {'sample was' if one else 'samples were'} not sent: {why}")
         if any(frames["injected"].values()):
             for what in ("injected", "counted"):
-                told = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())
-                console.print(f"link faults {what}: {told}")
+                counts = ", ".join(f"{count} {fault}" for fault, count in frames[what].items())
+                console.print(f"link faults {what}: {counts}")
             beyond = frames["counted"]["dropped"] - frames["injected"].get("dropped", 0)
             if beyond > 0 and frames["not_sent"]:
                 console.print(

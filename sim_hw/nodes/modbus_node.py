@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from pymodbus.framer import FramerRTU
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
-from drivers.modbus.layouts import TrendLayout
+from drivers.modbus.settings import RegistersLayout
 from sim_hw.nodes.modbus_unit import encode, store_for
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.acquisition.clock import Clock
-    from drivers.modbus.layouts import ModbusLayout
+    from drivers.modbus.settings import ModbusLayout
     from sim_hw.nodes.modbus_unit import ModbusUnit
     from sim_hw.nodes.pacing import Pacer
 
@@ -103,10 +103,10 @@ class UnitConnection:
         """Take bytes from the client, and answer every request that is complete."""
         self._buffer += data
         while True:
-            found = _rtu_request(self._buffer) if self._serial else _tcp_request(self._buffer)
-            if found is None:
+            parsed = _rtu_request(self._buffer) if self._serial else _tcp_request(self._buffer)
+            if parsed is None:
                 return
-            used, head, unit, pdu = found
+            used, head, unit, pdu = parsed
             self._buffer = self._buffer[used:]
             if unit in self._units and pdu:
                 self._answer(head, unit, pdu)
@@ -282,9 +282,9 @@ class ModbusNode:
         *,
         first_index: int = 0,
     ) -> None:
-        self._rows = encode(layout.record, samples)
+        self._rows = encode(layout, samples)
         self._store = store_for(unit, layout)
-        if isinstance(layout, TrendLayout):
+        if isinstance(layout, RegistersLayout):
             # A device has measured before it is asked for the first time.
             self._store.put(first_index, self._rows[:1])
         self._period_ns = NS_PER_S / rate_hz

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from drivers.modbus.layouts import Fifo, Ring, TrendLayout, Waveform
+from drivers.modbus.registers import RegisterRecord
+from drivers.modbus.settings import FifoLayout, RegistersLayout, RingLayout, WaveformLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from drivers.modbus.layouts import ModbusLayout, Table
-    from drivers.modbus.registers import RegisterRecord
+    from drivers.modbus.settings import ModbusLayout, Table
 
 ADDRESSES = 65_536
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE = 1, 2, 3
@@ -59,10 +59,10 @@ class ModbusUnit:
         """Let function 24 at ``address`` return what ``read`` returns: at most 31 registers."""
         self._queues[address] = read
 
-    def watch(self, address: int, told: Callable[[int], None]) -> None:
+    def watch(self, address: int, written: Callable[[int], None]) -> None:
         """Call ``told`` with the value whenever a holding register is written by request."""
         self.map("holding", address, 1)
-        self._watchers[address] = told
+        self._watchers[address] = written
 
     def answer(self, pdu: bytes) -> bytes:
         """The PDU of the reply to the PDU of a request."""
@@ -102,8 +102,8 @@ class ModbusUnit:
             return ILLEGAL_ADDRESS
         self.put("holding", address, raw)
         for k in range(count):
-            if (told := self._watchers.get(address + k)) is not None:
-                told(int.from_bytes(raw[2 * k : 2 * k + 2], "big"))
+            if (written := self._watchers.get(address + k)) is not None:
+                written(int.from_bytes(raw[2 * k : 2 * k + 2], "big"))
         return address.to_bytes(2, "big") + data[:2]
 
 
@@ -118,16 +118,17 @@ class SampleStore(Protocol):
 class TrendStore:
     """Registers that show the newest sample."""
 
-    def __init__(self, unit: ModbusUnit, layout: TrendLayout) -> None:
+    def __init__(self, unit: ModbusUnit, layout: RegistersLayout) -> None:
         self._unit, self._layout = unit, layout
-        for run in layout.record.runs:
+        self._runs = RegisterRecord.of(layout).runs
+        for run in self._runs:
             unit.map(layout.table, run.address, run.count)
 
     def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
         """See `SampleStore.put`."""
         del first_index
         at = 0
-        for run in self._layout.record.runs:
+        for run in self._runs:
             self._unit.put(self._layout.table, run.address, rows[-1, at : at + 2 * run.count])
             at += 2 * run.count
 
@@ -135,17 +136,17 @@ class TrendStore:
 class RingStore:
     """A ring and its write counter; each sample is written before it is counted."""
 
-    def __init__(self, unit: ModbusUnit, layout: Ring) -> None:
+    def __init__(self, unit: ModbusUnit, layout: RingLayout) -> None:
         self._unit, self._layout = unit, layout
-        unit.map(layout.table, layout.count.run.address, layout.count.run.count)
-        unit.map(layout.table, layout.address, layout.depth * layout.record.registers)
+        unit.map(layout.table, layout.count.address, layout.count.registers)
+        unit.map(layout.table, layout.address, layout.depth * layout.sample_registers)
 
     def put(self, first_index: int, rows: NDArray[np.uint8]) -> None:
         """See `SampleStore.put`."""
         layout = self._layout
         for k, row in enumerate(rows):
             place = (first_index + k) % layout.depth
-            self._unit.put(layout.table, layout.address + place * layout.record.registers, row)
+            self._unit.put(layout.table, layout.address + place * layout.sample_registers, row)
             self._unit.put(layout.table, layout.count.address, layout.count.encode(first_index + k + 1))
 
 
@@ -158,14 +159,14 @@ class FifoStore:
         depth: samples that it holds.
     """
 
-    def __init__(self, unit: ModbusUnit, layout: Fifo, depth: int = 1024) -> None:
+    def __init__(self, unit: ModbusUnit, layout: FifoLayout, depth: int = 1024) -> None:
         self._layout = layout
         self._queue: deque[tuple[int, bytes]] = deque(maxlen=depth)
         self._told: dict[int, int] = {}
         self._handed_out = 0
         unit.add_queue(layout.address, self._read)
         if layout.acknowledge is not None:
-            for k in range(layout.count.run.count):
+            for k in range(layout.count.registers):
                 unit.watch(layout.acknowledge + k, lambda value, k=k: self._acknowledge(k, value))  # type: ignore[misc]
 
     @property
@@ -196,7 +197,7 @@ class FifoStore:
 
     def _acknowledge(self, word: int, value: int) -> None:
         self._told[word] = value
-        if len(self._told) < self._layout.count.run.count:
+        if len(self._told) < self._layout.count.registers:
             return
         raw = b"".join(self._told[k].to_bytes(2, "big") for k in sorted(self._told))
         self._told.clear()
@@ -217,14 +218,14 @@ class WaveformStore:
     trigger is written.
     """
 
-    def __init__(self, unit: ModbusUnit, layout: Waveform) -> None:
+    def __init__(self, unit: ModbusUnit, layout: WaveformLayout) -> None:
         self._unit, self._layout = unit, layout
         self._taking = layout.trigger is None
         self._rows: list[NDArray[np.uint8]] = []
         self._block = b""
         self._id = 0
         self.block_starts: dict[int, int] = {}
-        shown = layout.samples * layout.record.registers if layout.page is None else layout.page.registers
+        shown = layout.samples * layout.sample_registers if layout.page is None else layout.page.registers
         unit.map(layout.table, layout.block_id, 1)
         unit.map(layout.table, layout.address, shown)
         if layout.trigger is not None:
@@ -266,13 +267,13 @@ class WaveformStore:
 
 def store_for(unit: ModbusUnit, layout: ModbusLayout) -> SampleStore:
     """A store of samples in a unit, as a layout says."""
-    if isinstance(layout, TrendLayout):
+    if isinstance(layout, RegistersLayout):
         return TrendStore(unit, layout)
-    if isinstance(layout, Fifo):
+    if isinstance(layout, FifoLayout):
         return FifoStore(unit, layout)
-    return RingStore(unit, layout) if isinstance(layout, Ring) else WaveformStore(unit, layout)
+    return RingStore(unit, layout) if isinstance(layout, RingLayout) else WaveformStore(unit, layout)
 
 
-def encode(record: RegisterRecord, samples: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.uint8]:
+def encode(layout: ModbusLayout, samples: NDArray[np.float64] | NDArray[np.float32]) -> NDArray[np.uint8]:
     """Registers of samples ``[n, channels]``, saturated as an analogue input does."""
-    return record.encode(samples, clip=True)
+    return RegisterRecord.of(layout).encode(samples, clip=True)

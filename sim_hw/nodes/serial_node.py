@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivers.frames import FrameLayout
 from sim_hw.link_faults import Fault
 from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.planned_node import RETRY_S, LinkLostError, PlannedNode
@@ -14,9 +15,8 @@ from sim_hw.nodes.planned_node import RETRY_S, LinkLostError, PlannedNode
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from drivers.frames import FrameLayout
     from drivers.serial.framing import Framing
-    from drivers.serial.lines import TextLayout
+    from drivers.serial.settings import LineLayout
     from sim_hw.link_faults import LinkFaults
     from sim_hw.node_faults import NodePlan
     from sim_hw.nodes.pacing import Pacer
@@ -55,7 +55,7 @@ class SerialNode(PlannedNode):
         cable: PseudoTerminal,
         framing: Framing,
         stream: str,
-        layout: FrameLayout | TextLayout,
+        layout: FrameLayout | LineLayout,
         samples: NDArray[np.float64] | NDArray[np.float32],
         rate_hz: float,
         *,
@@ -65,11 +65,12 @@ class SerialNode(PlannedNode):
         give_up_s: float = 10.0,
     ) -> None:
         per_frame = layout.samples_per_frame
+        channels = layout.channels if isinstance(layout, FrameLayout) else layout.channel_names
         n = len(samples) // per_frame
-        if n == 0 or samples.ndim != 2 or samples.shape[1] != len(layout.channels):
+        if n == 0 or samples.ndim != 2 or samples.shape[1] != len(channels):
             raise ValueError(
                 f"samples are {list(samples.shape)}; a frame of stream {stream!r} takes {per_frame} of "
-                f"{', '.join(layout.channels)}"
+                f"{', '.join(channels)}"
             )
         own_faults = NodeFaults.of(faults).without_babble
 

@@ -25,6 +25,7 @@ import can
 import cantools
 import numpy as np
 from can.interfaces.socketcan.socketcan import SocketcanBus
+from support.bus_tables import can_bus
 from support.can_standin import frames_bytes
 from targets import Targets
 
@@ -147,7 +148,7 @@ def with_reader(sock: socket.socket) -> int:
     received = 0
     while received < FRAMES:
         found = SORTER.sort(source.read(0.0), source.error_classes)
-        received += sum(len(part.decoded.samples) for part in found.frames)
+        received += sum(len(part.samples) for part in found.frames.values())
     return received
 
 
@@ -253,12 +254,12 @@ async def at_rate(name: str, record: dict[str, Any] | None = None) -> tuple[int,
     ring = SampleRing("s", load.layout.channels, 1_000_000)
     port = BusPort(
         "b",
-        {"interface": "socketcan", "channel": "stand-in", "record": record},
         [StreamSpec("s", load.layout, rate_hz)],
         SystemClock(),
         ring.write,
     )
-    driver = CanDriver(port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
+    bus = can_bus(interface="socketcan", channel="stand-in", record=record)
+    driver = CanDriver(bus, port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
     running = asyncio.create_task(driver.run())
     while driver.link.state != "up":
         await asyncio.sleep(0.01)

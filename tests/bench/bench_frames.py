@@ -14,6 +14,7 @@ import time
 
 import can
 import numpy as np
+from support.bus_tables import can_bus
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -67,9 +68,8 @@ def decode_alone(sent: list[can.Message]) -> tuple[float, float]:
 async def with_driver(sent: list[can.Message]) -> float:
     """CPU microseconds per frame, sending included, from the bus into the ring."""
     ring = SampleRing("s", ("a",), 100_000)
-    options = {"interface": "virtual", "channel": "bench-driver", "fd": True}
-    port = BusPort("b", options, [StreamSpec("s", layout(), 12_000.0)], SystemClock(), ring.write)
-    driver = CanDriver(port)
+    port = BusPort("b", [StreamSpec("s", layout(), 12_000.0)], SystemClock(), ring.write)
+    driver = CanDriver(can_bus(interface="virtual", channel="bench-driver", fd=True), port)
     running = asyncio.create_task(driver.run())
     while driver.link.state != "up":
         await asyncio.sleep(0.01)

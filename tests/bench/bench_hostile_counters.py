@@ -24,6 +24,7 @@ import tty
 from typing import Any, NamedTuple
 
 import numpy as np
+from support import bus_tables
 from support.can_standin import frame_bytes
 from targets import Targets
 
@@ -34,7 +35,6 @@ from drivers.can.driver import CanDriver
 from drivers.can.socketcan import SocketCan
 from drivers.frames import FrameLayout
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import TextLayout
 
 LOAD_S = 4.0
 TICK_S = 0.005
@@ -58,7 +58,7 @@ LAYOUT = FrameLayout.plain(
     counter_bits=32,
     first_byte=4,
 )
-LINES = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+LINES = bus_tables.line_layout(("seq", "x"), ("x",), counter="seq")
 
 
 class Load(NamedTuple):
@@ -150,9 +150,9 @@ def can_bus(name: str) -> tuple[CanDriver, int, list[socket.socket]]:
     with contextlib.suppress(PermissionError):
         ours.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, SEND_BUFFER_BYTES)
     ring = SampleRing("s", ("x",), 100_000)
-    options = {"interface": "socketcan", "channel": name}
-    port = BusPort(name, options, [StreamSpec("s", LAYOUT, RATE_HZ)], SystemClock(), ring.write)
-    driver = CanDriver(port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
+    port = BusPort(name, [StreamSpec("s", LAYOUT, RATE_HZ)], SystemClock(), ring.write)
+    table = bus_tables.can_bus(interface="socketcan", channel=name)
+    driver = CanDriver(table, port, open_source=lambda _port, _sorter: SocketCan(theirs, port.clock))
     return driver, ours.fileno(), [ours]
 
 
@@ -161,9 +161,9 @@ def serial_port() -> tuple[SerialDriver, int, list[Any]]:
     ours, theirs = pty.openpty()
     tty.setraw(ours)
     ring = SampleRing("s", ("x",), 100_000)
-    options = {"port": os.ttyname(theirs), "framing": "lines"}
-    port = BusPort("tty", options, [StreamSpec("s", LINES, RATE_HZ)], SystemClock(), ring.write)
-    return SerialDriver(port), ours, [ours, theirs]
+    table = bus_tables.serial_bus(port=os.ttyname(theirs), framing="lines")
+    port = BusPort("tty", [StreamSpec("s", LINES, RATE_HZ)], SystemClock(), ring.write)
+    return SerialDriver(table, port), ours, [ours, theirs]
 
 
 async def lateness(late_ms: list[float]) -> None:

@@ -21,13 +21,13 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from pymodbus.client import AsyncModbusTcpClient
+from support.bus_tables import modbus_bus
+from support.modbus_layouts import register, registers_layout
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.layouts import TrendLayout
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -40,13 +40,8 @@ ROUNDS = 40
 ROUND_S = 0.2
 WARM_UP_S = 0.05
 ASKED_FOR = 1.5
-LAYOUT = TrendLayout(
-    UNIT,
-    "input",
-    RegisterRecord(
-        tuple(RegisterField(f"c{k}", k, "int16", scale=0.001) for k in range(CHANNELS)),
-        (RegisterRun(0, CHANNELS),),
-    ),
+LAYOUT = registers_layout(
+    UNIT, "input", [register(f"c{k}", k, "int16", scale=0.001) for k in range(CHANNELS)]
 )
 
 
@@ -91,8 +86,8 @@ async def ours(port: int, rate_hz: float) -> Polls:
         nonlocal samples
         samples += len(block.samples)
 
-    options = {"transport": "tcp", "host": "127.0.0.1", "tcp_port": port}
-    driver = ModbusDriver(BusPort("mb", options, [StreamSpec("s", LAYOUT, rate_hz)], SystemClock(), deliver))
+    bus = modbus_bus(transport="tcp", host="127.0.0.1", tcp_port=port)
+    driver = ModbusDriver(bus, BusPort("mb", [StreamSpec("s", LAYOUT, rate_hz)], SystemClock(), deliver))
     task = asyncio.create_task(driver.run())
     while not samples:
         await asyncio.sleep(0.001)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import serial
+from support.bus_tables import line_layout, serial_bus
 from targets import Targets
 
 from daqsvc.acquisition.clock import SystemClock
@@ -30,7 +31,6 @@ from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.serial.binary import DELIMITER
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import TextLayout
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def frames(name: str, **options: str) -> Case:
     )
     index = PER_FRAME * np.arange(FRAMES, dtype=np.int64)
     samples = np.random.default_rng(0).normal(size=(FRAMES, PER_FRAME, 1))
-    framing = framing_of(options, [StreamSpec("a", layout, RATE_HZ)])
+    framing = framing_of(serial_bus(port="/dev/null", **options), [StreamSpec("a", layout, RATE_HZ)])
     data = b"".join(framing.encode("a", index, samples))
     return Case(name, options, layout, data, FRAMES * PER_FRAME)
 
@@ -93,9 +93,9 @@ def frames(name: str, **options: str) -> Case:
 def lines(name: str, **options: str) -> Case:
     """A counter, three numbers of six decimals and a CRC in each line."""
     axes = ("x", "y", "z")
-    layout = TextLayout(("seq", *axes), axes, np.ones(3), np.zeros(3), counter="seq")
+    layout = line_layout(("seq", *axes), axes, counter="seq")
     samples = np.random.default_rng(0).normal(size=(LINES, 1, 3))
-    framing = framing_of(options, [StreamSpec("a", layout, RATE_HZ)])
+    framing = framing_of(serial_bus(port="/dev/null", **options), [StreamSpec("a", layout, RATE_HZ)])
     data = b"".join(framing.encode("a", np.arange(LINES), samples))
     return Case(name, options, layout, data, LINES)
 
@@ -152,9 +152,9 @@ async def ours(cable: PseudoTerminal, case: Case, bytes_per_s: float = math.inf)
         if delivered == case.samples:
             done.set()
 
-    options = {"port": str(cable.path), "baud": 3_000_000, **case.options}
+    bus = serial_bus(port=str(cable.path), **{"baud": 3_000_000, **case.options})
     spec = StreamSpec("a", case.layout, RATE_HZ)
-    driver = SerialDriver(BusPort("ser0", options, [spec], SystemClock(), deliver))
+    driver = SerialDriver(bus, BusPort("ser0", [spec], SystemClock(), deliver))
     task = asyncio.create_task(driver.run())
     while driver.link.state != "up":
         await asyncio.sleep(0.001)

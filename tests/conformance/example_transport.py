@@ -137,7 +137,7 @@ class ExampleLogger:
         module = example()
         bus = module.LoggerBus(driver="tcp-frames", host="127.0.0.1", tcp_port=self.device.tcp_port)
         spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
-        port = BusPort("logger", {}, [spec], self.time.clock, deliver, start)
+        port = BusPort("logger", [spec], self.time.clock, deliver, start)
         made: Driver = module.LoggerPlugin().build(bus, port)
         return made
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import CHANNELS, STREAM, SimulatedTime
+from support.bus_tables import modbus_bus
+from support.modbus_layouts import count_at, fifo_layout, in_sample
 
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.layouts import Count, Fifo, sample_record
-from drivers.modbus.registers import RegisterField
+from drivers.modbus.registers import RegisterRecord
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit
 
@@ -25,11 +26,12 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
+    from drivers.modbus.settings import FifoLayout
 
 RATE_HZ = 1000.0
 POLL_NS = 2_000_000
 UNIT, QUEUE, ACKNOWLEDGE = 1, 10, 20
-RECORD = sample_record([RegisterField(name, place, "int16") for place, name in enumerate(CHANNELS)])
+SAMPLE = [in_sample(name, place, "int16") for place, name in enumerate(CHANNELS)]
 CANNOT = {
     "duplicate": "a reply answers one request, and a queue has each sample once",
     "reorder": "there is one request at a time, and a queue keeps its order",
@@ -39,7 +41,7 @@ CANNOT = {
 
 
 class _Device(FaultyDevice):
-    def __init__(self, layout: Fifo, unplug: Callable[[], None], plug: Callable[[], None]) -> None:
+    def __init__(self, layout: FifoLayout, unplug: Callable[[], None], plug: Callable[[], None]) -> None:
         super().__init__(samples_per_frame=1)
         self.unit = ModbusUnit()
         self._layout = layout
@@ -50,7 +52,7 @@ class _Device(FaultyDevice):
         assert not corrupt
         if self._store.full:
             return False
-        self._store.put(first_index, self._layout.record.encode(samples))
+        self._store.put(first_index, RegisterRecord.of(self._layout).encode(samples))
         return True
 
     def go_away(self) -> None:
@@ -80,7 +82,7 @@ class _Modbus(ABC):
 
     def __init__(self, _folder: Path) -> None:
         self.time = SimulatedTime()
-        self._layout = Fifo(UNIT, QUEUE, Count(0, 32), RECORD, self.acknowledge, POLL_NS)
+        self._layout = fifo_layout(UNIT, QUEUE, count_at(0, 32), SAMPLE, self.acknowledge, POLL_NS)
         self._spec: StreamSpec[Any] = StreamSpec(STREAM, self._layout, RATE_HZ)
         self.device = _Device(self._layout, self.unplug, self.plug)
 
@@ -102,7 +104,8 @@ class _Modbus(ABC):
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> ModbusDriver:
         options = {**self.options(), "timeout_ms": self.timeout_ms, "demote_after": 30}
-        return ModbusDriver(BusPort("mb", options, [self._spec], self.time.clock, deliver, start))
+        port = BusPort("mb", [self._spec], self.time.clock, deliver, start)
+        return ModbusDriver(modbus_bus(**options), port)
 
 
 class ModbusTcp(_Modbus):

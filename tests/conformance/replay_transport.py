@@ -9,6 +9,7 @@ import numpy as np
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import STREAM, SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME, layout
+from support.bus_tables import replay_bus
 
 from drivers.base import BusPort, StreamSpec
 from drivers.replay.driver import POLL_NS, ReplayDriver
@@ -91,9 +92,9 @@ class GrowingLog:
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> ReplayDriver:
         # A new reader would read the file from its beginning.
         self.device.begin_a_file()
-        options = {"file": str(self._path), "at_end": "wait"}
+        bus = replay_bus(file=self._path, at_end="wait")
         spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
-        return ReplayDriver(BusPort("replay", options, [spec], self.time.clock, deliver, start))
+        return ReplayDriver(bus, BusPort("replay", [spec], self.time.clock, deliver, start))
 
 
 TRANSPORTS = {GrowingLog.name: GrowingLog}

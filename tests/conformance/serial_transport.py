@@ -9,13 +9,14 @@ import numpy as np
 from cobs import cobs
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import CHANNELS, STREAM, SimulatedTime
+from support.bus_tables import line_layout, serial_bus
 
 from daqsvc.acquisition.clock import NS_PER_S
 from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.serial.binary import CobsFraming
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineFraming, TextLayout
+from drivers.serial.lines import LineFraming
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import StartPolicy
+    from drivers.serial.settings import LineLayout, SerialBus
 
 RATE_HZ = 1000.0
 SAMPLE_BYTE = 8
@@ -44,22 +46,14 @@ def packed(per_frame: int) -> FrameLayout:
     )
 
 
-LINES = TextLayout(
-    columns=("seq", *CHANNELS),
-    channels=CHANNELS,
-    scale=np.ones(2),
-    offset=np.zeros(2),
-    counter="seq",
-    counter_bits=32,
-    decimals=0,
-)
+LINES = line_layout(("seq", *CHANNELS), CHANNELS, counter="seq")
 
 
 class CableDevice(FaultyDevice):
-    def __init__(self, cable: PseudoTerminal, options: dict[str, Any], spec: StreamSpec[Any]) -> None:
+    def __init__(self, cable: PseudoTerminal, bus: SerialBus, spec: StreamSpec[Any]) -> None:
         super().__init__(spec.layout.samples_per_frame)
         self.cable = cable
-        self._framing = framing_of(options, [spec])
+        self._framing = framing_of(bus, [spec])
 
     def put(self, first_index: int, samples: NDArray[np.float32], *, corrupt: bool) -> bool:
         index = np.array([first_index], np.int64)
@@ -118,23 +112,23 @@ class SerialTransport:
     overflow_frames = 40_000
     cannot = {}  # noqa: RUF012
 
-    def __init__(self, name: str, layout: FrameLayout | TextLayout, folder: Path, **options: str) -> None:
+    def __init__(self, name: str, layout: FrameLayout | LineLayout, folder: Path, **options: str) -> None:
         self.name = name
         self.samples_per_frame = layout.samples_per_frame
         self.time = SimulatedTime()
         self._path = folder / "port"
-        self._options: dict[str, Any] = {"port": str(self._path), **options}
+        self._bus = serial_bus(port=str(self._path), **options)
         window_ns = 3 * layout.samples_per_frame * round(NS_PER_S / RATE_HZ)
         self._spec: StreamSpec[Any] = StreamSpec(STREAM, layout, RATE_HZ, window_ns)
 
     async def start(self) -> None:
-        self.device = CableDevice(PseudoTerminal(self._path), self._options, self._spec)
+        self.device = CableDevice(PseudoTerminal(self._path), self._bus, self._spec)
 
     async def stop(self) -> None:
         self.device.unplug()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> SerialDriver:
-        return SerialDriver(BusPort("ser0", self._options, [self._spec], self.time.clock, deliver, start))
+        return SerialDriver(self._bus, BusPort("ser0", [self._spec], self.time.clock, deliver, start))
 
 
 TRANSPORTS: dict[str, Callable[[Path], SerialTransport]] = {

@@ -51,15 +51,7 @@ def stamp_when_read(reader: SocketCan) -> None:
     reader._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
 
 
-def port_on(
-    channel: str, time: Time, deliver: Callable[[SampleBlock], None], start: StartPolicy, buffer_bytes: int
-) -> BusPort:
-    """The settings of the driver under test."""
-    options = {
-        "interface": "socketcan",
-        "channel": channel,
-        "fd": True,
-        "receive_buffer_bytes": buffer_bytes,
-    }
+def port_on(time: Time, deliver: Callable[[SampleBlock], None], start: StartPolicy) -> BusPort:
+    """What the driver under test is given beside its table."""
     spec = StreamSpec(STREAM, layout(), RATE_HZ, 30_000_000)
-    return BusPort("can0", options, [spec], time.clock, deliver, start)
+    return BusPort("can0", [spec], time.clock, deliver, start)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
 from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
+from support.bus_tables import can_bus
 from support.vcan_links import VcanLink
 
 from drivers.can.driver import CanDriver
@@ -125,13 +126,14 @@ class Vcan:
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
         def open_watched(port: BusPort, sorter: FrameDemultiplexer) -> SocketCan:
-            reader = open_socketcan(port.options, sorter.matches, port.clock)
+            reader = open_socketcan(bus, sorter.matches, port.clock)
             stamp_when_read(reader)
             self.device.watch(reader)
             return reader
 
-        port = port_on(self._link.name, self.time, deliver, start, RECEIVE_BUFFER_BYTES)
-        return CanDriver(port, open_source=open_watched)
+        size = {"receive_buffer_bytes": RECEIVE_BUFFER_BYTES}
+        bus = can_bus(interface="socketcan", channel=self._link.name, fd=True, **size)
+        return CanDriver(bus, port_on(self.time, deliver, start), open_source=open_watched)
 
 
 TRANSPORTS = {Vcan.name: Vcan}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from conformance.socketcan_frames import RATE_HZ, SocketDevice, port_on, stamp_when_read
 from conformance.transport import SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME
+from support.bus_tables import can_bus
 from support.can_standin import StandInBus
 
 from drivers.can.driver import CanDriver
@@ -68,11 +68,11 @@ class StandInSocketCan:
             stamp_when_read(reader)
             return reader
 
-        port = port_on("stand-in", self.time, deliver, start, 1 << 20)
-        return CanDriver(self.changed(port), open_source=open_end)
+        bus = can_bus(interface="socketcan", channel="stand-in", fd=True, record=self.record())
+        return CanDriver(bus, port_on(self.time, deliver, start), open_source=open_end)
 
-    def changed(self, port: BusPort) -> BusPort:
-        return port
+    def record(self) -> dict[str, Any] | None:
+        return None
 
 
 class RecordedStandInSocketCan(StandInSocketCan):
@@ -84,9 +84,8 @@ class RecordedStandInSocketCan(StandInSocketCan):
         super().__init__(folder)
         self._folder = folder
 
-    def changed(self, port: BusPort) -> BusPort:
-        record = {"folder": self._folder, "format": "candump", "file_mb": 1, "keep_mb": 2}
-        return replace(port, options={**port.options, "record": record})
+    def record(self) -> dict[str, Any]:
+        return {"folder": self._folder, "format": "candump", "file_mb": 1, "keep_mb": 2}
 
 
 TRANSPORTS = {made.name: made for made in (StandInSocketCan, RecordedStandInSocketCan)}

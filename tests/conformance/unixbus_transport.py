@@ -11,6 +11,7 @@ import numpy as np
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import STREAM, SimulatedTime
 from conformance.virtual_can_transport import PER_FRAME, layout
+from support.bus_tables import can_bus
 
 from drivers.base import BusPort, StreamSpec
 from drivers.can.driver import CanDriver
@@ -126,9 +127,9 @@ class UnixSocketCan:
         self.device.unplug()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
-        options = {"interface": "unixbus", "channel": self._path, "fd": True, "options": {"hub": "join"}}
+        bus = can_bus(interface="unixbus", channel=self._path, fd=True, options={"hub": "join"})
         spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
-        return CanDriver(BusPort("can0", options, [spec], self.time.clock, deliver, start))
+        return CanDriver(bus, BusPort("can0", [spec], self.time.clock, deliver, start))
 
 
 TRANSPORTS = {UnixSocketCan.name: UnixSocketCan}

@@ -11,6 +11,7 @@ import numpy as np
 from can.interfaces.virtual import VirtualBus
 from conformance.faulty_device import FaultyDevice
 from conformance.transport import CHANNELS, STREAM, SimulatedTime
+from support.bus_tables import can_bus
 
 from drivers.base import BusPort, StreamSpec
 from drivers.can.driver import CanDriver
@@ -139,14 +140,14 @@ class VirtualCan:
         self.device.close()
 
     def driver(self, deliver: Callable[[SampleBlock], None], *, start: StartPolicy = "retry") -> CanDriver:
-        options = {
-            "interface": "plugged",
-            "channel": self.channel,
-            "fd": True,
-            "options": {"rx_queue_size": RECEIVE_QUEUE, "protocol": can.CanProtocol.CAN_FD},
-        }
+        bus = can_bus(
+            interface="plugged",
+            channel=self.channel,
+            fd=True,
+            options={"rx_queue_size": RECEIVE_QUEUE, "protocol": can.CanProtocol.CAN_FD},
+        )
         spec = StreamSpec(STREAM, layout(), self.rate_hz, 30_000_000)
-        return CanDriver(BusPort("can0", options, [spec], self.time.clock, deliver, start))
+        return CanDriver(bus, BusPort("can0", [spec], self.time.clock, deliver, start))
 
 
 TRANSPORTS = {VirtualCan.name: VirtualCan}

@@ -137,7 +137,7 @@ async def test_a_device_that_stops_while_a_doubt_stands_is_silent_and_no_longer_
         before = len(events)
         for _ in range(10 * seconds):
             if doubt is not None:
-                standing.take(doubt, clock.monotonic_ns(), known=True)
+                standing.update(doubt, clock.monotonic_ns(), known=True)
             if doubt == "":
                 first, t_ns = ring.end_index, clock.monotonic_ns()
                 ring.write(SampleBlock("s", first, np.ones((BLOCK, 1), np.float32), t_ns, NS_PER_S / 100))

@@ -50,7 +50,7 @@ async def test_each_snapshot_is_read_by_itself_whatever_block_a_detector_asks_fo
 
     async def follow():
         while len(chunks) < 4:
-            chunks.append(await reader.take(1600, 64))
+            chunks.append(await reader.read(1600, 64))
 
     following = asyncio.create_task(follow())
     for k in range(4):
@@ -71,10 +71,10 @@ async def test_a_reader_that_is_too_slow_misses_whole_snapshots_and_is_told_how_
     reader.position = 0
     for k in range(1, 5):
         ring.write(snapshot(k))
-    chunk = await reader.take(1600, 64)
+    chunk = await reader.read(1600, 64)
     assert (chunk.first_index, chunk.skipped) == (3 * EVERY, 3 * SAMPLES)
     assert reader.samples_skipped == 3 * SAMPLES
-    assert (await reader.take(1600, 64)).first_index == 4 * EVERY
+    assert (await reader.read(1600, 64)).first_index == 4 * EVERY
 
 
 def test_a_snapshot_is_measured_whole_whatever_its_length():

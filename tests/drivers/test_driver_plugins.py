@@ -5,20 +5,22 @@ from __future__ import annotations
 import json
 import tomllib
 from importlib.metadata import EntryPoint, entry_points
+from types import SimpleNamespace
 from typing import Annotated, Literal
 
 import pytest
 from pydantic import Field
+from support.bus_tables import line_layout, table_layout
 from support.machine_files import LAVAL, MOTOR, changed, problems_of
 from support.machine_mutations import toml
+from support.modbus_layouts import register, registers_layout
 
-from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import load_machine_file, parse_machine_file, registry
 from daqsvc.settings.buses import Bus, Layout, UnknownBus
 from daqsvc.settings.section import Name  # noqa: TC001 - pydantic reads the annotations
 from drivers.base import BusCounters
-from drivers.make import bus_driver, bus_self_checks, stream_layout
-from drivers.plugin import DriverPlugin
+from drivers.make import bus_self_checks, stream_layout
+from drivers.plugin import DriverPlugin, in_units
 
 BUS = 'driver = "can"'
 
@@ -142,10 +144,23 @@ def test_layouts_of_other_drivers_are_said_to_be_none_of_a_bus():
     assert problem.message == f'is a layout of pulses, and bus "{bus}" is a CAN bus'
 
 
-def test_options_that_are_changed_reach_the_driver():
-    machine = load_machine_file(LAVAL)
-    driver = bus_driver(machine, "can0", SystemClock(), lambda _block: None, {"channel": "other"})
-    assert "other" in driver.link.name
+UNITS = SimpleNamespace(sensors=[SimpleNamespace(channel="x", stream="s", gain=2.0, shift=5.0)])
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        registers_layout(1, "holding", [register("x", 0, "int16", scale=0.5, offset=-3.0)]),
+        line_layout(("n", "x"), [{"name": "x", "scale": 0.5, "offset": -3.0}], counter="n"),
+        table_layout(("x", "column", 0.5, -3.0)),
+    ],
+    ids=["registers", "line", "table"],
+)
+def test_a_layout_is_put_in_the_units_of_its_sensors(layout):
+    turned = in_units(layout, UNITS, "s")
+    [channel] = getattr(turned, turned.channels_key)
+    assert (channel.scale, channel.offset) == (1.0, -1.0)
+    assert in_units(layout, UNITS, "another") == layout
 
 
 def test_what_can_be_watched_of_a_bus_its_driver_says():

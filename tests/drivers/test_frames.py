@@ -122,6 +122,12 @@ def test_dbc_layout_has_the_messages_signals_as_samples(tmp_path: Path) -> None:
     payload = layout.encode(np.array([2 * 300]), np.array([[[-5.0], [700.0]]]))
     assert payload.tobytes() == bytes([300 % 256]) + struct.pack("<h", -5) + struct.pack(">h", 700) + bytes(3)
     assert layout.decode(payload).samples.ravel().tolist() == [-5.0, 700.0]
+    units = {"a": (1000 / 7.87, 10_000 / 7.87)}
+    turned = layout_from_dbc(
+        path, "M", counter="Seq", counts="frames", channels={"a": ["A0", "A1"]}, units=units
+    )
+    expected = np.float32(np.array([-5.0, 700.0]) * (1000 / 7.87) + 10_000 / 7.87)
+    np.testing.assert_array_equal(turned.decode(payload).samples.ravel(), expected)
 
 
 def test_dbc_problems_name_the_file_and_what_it_has(tmp_path: Path) -> None:
@@ -131,13 +137,6 @@ def test_dbc_problems_name_the_file_and_what_it_has(tmp_path: Path) -> None:
         layout_from_dbc(path, "M", counter="Seq", counts="frames", channels={"a": ["A0"]})
     with pytest.raises(LayoutError, match="message 'N'"):
         layout_from_dbc(path, "N", counter="Seq", counts="frames", channels={})
-
-
-def test_units_are_folded_into_the_scale() -> None:
-    layout = three_channels().in_units({"x": (1000 / 7.87, 10_000 / 7.87)})
-    volts = np.full((1, 10, 3), -9.5)
-    sent = three_channels().encode(np.array([0]), volts)
-    assert layout.decode(sent).samples[0, 0, 0] == np.float32((-9.5 + 10) * 1000 / 7.87)
 
 
 @pytest.mark.parametrize("value", [20_000.0, float("nan"), float("inf")])

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.bus_tables import can_bus, line_layout, replay_bus, serial_bus, table_layout
 from support.fuzz_bytes import mutated
+from support.modbus_layouts import register
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import DrivenClock
@@ -23,13 +25,11 @@ from drivers.can.adapter import batch_of
 from drivers.can.batches import ERROR, EXTENDED, REMOTE, CanBatch, FrameDemultiplexer
 from drivers.can.driver import CanDriver
 from drivers.frames import Field, FrameLayout
-from drivers.modbus.registers import RegisterField, RegisterRecord, plan_runs
+from drivers.modbus.registers import RegisterRecord, plan_runs, run_of
 from drivers.modbus.replies import MAX_TCP_BYTES, ExpectedReply, judge_rtu, judge_tcp, register_bytes
 from drivers.replay.driver import ReplayDriver
-from drivers.replay.files import ColumnLayout
 from drivers.replay.growing import candump_log
 from drivers.serial.driver import framing_of
-from drivers.serial.lines import TextLayout
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,9 +83,9 @@ def assembler_of(layout: Any, blocks: list[SampleBlock]) -> StreamAssembler:
     return StreamAssembler(
         "s",
         1000.0,
-        counter_bits=layout.counter_bits,
+        counter_bits=layout.counter_bits if isinstance(layout, FrameLayout) else layout.counter.bits,
         samples_per_frame=layout.samples_per_frame,
-        counts_per_frame=layout.counts_per_frame,
+        counts_per_frame=layout.counts_per_frame if isinstance(layout, FrameLayout) else 1,
         deliver=blocks.append,
     )
 
@@ -128,7 +128,7 @@ def can_frames(rng: np.random.Generator) -> int:
     data = rng.integers(0, 256, (n, 64)).astype(np.uint8)
     batch = CanBatch(ids, lengths, data, np.arange(n))
     found = FrameDemultiplexer(specs).sort(batch, int(rng.choice([0x1FFF_FFFF, 0x40, 0])))
-    decoded = sum(len(frames.arrival_ns) for frames in found.frames)
+    decoded = sum(len(frames.arrival_ns) for frames in found.frames.values())
     wrong = sum(count for count, _ in found.wrong_length.values())
     notes = found.notes
     elsewhere = sum(notes.get(f"frames_{kind}", 0) for kind in ("error", "remote", "unknown"))
@@ -142,9 +142,9 @@ def register_values(rng: np.random.Generator) -> int:
     address, fields = 0, []
     for k, kind in enumerate(rng.permutation(kinds)):
         order = str(rng.choice(["ABCD", "CDAB", "BADC", "DCBA"]))
-        fields.append(RegisterField(f"c{k}", address, kind, order))
-        address = fields[-1].run.end
-    record = RegisterRecord(tuple(fields), tuple(plan_runs([field.run for field in fields])))
+        fields.append(register(f"c{k}", address, kind, order))
+        address += fields[-1].registers
+    record = RegisterRecord(tuple(fields), plan_runs(map(run_of, fields)))
     raw = rng.integers(0, 256, (500, 2 * record.registers)).astype(np.uint8)
     raw[rng.random(500) < 0.2] = 0xFF
     assert record.decode(raw).shape == (500, len(fields))
@@ -196,15 +196,7 @@ def _crc(data: bytes) -> int:
     return crc >> 8 | (crc & 0xFF) << 8
 
 
-LINES = TextLayout(
-    columns=("seq", "x", "y"),
-    channels=("x", "y"),
-    scale=np.ones(2),
-    offset=np.zeros(2),
-    counter="seq",
-    counter_bits=32,
-    decimals=2,
-)
+LINES = line_layout(("seq", "x", "y"), ("x", "y"), counter="seq")
 SERIAL: dict[str, tuple[dict[str, Any], Any]] = {
     "COBS": ({"framing": "cobs"}, frame_layout(crc_byte=None, length=26)),
     "sync word": ({"framing": "sync", "sync_word": "a55a"}, frame_layout(crc_byte=None, length=26)),
@@ -219,7 +211,7 @@ def serial_stream(kind: str) -> Callable[[np.random.Generator], int]:
     def fuzz(rng: np.random.Generator) -> int:
         options, layout = SERIAL[kind]
         spec = StreamSpec("s", layout, 1000.0)
-        framing = framing_of({"port": "/dev/null", **options}, [spec])
+        framing = framing_of(serial_bus(port="/dev/null", **options), [spec])
         n = 300
         per_frame = layout.samples_per_frame
         index = per_frame * np.arange(n + 3)
@@ -236,9 +228,10 @@ def serial_stream(kind: str) -> Callable[[np.random.Generator], int]:
         found = [framing.cut(frame) for frame in sound[n:]]
         for part in found:
             _accept(assembler, part, at, 10**6)
-        last = found[-1].frames["s"].decoded
+        last = found[-1].frames["s"]
         assert last.intact[-1]
-        assert last.counter[-1] == (n + 2) * layout.counts_per_frame % 2**layout.counter_bits
+        counts, bits = (layout.counts_per_frame, layout.counter_bits) if per_frame > 1 else (1, 32)
+        assert last.counter[-1] == (n + 2) * counts % 2**bits
         assembler.flush()
         in_order(blocks)
         return n
@@ -248,11 +241,8 @@ def serial_stream(kind: str) -> Callable[[np.random.Generator], int]:
 
 def _accept(assembler: StreamAssembler, found: Any, at: int, length: int) -> None:
     for frames in found.frames.values():
-        decoded = frames.decoded
-        assert (frames.ends <= length).all()
-        assembler.accept(
-            decoded.counter, decoded.samples, decoded.intact, np.full(len(decoded.counter), at * 30_000)
-        )
+        assert (frames.arrival_ns <= length).all()
+        assembler.accept(*frames._replace(arrival_ns=np.full(len(frames.counter), at * 30_000)))
 
 
 def candump_lines(rng: np.random.Generator) -> int:
@@ -348,11 +338,10 @@ def _sound_file(path: Path, rng: np.random.Generator) -> bytes:
 
 async def _play(path: Path) -> None:
     table = path.suffix in {".npz", ".csv"}
-    columns = ColumnLayout(("x", "y"), ("x", "y"), np.ones(2), np.zeros(2))
+    columns = table_layout(("x", "x", 1.0, 0.0), ("y", "y", 1.0, 0.0))
     layout: Any = columns if table else frame_layout()
-    options = {"file": path, "at_end": "stop", "pace": "unpaced"}
-    port = BusPort("tape", options, [StreamSpec("s", layout, 250.0)], DrivenClock(), lambda _: None)
-    driver = ReplayDriver(port)
+    port = BusPort("tape", [StreamSpec("s", layout, 250.0)], DrivenClock(), lambda _: None)
+    driver = ReplayDriver(replay_bus(file=path, at_end="stop", pace="unpaced"), port)
     task = asyncio.create_task(driver.run())
     # It ends by itself, or has said why it cannot go on and waits for better times.
     while not driver.link.reason:
@@ -368,9 +357,9 @@ async def test_a_driver_outlives_whatever_is_on_its_bus() -> None:
     rng = np.random.default_rng(3)
     blocks: list[SampleBlock] = []
     clock = DrivenClock()
-    options = {"interface": "virtual", "channel": "fuzz", "fd": True}
+    bus_table = can_bus(interface="virtual", channel="fuzz", fd=True)
     layout = frame_layout()
-    driver = CanDriver(BusPort("can0", options, [StreamSpec("s", layout, 1000.0)], clock, blocks.append))
+    driver = CanDriver(bus_table, BusPort("can0", [StreamSpec("s", layout, 1000.0)], clock, blocks.append))
     task = asyncio.create_task(driver.run())
     with can.Bus(interface="virtual", channel="fuzz", protocol=can.CanProtocol.CAN_FD) as bus:
         async with asyncio.timeout(60):

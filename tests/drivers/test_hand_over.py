@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import serial
 
-from drivers.can.batches import DecodedBatch
 from drivers.can.driver import BATCHES_UNDER_WAY, CanReader
+from drivers.frames import DecodedBatch
 from drivers.reconnect import HandOver
 from drivers.serial.reader import SerialReader
 

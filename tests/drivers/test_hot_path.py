@@ -7,6 +7,7 @@ import sys
 import can
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -37,12 +38,11 @@ def interpreter_events(samples_per_frame: int) -> int:
     ring = SampleRing("s", ("a",), 100_000)
     port = BusPort(
         "b",
-        {"interface": "virtual", "channel": "hot-path"},
         [StreamSpec("s", layout, rate_hz)],
         SystemClock(),
         ring.write,
     )
-    driver = CanDriver(port)
+    driver = CanDriver(can_bus(interface="virtual", channel="hot-path"), port)
     detector = LevelDetector("m", "s", rate_hz, [LevelChannel("a", 0, "g")], window_s=0.25)
     detector.warm()
     index = samples_per_frame * np.arange(FRAMES, dtype=np.int64)
@@ -63,7 +63,7 @@ def interpreter_events(samples_per_frame: int) -> int:
     sys.settrace(count)  # type: ignore[arg-type]
     sys.setprofile(count)  # type: ignore[arg-type]
     try:
-        driver.take(driver._sorter.sort(batch_of(messages, arrival_ns), 0))
+        driver.accept(driver._sorter.sort(batch_of(messages, arrival_ns), 0))
         for assembler in driver._assemblers.values():
             assembler.flush()
         got = ring.read(0, FRAMES * samples_per_frame)
@@ -76,6 +76,7 @@ def interpreter_events(samples_per_frame: int) -> int:
 
 
 def test_thirty_samples_a_frame_cost_the_interpreter_what_one_does() -> None:
+    interpreter_events(1)  # what is done once in a process does not count
     one, thirty = interpreter_events(1), interpreter_events(30)
     assert thirty == pytest.approx(one, rel=0.02), (
         f"{one} events for {FRAMES} samples, {thirty} for 30 times as many"

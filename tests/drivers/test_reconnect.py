@@ -48,7 +48,7 @@ class _NotedWaits:
 
 
 def _port(clock: _NotedWaits, start: StartPolicy = "retry") -> BusPort:
-    return BusPort("can0", {}, (), clock, lambda _block: None, start)
+    return BusPort("can0", (), clock, lambda _block: None, start)
 
 
 async def _kept(outcomes: list[Attempt | None], start: StartPolicy = "retry") -> tuple[Link, list[int], int]:

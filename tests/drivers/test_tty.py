@@ -8,24 +8,22 @@ import logging
 import os
 import termios
 
-import numpy as np
 import pytest
+from support.bus_tables import line_layout, serial_bus
 from support.clocks import QuickClock
+from support.modbus_layouts import register, registers_layout
 from support.modbus_lines import Rig, until
 
 from drivers.base import BusPort, StreamSpec
-from drivers.modbus.layouts import TrendLayout
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import TextLayout
 from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
 from sim_hw.nodes.modbus_node import ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
 pytestmark = pytest.mark.integration
-TREND = TrendLayout(1, "input", RegisterRecord((RegisterField("x", 0, "int16"),), (RegisterRun(0, 1),)))
-LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+TREND = registers_layout(1, "input", [register("x", 0, "int16")])
+LINE = line_layout(("seq", "x"), ("x",), counter="seq")
 
 
 def told(caplog):
@@ -59,7 +57,7 @@ async def test_a_serial_device_on_a_pseudo_terminal_is_opened_and_opened_again(t
     blocks = []
     given = {"port": str(tmp_path / "port"), "framing": "lines", "parity": "even", "data_bits": 7}
     spec = StreamSpec("x", LINE, 100.0)
-    driver = SerialDriver(BusPort("ser0", given, [spec], QuickClock(10), blocks.append))
+    driver = SerialDriver(serial_bus(**given), BusPort("ser0", [spec], QuickClock(10), blocks.append))
     with caplog.at_level(logging.WARNING), PseudoTerminal(tmp_path / "port") as cable:
         for _ in range(2):  # the C library fails at the second attempt to set what the first could not
             task = asyncio.create_task(driver.run())

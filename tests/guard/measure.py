@@ -33,7 +33,20 @@ DETECTORS = (
 DETECTOR_ROOMS = ("daqsvc/rotor/", "daqsvc/bearing/", "daqsvc/diagnosis/", "daqsvc/detectors/")
 """What a detector may be named in, today and by the picture of the house."""
 DRIVERS = ("can", "modbus", "serial", "replay")
-SAMPLE_TYPES = ("Decoded", "StreamFrames", "Sorted", "Placement", "Placed", "SampleBlock", "Chunk", "Window")
+SAMPLE_TYPES = (
+    *(
+        "Decoded",
+        "StreamFrames",
+        "Frames",
+        "Found",
+        "ReceivedBytes",
+        "Sorted",
+        "Placement",
+        "Placed",
+        "Chunk",
+    ),
+    *("DecodedFrames", "DecodedBatch", "SampleBlock", "Window"),
+)
 SETTING = "on_delay_s"
 Which: TypeAlias = Literal["run", "types", "all"]
 """Imports that count: at module level at run time; also for the type checker; also within functions."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from support.bus_tables import can_bus
 from support.can_standin import frame_bytes
 from support.clocks import QuickClock
 from support.running_drivers import CountingDevice, running
@@ -39,7 +40,8 @@ LAYOUT = FrameLayout.plain(
 
 def driver_on(vcan: VcanLink, blocks: list[SampleBlock], **options: Any) -> CanDriver:
     chosen = {"interface": "socketcan", "channel": vcan.name, "fd": True} | options
-    return CanDriver(BusPort("can0", chosen, [StreamSpec("s", LAYOUT, 3000.0)], QuickClock(), blocks.append))
+    port = BusPort("can0", [StreamSpec("s", LAYOUT, 3000.0)], QuickClock(), blocks.append)
+    return CanDriver(can_bus(**chosen), port)
 
 
 async def call(*command: str) -> str:

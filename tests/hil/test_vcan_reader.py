@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_standin import frame_bytes
 
 from daqsvc.acquisition.clock import NS_PER_S, SystemClock
@@ -28,9 +29,8 @@ PATIENCE_S = 10.0
 
 
 def opened(vcan: VcanLink, *matches: IdMatch, **options: object) -> contextlib.closing[SocketCan]:
-    return contextlib.closing(
-        open_socketcan({"channel": vcan.name, "fd": True} | options, matches, SystemClock())
-    )
+    bus = can_bus(**({"interface": "socketcan", "channel": vcan.name, "fd": True} | options))
+    return contextlib.closing(open_socketcan(bus, matches, SystemClock()))
 
 
 def read_all(source: SocketCan, frames: int) -> list[CanBatch]:

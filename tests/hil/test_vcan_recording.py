@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_recordings import STREAMS, books, only_file, replayed
 from support.can_standin import frame_bytes
 from support.running_drivers import running
@@ -18,6 +19,7 @@ from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort
 from drivers.can.batches import ERROR
 from drivers.can.driver import CanDriver
+from drivers.can.record_files import Logs, OneLog
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,9 +35,9 @@ SENT = GENERATED + REMOTE_FRAMES + ERROR_FRAMES
 LINE = re.compile(r"\((\d+\.\d{6})\) +(\S+) ([0-9A-F]+#\S*)(?: [RT])?\n")
 
 
-def driver_on(vcan: VcanLink, record: dict[str, Any]) -> CanDriver:
-    options = {"interface": "socketcan", "channel": vcan.name, "fd": True, "record": record}
-    return CanDriver(BusPort("can0", options, STREAMS, SystemClock(), lambda _: None))
+def driver_on(vcan: VcanLink, logs: Logs | None = None, **options: Any) -> CanDriver:
+    bus = can_bus(**({"interface": "socketcan", "channel": vcan.name, "fd": True} | options))
+    return CanDriver(bus, BusPort("can0", STREAMS, SystemClock(), lambda _: None), logs=logs)
 
 
 async def call(*command: str | Path) -> str:
@@ -82,7 +84,7 @@ def counted(driver: CanDriver | ReplayDriver) -> dict[str, Any]:
 async def recorded(vcan: VcanLink, folder: Path, log_format: str) -> tuple[CanDriver, str]:
     """Traffic recorded by the driver, and as candump saw it."""
     record = {"folder": folder, "format": log_format, "file_mb": 64, "keep_mb": 2048}
-    driver = driver_on(vcan, record)
+    driver = driver_on(vcan, record=record)
     async with running(driver):
         dump = await dumped(vcan, SENT)
         await send_of_every_kind(vcan)
@@ -151,8 +153,7 @@ async def test_the_whole_bus_is_recorded_unless_it_is_filtered(vcan: VcanLink, t
     counts = []
     for asked in ({}, {"filter": True}):
         log = tmp_path / f"{len(counts)}.log"
-        driver = driver_on(vcan, {"file": log})
-        driver._port.options.update(asked)
+        driver = driver_on(vcan, OneLog(log), **asked)
         async with running(driver):
             with vcan.sender() as sender:
                 sender.send(frame_bytes(0x7FF, b"of no stream"[:8]))
@@ -165,8 +166,7 @@ async def test_the_whole_bus_is_recorded_unless_it_is_filtered(vcan: VcanLink, t
 async def test_fd_frames_are_recorded_whatever_the_machine_file_says_of_fd(
     vcan: VcanLink, tmp_path: Path
 ) -> None:
-    driver = driver_on(vcan, {"file": tmp_path / "fd.log"})
-    driver._port.options["fd"] = False
+    driver = driver_on(vcan, OneLog(tmp_path / "fd.log"), fd=False)
     async with running(driver):
         with vcan.sender() as sender:
             sender.send(frame_bytes(0x7FF, bytes(64), fd=True))

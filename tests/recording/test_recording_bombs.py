@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, OBJ_HEADER_BASE_STRUCT, BLFWriter
 from support import file_bombs
+from support.bus_tables import replay_bus, table_layout
 from support.orbit_files import OPTIONS, Orbit
 
 from daqsvc.acquisition.clock import SystemClock
@@ -23,8 +24,8 @@ from daqsvc.recording.recording import load_recording, set_limits, shared, stop_
 from drivers.base import BusPort, StreamSpec
 from drivers.replay.can_log import CanLog
 from drivers.replay.driver import ReplayDriver
-from drivers.replay.files import ColumnLayout, SampleTable
 from drivers.replay.files import RecordedLogError as ReplayError
+from drivers.replay.files import SampleTable
 
 pytestmark = pytest.mark.integration
 MOST_MB = 400
@@ -120,7 +121,7 @@ def test_memory_is_given_on_the_command_line(tmp_path, capsys):
     assert "is not a number of GB from 0.05 to 1000" in capsys.readouterr().err
 
 
-COLUMNS = ColumnLayout(channels=("x",), columns=("x",), scale=np.ones(1), offset=np.zeros(1))
+COLUMNS = table_layout(("x", "x", 1.0, 0.0))
 
 
 @pytest.mark.parametrize("name", ["a.npz", "said.npz"])
@@ -201,8 +202,8 @@ async def test_a_table_that_takes_long_does_not_hold_up_the_end(tmp_path, monkey
     np.savez(path, x=np.zeros(100))
     monkeypatch.setattr("drivers.replay.table.COLUMNS", "support.confined_work:spin_with")
     spec = StreamSpec("s", COLUMNS, 1000.0)
-    port = BusPort("t", {"file": path}, [spec], SystemClock(), lambda _block: None)
-    driver = ReplayDriver(port)
+    port = BusPort("t", [spec], SystemClock(), lambda _block: None)
+    driver = ReplayDriver(replay_bus(file=path), port)
     running = asyncio.create_task(driver.run())
     while driver._reader._running is None:
         await asyncio.sleep(0.01)

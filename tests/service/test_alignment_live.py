@@ -17,8 +17,8 @@ from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.service import Service
 from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
+from sim_hw.nodes.can_node import to_frames
 from sim_hw.nodes.pacing import DrivenPacer
-from sim_hw.nodes.wire import to_frames
 from sim_hw.scenario import Scenario
 
 if TYPE_CHECKING:

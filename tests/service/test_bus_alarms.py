@@ -10,8 +10,8 @@ from support.machine_files import MACHINES
 
 from daqsvc.alarms.states import Level
 from daqsvc.settings import parse_machine_file
-from drivers.can.batches import DecodedBatch
 from drivers.can.errors import ErrorCounts
+from drivers.frames import DecodedBatch
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,8 +35,8 @@ async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -
         driver: CanDriver = service.drivers[0]  # type: ignore[assignment]
         service.alarms.tick()
         assert "bus-overrun/can0" not in service.alarms.manager.alarms, "nothing has happened"
-        driver.take(DecodedBatch(notes={"frames_overrun": 3}))
-        driver.take(DecodedBatch(errors=ErrorCounts({"bus_off": 1}, "bus-off")))
+        driver.accept(DecodedBatch(notes={"frames_overrun": 3}))
+        driver.accept(DecodedBatch(errors=ErrorCounts({"bus_off": 1}, "bus-off")))
         service.alarms.tick()
         level, message = how(service, "bus-overrun/can0")
         assert level is Level.ALERT
@@ -48,6 +48,6 @@ async def test_an_overrun_and_a_bus_off_are_alarms_that_return(tmp_path: Path) -
         level, message = how(service, "bus-recording/can0")
         assert level is Level.ALERT
         assert "frames of bus can0 are missing from its recording" in message
-        driver.take(DecodedBatch(errors=ErrorCounts({"restarts": 1}, "error-active")))
+        driver.accept(DecodedBatch(errors=ErrorCounts({"restarts": 1}, "error-active")))
         service.alarms.tick()
         assert how(service, "bus-controller/can0")[0] is Level.DANGER, "it has only just come back"

@@ -21,7 +21,7 @@ from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
 from sim_hw.demo.session import DemoOutcome, DemoSession, Script
 from sim_hw.demo.summary import summarise
 from sim_hw.link_faults import LinkFaults
-from sim_hw.nodes.wire import quantised
+from sim_hw.nodes.can_node import quantised
 from sim_hw.scenario import load_scenario
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from support.waiting import eventually
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
-from drivers.modbus.build import modbus_layout
+from drivers.make import stream_layout
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
@@ -157,7 +157,7 @@ async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block
     await server.start()
     text = WAVEFORMS.format(port=server.port, every_s=every_s) + ALARM
     machine = parse_machine_file(text, tmp_path / "machine.toml")
-    layout = modbus_layout(machine, "casing")
+    layout = stream_layout(machine, "casing")
     store = WaveformStore(unit, layout)
     async with running(machine, tmp_path / "store") as service:
         heard = Heard(service)

@@ -8,17 +8,15 @@ import uuid
 import can
 import numpy as np
 import pytest
+from support.modbus_layouts import register, registers_layout
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.frames import FrameLayout
-from drivers.modbus.layouts import TrendLayout
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from sim_hw.link_faults import Fault, FaultCounts, LinkFaults
-from sim_hw.nodes.can_node import CanNode
+from sim_hw.nodes.can_node import CanNode, quantised, to_frames
 from sim_hw.nodes.modbus_node import ModbusNode
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pacing import SHORTEST_SLEEP_NS, DrivenPacer, RealTimePacer
-from sim_hw.nodes.wire import quantised, to_frames
 
 MS = 1_000_000
 LAYOUT = FrameLayout.plain(
@@ -324,9 +322,7 @@ async def test_real_time_deadlines_do_not_drift():
 
 def test_registers_that_a_modbus_unit_does_not_have_are_refused_as_devices_do() -> None:
     unit = ModbusUnit()
-    layout = TrendLayout(
-        1, "holding", RegisterRecord((RegisterField("x", 10, "int16", scale=0.1),), (RegisterRun(10, 1),))
-    )
+    layout = registers_layout(1, "holding", [register("x", 10, "int16", scale=0.1)])
     ModbusNode(unit, layout, np.array([[4.2], [5.0]]), 1.0)
     read = lambda address, count: unit.answer(struct.pack(">BHH", 3, address, count))  # noqa: E731
     # It has measured before it is asked for the first time.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import can
 import numpy as np
+from support.bus_tables import can_bus, replay_bus
 from support.can_standin import frame_bytes
 from support.paths import ROOT
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.samples import SampleBlock
+    from drivers.can.record_files import Logs
 
 DBC = ROOT / "config" / "devices" / "triaxial-accelerometer.dbc"
 ENDINGS = {"blf": ".blf", "asc": ".asc", "candump": ".log"}
@@ -115,15 +117,16 @@ def samples(blocks: list[SampleBlock]) -> dict[str, list[list[float]]]:
 
 def recorded_driver(
     bus: StandInBus,
-    record: Mapping[str, Any],
+    record: Mapping[str, Any] | None,
     blocks: list[SampleBlock] | None = None,
     clock: Clock | None = None,
+    logs: Logs | None = None,
 ) -> CanDriver:
     """A driver on a stand-in bus whose frames are recorded."""
-    options = {"interface": "socketcan", "channel": "can7", "fd": True, "record": dict(record)}
+    bus_table = can_bus(interface="socketcan", channel="can7", fd=True, record=record)
     deliver = (lambda _: None) if blocks is None else blocks.append
-    port = BusPort("can0", options, STREAMS, clock or SystemClock(), deliver)
-    return CanDriver(port, open_source=bus.open)
+    port = BusPort("can0", STREAMS, clock or SystemClock(), deliver)
+    return CanDriver(bus_table, port, open_source=bus.open, logs=logs)
 
 
 def only_file(folder: Path) -> Path:
@@ -134,8 +137,8 @@ def only_file(folder: Path) -> Path:
 async def replayed(path: Path) -> tuple[ReplayDriver, list[SampleBlock]]:
     """A recording played as fast as it goes, to its end."""
     blocks: list[SampleBlock] = []
-    options = {"file": path, "at_end": "stop", "pace": "unpaced"}
-    driver = ReplayDriver(BusPort("can0", options, STREAMS, DrivenClock(), blocks.append))
+    bus = replay_bus(file=path, at_end="stop", pace="unpaced")
+    driver = ReplayDriver(bus, BusPort("can0", STREAMS, DrivenClock(), blocks.append))
     async with asyncio.timeout(20):
         await driver.run()
     return driver, blocks

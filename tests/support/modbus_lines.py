@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pymodbus.transport import CommParams, CommType, ModbusProtocol
+from support.bus_tables import modbus_bus
 from support.clocks import LoopClock
 
 from daqsvc.acquisition.clock import SystemClock
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 
     from daqsvc.acquisition.samples import SampleBlock
-    from drivers.modbus.layouts import ModbusLayout
+    from drivers.modbus.settings import ModbusLayout
     from sim_hw.nodes.modbus_node import FaultPlan
     from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -41,10 +42,8 @@ class Rig:
     ) -> None:
         specs = [StreamSpec(name, layout, rate_hz) for name, (layout, rate_hz) in streams.items()]
         self.blocks: dict[str, list[SampleBlock]] = {name: [] for name in streams}
-        port = BusPort(
-            "mb", options, specs, clock or SystemClock(), lambda b: self.blocks[b.stream].append(b), start
-        )
-        self.driver = ModbusDriver(port)
+        port = BusPort("mb", specs, clock or SystemClock(), lambda b: self.blocks[b.stream].append(b), start)
+        self.driver = ModbusDriver(modbus_bus(**options), port)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[ModbusDriver]:
@@ -212,4 +211,4 @@ def ramp(n: int, channels: int = 2, first: int = 0) -> np.ndarray:
 
 
 def field_names(layouts: Sequence[ModbusLayout]) -> list[str]:
-    return [field.name for layout in layouts for field in layout.record.fields]
+    return [channel.name for layout in layouts for channel in layout.channels]

@@ -15,6 +15,7 @@ import numpy as np
 from drivers.base import StreamSpec
 from drivers.make import stream_layout
 from drivers.serial.driver import framing_of
+from drivers.serial.settings import SerialBus
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
@@ -262,7 +263,8 @@ class RogueDevices(threading.Thread):
                 sequence = RogueFrames(_can_encoder(spec.layout), self._seed + 10 + k)
                 step = self._can_step(sequence, spec.layout.frame_id)
             else:
-                bus = machine.buses[machine.streams[name].bus].model_dump()
+                bus = machine.buses[machine.streams[name].bus]
+                assert isinstance(bus, SerialBus)
                 framing = framing_of(bus, [spec])
                 encode = lambda c, x, f=framing, n=name: f.encode(n, c, x, clip=True)  # noqa: E731
                 step = self._serial_step(RogueFrames(encode, self._seed + 10 + k, text=name == "lines"), name)

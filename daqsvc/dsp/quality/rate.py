@@ -221,7 +221,7 @@ class ArrivalRate:
     def _is_nominal(self, rate_hz: float) -> bool:
         return abs(rate_hz / self._nominal_hz - 1.0) <= FITS
 
-    def take(self, arrival_ns: NDArray[np.int64]) -> None:
+    def add(self, arrival_ns: NDArray[np.int64]) -> None:
         """Take in arrivals.
 
         Args:

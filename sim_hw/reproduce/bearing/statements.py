@@ -122,14 +122,16 @@ def _ball(experiment: BearingExperiment) -> ResultRow:
 
 
 def _service(experiment: BearingExperiment) -> ResultRow:
-    said = {fault: experiment.verdicts[fault] for fault in ("healthy", "inner", "outer")}
-    right = sum(said[f] == expected for f, expected in zip(said, ("normal", "inner", "outer"), strict=True))
+    declared = {fault: experiment.verdicts[fault] for fault in ("healthy", "inner", "outer")}
+    right = sum(
+        declared[f] == expected for f, expected in zip(declared, ("normal", "inner", "outer"), strict=True)
+    )
     return ResultRow(
         name="bearing-service",
         figure="V",
         paper="detects and diagnoses inner and outer raceway faults",
-        obtained=", ".join(f"{fault}: {verdict}" for fault, verdict in said.items()),
-        agrees=right == len(said),
+        obtained=", ".join(f"{fault}: {verdict}" for fault, verdict in declared.items()),
+        agrees=right == len(declared),
         remark="the service's detectors on a simulated machine with slip, load zone, noise and parameters up "
         "to 10 % off",
         values={"right": float(right)},

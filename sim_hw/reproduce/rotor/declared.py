@@ -73,7 +73,7 @@ def _order(experiment: RotorExperiment) -> Iterable[ResultRow]:
     for rule, spoken_rule in _SPOKEN_RULES.items():
         changes = experiment.shown[rule].changes
         delays = delays_rev(changes, experiment.begins_rev, experiment.end_rev)
-        found = bool(np.isfinite(delays).all())
+        all_declared = bool(np.isfinite(delays).all())
         only = [mode for _, mode in changes] == list(range(len(MODES)))
         at = [
             f"{spoken(mode)} "
@@ -86,7 +86,7 @@ def _order(experiment: RotorExperiment) -> Iterable[ResultRow]:
             paper="N, F1, F1 L2 and F1 L3 are detected one after the other" if rule == "paper" else "",
             obtained=f"{spoken_rule}: first declared rightly at t = {', '.join(at)}; "
             + ("nothing else is declared" if only else f"{len(changes)} changes of the declared mode in all"),
-            agrees=found if rule == "paper" else None,
+            agrees=all_declared if rule == "paper" else None,
             remark=f"the run of the figures, {in_decibels(experiment.snr_db)}.",
             values={
                 "changes": len(changes),

@@ -117,8 +117,8 @@ def delays_rev(changes: Sequence[tuple[int, int]], begins_rev: Sequence[float], 
         if before and before[-1] == mode:
             delays[mode] = 0.0
         else:
-            found = (rev - begin for rev, declared in at if declared == mode and begin <= rev < end)
-            delays[mode] = min(found, default=np.inf)
+            after_rev = (rev - begin for rev, declared in at if declared == mode and begin <= rev < end)
+            delays[mode] = min(after_rev, default=np.inf)
     return delays
 
 

@@ -287,21 +287,21 @@ def convergence(experiment: RotorExperiment) -> Convergence:
 
 
 def _convergence(experiment: RotorExperiment) -> Iterable[ResultRow]:
-    found = convergence(experiment)
-    converges = math.isfinite(found.begins)
+    converging = convergence(experiment)
+    converges = math.isfinite(converging.begins)
     yield ResultRow(
         name="convergence",
         figure="5",
         paper=f"the F1 L3 observer error begins to converge at t = {CONVERGENCE:g} s",
-        obtained=(f"at t = {found.begins:.0f} s; " if converges else "it does not; ")
-        + f"from {found.before:.2f} rms in F1 L2 to {found.after:.2f} rms",
-        agrees=abs(found.begins - CONVERGENCE) <= _CONVERGENCE_TOLERANCE
-        and found.after < _CONVERGING * found.before,
+        obtained=(f"at t = {converging.begins:.0f} s; " if converges else "it does not; ")
+        + f"from {converging.before:.2f} rms in F1 L2 to {converging.after:.2f} rms",
+        agrees=abs(converging.begins - CONVERGENCE) <= _CONVERGENCE_TOLERANCE
+        and converging.after < _CONVERGING * converging.before,
         remark=f"begins: RMS over a revolution below {100 * _CONVERGING:.0f} % of that in F1 L2, for "
         "the first time. The paper gives no gain; this one trusts its model.",
         values={
-            **({"begins_s": found.begins} if converges else {}),
-            "error_before": found.before,
-            "error_after": found.after,
+            **({"begins_s": converging.begins} if converges else {}),
+            "error_before": converging.before,
+            "error_after": converging.after,
         },
     )

@@ -9,7 +9,9 @@ from types import SimpleNamespace
 
 import pytest
 from support.alarm_rig import RIG
+from support.bus_tables import modbus_bus
 from support.clocks import LoopClock
+from support.modbus_layouts import register, registers_layout
 from support.modbus_lines import options_of, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -24,8 +26,6 @@ from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.dsp.quality.missing import Patience
 from drivers.base import BusPort, StreamSpec
 from drivers.modbus.driver import ModbusDriver
-from drivers.modbus.layouts import TrendLayout
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
@@ -33,9 +33,7 @@ pytestmark = pytest.mark.integration
 RATE_HZ = 1 / 60
 MINUTE_NS = 60 * NS_PER_S
 HOT = LevelRule("hot", "oil", "value", Setpoint(alert=80.0, deadband=2.0, on_delay_ns=5 * NS_PER_S))
-REGISTERS = TrendLayout(
-    1, "holding", RegisterRecord((RegisterField("oil", 0, "int16"),), (RegisterRun(0, 1),))
-)
+REGISTERS = registers_layout(1, "holding", [register("oil", 0, "int16")])
 
 
 class AtOnce:
@@ -64,13 +62,12 @@ class Oil:
         ring = SampleRing("trend", ("oil",), 16)
         port = BusPort(
             "mb",
-            options_of(serial=True, timeout_ms=500.0),
             [StreamSpec("trend", REGISTERS, RATE_HZ)],
             LoopClock(),
             ring.write,
             "retry",
         )
-        self._driver = ModbusDriver(port)
+        self._driver = ModbusDriver(modbus_bus(**options_of(serial=True, timeout_ms=500.0)), port)
         channel = TrendChannel("oil", 0, "degC", [Limits("value", 80.0, None)])
         detector = TrendDetector("rig", "trend", RATE_HZ, [channel])
         self._pipeline = Pipeline(

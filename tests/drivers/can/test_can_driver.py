@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.clocks import QuickClock
 from support.fake_can import FaultyBus
 from support.running_drivers import begun
@@ -55,12 +56,14 @@ def message(frame: int, **changes: Any) -> can.Message:
 def port(blocks: list[SampleBlock], **changes: Any) -> BusPort:
     arguments: dict[str, Any] = {
         "name": "can0",
-        "options": {"interface": "faulty", "channel": "test", "fd": True},
         "streams": [StreamSpec("shaft", layout(), 1000.0)],
         "clock": QuickClock(),
         "deliver": blocks.append,
     }
     return BusPort(**(arguments | changes))
+
+
+FAULTY = can_bus(interface="faulty", channel="test", fd=True)
 
 
 @pytest.fixture(autouse=True)
@@ -70,12 +73,12 @@ def _renew() -> None:
 
 async def test_frames_of_a_virtual_bus_become_blocks() -> None:
     blocks: list[SampleBlock] = []
-    options = {"interface": "virtual", "channel": "test_frames_become_blocks", "fd": True}
-    driver = CanDriver(port(blocks, options=options))
+    bus_table = can_bus(interface="virtual", channel="test_frames_become_blocks", fd=True)
+    driver = CanDriver(bus_table, port(blocks))
     async with begun(driver):
         await eventually(lambda: driver.link.state == "up")
         with can.Bus(
-            interface="virtual", channel=options["channel"], protocol=can.CanProtocol.CAN_FD
+            interface="virtual", channel=bus_table.channel, protocol=can.CanProtocol.CAN_FD
         ) as sender:
             for frame in range(100):
                 sender.send(message(frame))
@@ -88,7 +91,7 @@ async def test_frames_of_a_virtual_bus_become_blocks() -> None:
 
 async def test_what_is_no_sample_is_counted_and_said_once(caplog: pytest.LogCaptureFixture) -> None:
     blocks: list[SampleBlock] = []
-    driver = CanDriver(port(blocks))
+    driver = CanDriver(FAULTY, port(blocks))
     short = message(1).data[:40]
     strays = [
         *[message(0, arbitration_id=0x7FF)] * 3,
@@ -132,7 +135,7 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
     failure: Any, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     blocks: list[SampleBlock] = []
-    driver = CanDriver(port(blocks))
+    driver = CanDriver(FAULTY, port(blocks))
     with caplog.at_level(logging.WARNING):
         async with begun(driver):
             for frame in range(5):
@@ -156,7 +159,7 @@ async def test_a_lost_bus_is_opened_again_and_its_loss_counted(
 
 
 async def test_an_adapter_that_reports_bus_off_by_its_state_is_opened_again() -> None:
-    driver = CanDriver(port([]))
+    driver = CanDriver(FAULTY, port([]))
     async with begun(driver):
         await eventually(lambda: driver.link.state == "up")
         FaultyBus.dead = True
@@ -169,7 +172,7 @@ async def test_a_hundred_losses_leave_no_thread_behind() -> None:
     import threading
 
     blocks: list[SampleBlock] = []
-    driver = CanDriver(port(blocks))
+    driver = CanDriver(FAULTY, port(blocks))
     before = threading.active_count()
     async with begun(driver):
         for k in range(100):
@@ -188,13 +191,13 @@ async def test_a_hundred_losses_leave_no_thread_behind() -> None:
 async def test_absent_at_start_follows_the_policy() -> None:
     FaultyBus.open_errors = [can.CanInitializationError("no such interface")]
     with pytest.raises(DeviceAbsentError, match=r"'can0'.*no such interface"):
-        await CanDriver(port([], start="error")).run()
+        await CanDriver(FAULTY, port([], start="error")).run()
     FaultyBus.open_errors = [can.CanInitializationError("no such interface")]
-    ignoring = CanDriver(port([], start="ignore"))
+    ignoring = CanDriver(FAULTY, port([], start="ignore"))
     await ignoring.run()
     assert ignoring.counters.open_failures == 1
     FaultyBus.open_errors = [OSError("no"), can.CanInitializationError("no"), ValueError("no")]
-    retrying = CanDriver(port([]))
+    retrying = CanDriver(FAULTY, port([]))
     async with begun(retrying):
         await eventually(lambda: retrying.link.state == "up")
     assert retrying.counters.open_failures == 3
@@ -202,7 +205,7 @@ async def test_absent_at_start_follows_the_policy() -> None:
 
 async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
     blocks: list[SampleBlock] = []
-    driver = CanDriver(port(blocks, streams=[StreamSpec("shaft", layout(), 1000.0, 10_000_000_000)]))
+    driver = CanDriver(FAULTY, port(blocks, streams=[StreamSpec("shaft", layout(), 1000.0, 10_000_000_000)]))
     async with begun(driver):
         for frame in (0, 1, 3):
             FaultyBus.inbox.put(message(frame))
@@ -215,7 +218,7 @@ async def test_what_is_held_back_is_handed_over_at_the_end() -> None:
 async def test_the_virtual_bus_tells_of_its_overflows_as_a_controller_does(tmp_path: Path) -> None:
     path = str(tmp_path / "can0")
     blocks: list[SampleBlock] = []
-    driver = CanDriver(port(blocks, options={"interface": "unixbus", "channel": path, "fd": True}))
+    driver = CanDriver(can_bus(interface="unixbus", channel=path, fd=True), port(blocks))
     async with begun(driver):
         await eventually(lambda: driver.link.state == "up")
         with can.Bus(interface="unixbus", channel=path, fd=True, hub="join") as peer:

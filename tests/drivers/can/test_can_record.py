@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import can
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_recordings import (
     ENDINGS,
     batch,
@@ -114,8 +115,8 @@ def test_every_frame_is_there_to_the_bit_with_its_time(tmp_path: Path, log_forma
     ]
     made, counters = recorder(OneLog(tmp_path / f"run{ENDINGS[log_format]}"), clock)
     t_ns = [NS_PER_S + 1234_000 * k for k in range(len(frames))]
-    made.take(batch_of(frames[:5], t_ns[:5]))
-    made.take(batch_of(frames[5:], t_ns[5:]))
+    made.record(batch_of(frames[:5], t_ns[:5]))
+    made.record(batch_of(frames[5:], t_ns[5:]))
     made.close()
     assert counters.frames_recorded == len(frames)
     with can.LogReader(tmp_path / f"run{ENDINGS[log_format]}") as log:
@@ -136,7 +137,7 @@ def test_a_candump_log_says_what_error_and_remote_frames_say(tmp_path: Path) -> 
         arbitration_id=0x24, is_extended_id=False, is_error_frame=True, data=b"\0\x20" + bytes(6)
     )
     remote = can.Message(arbitration_id=0x55, is_extended_id=False, is_remote_frame=True, dlc=6)
-    made.take(batch_of([error, remote], [NS_PER_S, NS_PER_S + 1_500]))
+    made.record(batch_of([error, remote], [NS_PER_S, NS_PER_S + 1_500]))
     made.close()
     assert (tmp_path / "run.log").read_text() == (
         "(1790000000.000000) can0 20000024#0020000000000000\n(1790000000.000001) can0 055#R6\n"
@@ -147,14 +148,14 @@ def test_a_step_of_the_wall_clock_is_no_step_between_frames(tmp_path: Path) -> N
     clock = SettableClock(NS_PER_S, 1_790_000_000 * NS_PER_S)
     logs = LogFolder(tmp_path, "can0", "candump", file_bytes=2000.0, keep_bytes=1e9)
     made, counters = recorder(logs, clock)
-    made.take(batch(0, 10))
+    made.record(batch(0, 10))
     while counters.frames_recorded < 10:
         os.sched_yield()
     clock.set_wall(-3600)
-    made.take(batch(10, 100))  # in the same file, which is full with it
+    made.record(batch(10, 100))  # in the same file, which is full with it
     while counters.frames_recorded < 110:
         os.sched_yield()
-    made.take(batch(110, 1))
+    made.record(batch(110, 1))
     made.close()
     later, first = sorted(tmp_path.iterdir())
     with can.LogReader(first) as log:
@@ -177,7 +178,7 @@ def test_the_oldest_files_make_room_and_no_others(tmp_path: Path, log_format: st
     logs = LogFolder(tmp_path, "can0", log_format, file_bytes=20_000, keep_bytes=100_000)
     made, counters = recorder(logs, clock)
     for k in range(200):
-        made.take(batch(100 * k, 100))
+        made.record(batch(100 * k, 100))
         # Numbers that do not compress; a container of BLF is written when its time has come.
         clock.advance_to(clock.monotonic_ns() + NS_PER_S)
         while counters.frames_recorded < 100 * (k + 1):
@@ -239,7 +240,7 @@ def test_a_full_disk_costs_what_is_counted_and_is_said_once(
         if k == 80:
             assert counters.frames_unrecorded >= 1000
             disk.writes = 1 << 30
-        made.take(batch(100 * k, 100))
+        made.record(batch(100 * k, 100))
         clock.advance_to(clock.monotonic_ns() + NS_PER_S)
         settled(100 * (k + 1))
     made.close()
@@ -259,7 +260,7 @@ def test_a_full_disk_costs_what_is_counted_and_is_said_once(
 
 async def test_files_that_the_system_limits_go_on_in_others(bus: StandInBus, tmp_path: Path) -> None:
     """A real refusal of the kernel, half-way through a write: EFBIG."""
-    driver = recorded_driver(bus, {"file": tmp_path / "run.log"})
+    driver = recorded_driver(bus, None, logs=OneLog(tmp_path / "run.log"))
     sent = [frame_bytes(0x300, k.to_bytes(8, "little")) for k in range(3000)]
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     async with running(driver):
@@ -293,7 +294,7 @@ def test_a_disk_that_takes_a_little_now_and_then_is_spoken_of_once(
     for k in range(60):
         if k % 4 == 3:
             disk.writes += 1
-        made.take(batch(k, 1))
+        made.record(batch(k, 1))
         clock.advance_to(clock.monotonic_ns() + NS_PER_S)
         while counters.frames_recorded + counters.frames_unrecorded <= k:
             os.sched_yield()
@@ -395,7 +396,7 @@ async def test_a_file_that_breaks_off_anywhere_is_played_that_far(tmp_path: Path
     whole = tmp_path / f"whole{ENDINGS[log_format]}"
     made, _ = recorder(OneLog(whole))
     for k in range(20):
-        made.take(batch(20 * k, 20))
+        made.record(batch(20 * k, 20))
     made.close()
     content = whole.read_bytes()
     broken = tmp_path / f"broken{ENDINGS[log_format]}"
@@ -457,6 +458,8 @@ async def test_the_recording_outlives_the_link(bus: StandInBus, tmp_path: Path) 
 def test_fd_frames_that_an_adapter_is_told_not_to_read_are_said_to_be_missing(
     options: dict[str, Any], *, missing: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    port = BusPort("can0", options | {"record": {"file": tmp_path / "run.log"}}, [], SystemClock(), print)
-    assert can_record.recorder_of(port, "CAN bus 'can0'", CanCounters()) is not None
+    port = BusPort("can0", [], SystemClock(), print)
+    logs = OneLog(tmp_path / "run.log")
+    made = can_record.recorder_of(can_bus(**options), port, "CAN bus 'can0'", CanCounters(), logs)
+    assert made is not None
     assert ("CAN FD frames are neither read nor recorded" in caplog.text) is missing

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from support.examples import examples
 
 from drivers.can.adapter import batch_of
-from drivers.can.batches import ERROR, DecodedBatch
+from drivers.can.batches import ERROR
 from drivers.can.record_files import ENDINGS, LogFile, encoder_for
+from drivers.frames import DecodedBatch
 from drivers.replay.can_log import CanLog
 
 pytestmark = pytest.mark.property

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import SampleBlock
     from daqsvc.settings.models import MachineFile
-    from drivers.can.batches import DecodedBatch
-    from drivers.frames import FrameLayout
+    from drivers.frames import DecodedBatch, FrameLayout
 
 pytestmark = [pytest.mark.integration, pytest.mark.data]
 
@@ -97,15 +96,15 @@ def test_every_signal_of_every_frame_is_what_cantools_reads(data: Path, recordin
     )
     assert not any(piece.wrong_length for piece in pieces)
     for frame_id, message in messages.items():
-        parts = [part for piece in pieces for part in piece.frames if part.stream == message.name]
+        parts = [piece.frames[message.name] for piece in pieces if message.name in piece.frames]
         payloads = [payload for name, payload in written if name == frame_id]
         first, *rest = (signal.name for signal in message.signals)
-        counts = np.concatenate([part.decoded.counter for part in parts])
+        counts = np.concatenate([part.counter for part in parts])
         raw: list[Any] = [message.decode(p, decode_choices=False, scaling=False) for p in payloads]
         physical: list[Any] = [message.decode(p, decode_choices=False) for p in payloads]
         assert counts.tolist() == [row[first] for row in raw]
         if rest:
-            values = np.concatenate([part.decoded.samples[:, 0] for part in parts])
+            values = np.concatenate([part.samples[:, 0] for part in parts])
             expected = np.array([[row[name] for name in rest] for row in physical], np.float64)
             np.testing.assert_allclose(values, expected, rtol=2e-7, atol=1e-12)
 
@@ -116,7 +115,7 @@ def test_the_imu_feels_gravity_and_nothing_else(data: Path) -> None:
     axes = {axis: [f"Acceleration{axis.upper()}"] for axis in "xyz"}
     layout = layout_from_dbc(data / dbc_path, "gnss_imu", counter="ImuValid", counts="frames", channels=axes)
     pieces = played(data / log_path, [StreamSpec("imu", layout, 100.0)])
-    felt = np.concatenate([part.decoded.samples[:, 0] for piece in pieces for part in piece.frames])
+    felt = np.concatenate([part.samples[:, 0] for piece in pieces for part in piece.frames.values()])
     assert np.linalg.norm(felt.mean(axis=0)) == pytest.approx(9.81, abs=1.0)
     assert felt.std(axis=0).max() < 0.5
 

@@ -143,7 +143,7 @@ def test_pages_go_to_their_streams_and_are_encoded_as_they_are_read(paged: Path)
     sorter = FrameDemultiplexer([StreamSpec(name, layout, 100.0) for name, layout in layouts.items()])
     ids = np.full(3, 2566844416, np.uint32)
     found = sorter.sort(CanBatch(ids, np.full(3, 12), data, np.arange(3)), 0)
-    got = {part.stream: part.decoded.samples.ravel().tolist() for part in found.frames}
+    got = {name: part.samples.ravel().tolist() for name, part in found.frames.items()}
     assert got == {"LittleSigned": [-100.0], "Nested": [-5.0]}
     assert list(found.unknown.values()) == [found.notes["frames_unknown"]] == [1]
     assert "page of no stream" in next(iter(found.unknown))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import can
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.machine_files import MACHINES, changed, problems_of
 
 from daqsvc.acquisition.clock import SystemClock
@@ -35,9 +36,9 @@ GROUP_AND_SOURCE = 0xFF0380
 async def test_frames_of_any_priority_are_one_stream() -> None:
     layout = frame_layout(load_machine_file(PUMP_SET), "housing")
     blocks: list[SampleBlock] = []
-    options = {"interface": "virtual", "channel": "j1939", "options": {"receive_own_messages": False}}
+    bus_table = can_bus(interface="virtual", channel="j1939", options={"receive_own_messages": False})
     specs = [StreamSpec("housing", layout, 100.0, 0)]
-    driver = CanDriver(BusPort("can0", options, specs, SystemClock(), blocks.append))
+    driver = CanDriver(bus_table, BusPort("can0", specs, SystemClock(), blocks.append))
     task = asyncio.create_task(driver.run())
     with can.Bus(interface="virtual", channel="j1939") as bus:
         while driver.link.state != "up":
@@ -105,8 +106,8 @@ async def test_the_standard_message_has_no_counter_and_its_loss_is_told_all_the_
     clock = SystemClock()
     source = Played(sent, clock.monotonic_ns() - 20_000_000_000)
     specs = [StreamSpec("foot", frame_layout(machine, "foot"), 100.0)]
-    port = BusPort("can0", {"interface": "played", "channel": "x"}, specs, clock, blocks.append)
-    driver = CanDriver(port, lambda _port, _sorter: source)
+    port = BusPort("can0", specs, clock, blocks.append)
+    driver = CanDriver(can_bus(interface="played", channel="x"), port, lambda _port, _sorter: source)
     task = asyncio.create_task(driver.run())
     async with asyncio.timeout(20):
         while driver.streams["foot"][0].frames_received < len(sent):

@@ -24,7 +24,8 @@ def test_a_recorded_bus_is_described_and_its_folder_is_beside_the_machine_file()
     assert "recorded as candump in can, 500 MB at most" in describe(machine).replace("\n", " ")
     driver = bus_driver(machine, "can0", SystemClock(), lambda _: None)
     assert isinstance(driver, CanDriver)
-    assert driver._port.options["record"] == {
+    assert driver._bus.record is not None
+    assert driver._bus.record.model_dump() == {
         "folder": Path("/etc/daqsvc/can"),
         "format": "candump",
         "file_mb": 64,

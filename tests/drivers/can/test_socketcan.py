@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_standin import frame_bytes
 from support.clocks import SettableClock
 
@@ -166,9 +167,11 @@ def test_descriptors_past_1024_are_read() -> None:
 
 def test_an_interface_that_cannot_be_opened_says_why() -> None:
     with pytest.raises(OSError, match=r"no-such-can0|No such device|has no SocketCAN"):
-        open_socketcan({"channel": "no-such-can0"}, [], SystemClock())
+        open_socketcan(can_bus(interface="socketcan", channel="no-such-can0"), [], SystemClock())
     with pytest.raises(OSError, match=r"options \['bitrat'\] mean nothing to SocketCAN"):
-        open_socketcan({"channel": "can0", "options": {"bitrat": 1}}, [], SystemClock())
+        open_socketcan(
+            can_bus(interface="socketcan", channel="can0", options={"bitrat": 1}), [], SystemClock()
+        )
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0, 0.5, -0.5])
@@ -260,11 +263,11 @@ def test_frames_are_sorted_to_streams_in_their_order() -> None:
     frames += [(0x101, b"short"), (0x666, b""), (0x101 | REMOTE, b""), (ERROR | 0x40, bytes(8))]
     found = sorter.sort(batch(frames), 0)
     got = {
-        part.stream: list(zip(part.decoded.counter.tolist(), part.arrival_ns.tolist(), strict=True))
-        for part in found.frames
+        name: list(zip(part.counter.tolist(), part.arrival_ns.tolist(), strict=True))
+        for name, part in found.frames.items()
     }
     assert got == expected
-    assert all((part.decoded.samples[:, :, 0] == part.arrival_ns[:, None]).all() for part in found.frames)
+    assert all((part.samples[:, :, 0] == part.arrival_ns[:, None]).all() for part in found.frames.values())
     assert found.wrong_length == {"a": (1, 5)}
     assert found.unknown == {"0x666 (11 bit)": 1}
     assert found.notes == {"frames_unknown": 1, "frames_remote": 1, "frames_error": 1}
@@ -275,7 +278,7 @@ def test_frames_are_sorted_to_streams_in_their_order() -> None:
 def test_two_streams_may_share_an_id() -> None:
     sorter = FrameDemultiplexer([StreamSpec("a", layout(), 100.0), StreamSpec("b", layout(), 100.0)])
     found = sorter.sort(batch([(0x101, bytes(8))]), 0)
-    assert sorted(part.stream for part in found.frames) == ["a", "b"]
+    assert sorted(found.frames) == ["a", "b"]
 
 
 @pytest.mark.parametrize(

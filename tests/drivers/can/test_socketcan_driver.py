@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_standin import StandInBus, frame_bytes
 from support.running_drivers import CountingDevice, running
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
-from drivers.can.batches import ERROR, DecodedBatch
+from drivers.can.batches import ERROR
 from drivers.can.driver import CanDriver
-from drivers.frames import FrameLayout
+from drivers.frames import DecodedBatch, FrameLayout
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -40,9 +41,8 @@ def sample_frame(frame: int) -> bytes:
 
 
 def driver_on(bus: StandInBus, blocks: list[SampleBlock]) -> CanDriver:
-    options = {"interface": "socketcan", "channel": "can7"}
-    port = BusPort("can0", options, [StreamSpec("s", LAYOUT, 3000.0)], SystemClock(), blocks.append)
-    return CanDriver(port, open_source=bus.open)
+    port = BusPort("can0", [StreamSpec("s", LAYOUT, 3000.0)], SystemClock(), blocks.append)
+    return CanDriver(can_bus(interface="socketcan", channel="can7"), port, open_source=bus.open)
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ async def test_bus_off_and_restart_in_one_batch_are_one_loss() -> None:
     source_errors = np.array([ERROR | 0x40, ERROR | 0x100], np.uint32)
     from drivers.can.errors import ErrorCounts
 
-    driver.take(DecodedBatch(errors=ErrorCounts.of(source_errors, np.zeros((2, 8), np.uint8))))
+    driver.accept(DecodedBatch(errors=ErrorCounts.of(source_errors, np.zeros((2, 8), np.uint8))))
     assert (driver.link.state, driver.link.losses) == ("up", 1)
 
 
@@ -124,8 +124,8 @@ async def test_frames_that_the_kernel_dropped_are_counted_and_said_once(
 ) -> None:
     driver = driver_on(StandInBus(), [])
     with caplog.at_level(logging.WARNING):
-        driver.take(DecodedBatch(notes={"frames_overrun": 3}))
-        driver.take(DecodedBatch(notes={"frames_overrun": 4}))
+        driver.accept(DecodedBatch(notes={"frames_overrun": 3}))
+        driver.accept(DecodedBatch(notes={"frames_overrun": 4}))
     assert driver.counters.frames_overrun == 7
     assert [record.message for record in caplog.records if "receive_buffer_bytes" in record.message] == [
         caplog.records[0].message

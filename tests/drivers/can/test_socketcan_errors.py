@@ -44,11 +44,11 @@ def test_each_class_is_read(classes: int, payload: bytes, counts: dict[str, int]
 
 def test_the_last_state_counts_and_the_error_counters_are_kept() -> None:
     counters = CanCounters()
-    counters.take(read((0x204, b"\x00\x20\x00\x00\x00\x00\x80\x07"), (0x040, b"")))
+    counters.add(read((0x204, b"\x00\x20\x00\x00\x00\x00\x80\x07"), (0x040, b"")))
     assert (counters.controller_state, counters.tx_errors, counters.rx_errors) == ("bus-off", 128, 7)
-    counters.take(read((0x020, b"")))
+    counters.add(read((0x020, b"")))
     assert counters.controller_state == "bus-off", "a frame that tells no state changes none"
-    counters.take(read((0x100, b""), (0x004, b"\x00\x08")))
+    counters.add(read((0x100, b""), (0x004, b"\x00\x08")))
     assert counters.controller_state == "error-warning"
     assert (counters.bus_off, counters.restarts, counters.no_acknowledge) == (1, 1, 1)
 

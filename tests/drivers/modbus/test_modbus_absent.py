@@ -11,23 +11,30 @@ import struct
 import numpy as np
 import pytest
 from support.clocks import LoopClock
+from support.modbus_layouts import (
+    count_at,
+    fifo_layout,
+    in_sample,
+    register,
+    registers_layout,
+    ring_layout,
+    waveform_layout,
+)
 from support.modbus_lines import Rig, options_of, responding, simulate
 
-from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
 
 pytestmark = pytest.mark.integration
-FIELDS = (RegisterField("x", 0, "float32"), RegisterField("y", 2, "float64"))
-SAMPLE = sample_record(list(FIELDS))
+FIELDS = (register("x", 0, "float32"), register("y", 2, "float64"))
+SAMPLE = (in_sample("x", 0, "float32"), in_sample("y", 2, "float64"))
 SENT = [(1.5, -2.0), (math.inf, 1.0), (2.5, -math.inf), (math.nan, 3.0), (3.4e38, 1e39), (-1.5, 0.25)]
 ABSENT = 4  # 1e39 is more than any float32
 LAYOUTS = {
-    "registers": TrendLayout(1, "holding", RegisterRecord(FIELDS, (RegisterRun(0, 6),))),
-    "fifo": Fifo(1, 33, Count(0, 32), SAMPLE, poll_ns=20_000_000),
-    "ring": Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=20_000_000),
-    "waveform": Waveform(1, "holding", 0, 100, len(SENT), SAMPLE, poll_ns=20_000_000),
+    "registers": registers_layout(1, "holding", FIELDS),
+    "fifo": fifo_layout(1, 33, count_at(0, 32), SAMPLE, poll_ns=20_000_000),
+    "ring": ring_layout(1, "holding", count_at(0, 32), 100, 64, SAMPLE, poll_ns=20_000_000),
+    "waveform": waveform_layout(1, "holding", 0, 100, len(SENT), SAMPLE, poll_ns=20_000_000),
 }
 
 

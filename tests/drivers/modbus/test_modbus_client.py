@@ -13,9 +13,10 @@ from unittest import mock
 import pytest
 import serial
 from pymodbus.framer import FramerRTU
+from support.bus_tables import modbus_bus
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus.client import LineOptions, ModbusClient
+from drivers.modbus.client import ModbusClient
 from drivers.modbus.replies import LineLostError, ModbusCounters, NoReplyError
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 
@@ -49,7 +50,7 @@ async def far_end(*answers):
     server = await asyncio.start_server(talk, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     counters = ModbusCounters()
-    options = LineOptions("tcp", host="127.0.0.1", tcp_port=port, timeout_ns=TIMEOUT_NS)
+    options = modbus_bus(transport="tcp", host="127.0.0.1", tcp_port=port, timeout_ms=TIMEOUT_NS / 1e6)
     client = ModbusClient(options, SystemClock(), counters)
     await client.connect()
     try:
@@ -113,25 +114,25 @@ def nobody(tmp_path):
     """A TCP port that somebody has, and on which nobody listens."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
-        yield LineOptions("tcp", host="127.0.0.1", tcp_port=taken.getsockname()[1])
+        yield modbus_bus(transport="tcp", host="127.0.0.1", tcp_port=taken.getsockname()[1])
 
 
 @contextlib.contextmanager
 def unknown(tmp_path):
     nowhere = mock.Mock(side_effect=socket.gaierror(socket.EAI_NONAME, "Name or service not known"))
     with mock.patch.object(socket, "getaddrinfo", nowhere):
-        yield LineOptions("tcp", host="no-such-host.invalid", tcp_port=502)
+        yield modbus_bus(transport="tcp", host="no-such-host.invalid", tcp_port=502)
 
 
 @contextlib.contextmanager
 def unplugged(tmp_path):
-    yield LineOptions("rtu", serial_port=str(tmp_path / "ttyUSB0"))
+    yield modbus_bus(transport="rtu", serial_port=str(tmp_path / "ttyUSB0"))
 
 
 @contextlib.contextmanager
 def in_use(tmp_path):
     with PseudoTerminal(tmp_path / "port"), serial.Serial(str(tmp_path / "port"), exclusive=True):
-        yield LineOptions("rtu", serial_port=str(tmp_path / "port"), parity="none")
+        yield modbus_bus(transport="rtu", serial_port=str(tmp_path / "port"), parity="none")
 
 
 @pytest.mark.parametrize(
@@ -163,8 +164,8 @@ async def test_what_came_while_this_process_was_suspended_is_not_the_reply_to_th
     """The quiet time has passed by the clock, but nobody has looked at what came in it."""
     counters = ModbusCounters()
     with PseudoTerminal(tmp_path / "port") as cable:
-        options = LineOptions(
-            "rtu", serial_port=str(cable.path), parity="none", timeout_ns=round(PATIENT_S * 1e9)
+        options = modbus_bus(
+            transport="rtu", serial_port=str(cable.path), parity="none", timeout_ms=1e3 * PATIENT_S
         )
         client = ModbusClient(options, SystemClock(), counters)
         await client.connect()

@@ -12,25 +12,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
+from support.modbus_layouts import count_at, fifo_layout, in_sample, page_at, ring_layout, waveform_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import link as supervision
-from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
-from drivers.modbus.registers import RegisterField
+from drivers.modbus.registers import RegisterRecord, RegisterRun
+from drivers.modbus.settings import FifoLayout, RingLayout, WaveformLayout
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, WaveformStore, store_for
 
 pytestmark = pytest.mark.property
 RATE_HZ = 500.0
 WORD = 30_000
-SAMPLE = sample_record([RegisterField("low", 0, "int16"), RegisterField("high", 1, "int16")])
+SAMPLE = (in_sample("low", 0, "int16"), in_sample("high", 1, "int16"))
+RECORD = RegisterRecord(SAMPLE, (RegisterRun(0, 2),))
 BLOCK = 60
 
 
 def rows_of(first, n):
     """The registers of the samples with these numbers; no sample has the number 0."""
     numbers = np.arange(first, first + n)
-    return SAMPLE.encode(np.stack([numbers % WORD, numbers // WORD], axis=1).astype(np.float32))
+    return RECORD.encode(np.stack([numbers % WORD, numbers // WORD], axis=1).astype(np.float32))
 
 
 def numbers_of(samples):
@@ -62,7 +64,7 @@ class Device:
     def _on(self, count):
         self._told = {}
         self._unit = ModbusUnit()
-        if isinstance(self.layout, Fifo):
+        if isinstance(self.layout, FifoLayout):
             self._store = FifoStore(self._unit, self.layout, self._depth)
         else:
             self._store = store_for(self._unit, self.layout)
@@ -71,7 +73,7 @@ class Device:
         self._since_s = asyncio.get_running_loop().time()
         self._first = self._count = count
         self.on = True
-        if isinstance(self.layout, Ring) and count:
+        if isinstance(self.layout, RingLayout) and count:
             # It has run before, and the ring is full of what it has sampled.
             before = min(count, self.layout.depth)
             self._store.put(count - before, rows_of(1, before))
@@ -115,18 +117,18 @@ class Device:
         if self._rng.random() < self._damaged:
             told = int.from_bytes(reply[at : at + self._count_bytes], "big")
             # Of a queue, an error of less than a reply could be a repeat, or a loss: nobody can tell.
-            lowest = 5 if isinstance(self.layout, Fifo) else 0
+            lowest = 5 if isinstance(self.layout, FifoLayout) else 0
             told ^= 1 << self._rng.randrange(lowest, 8 * self._count_bytes)
             return reply[:at] + told.to_bytes(self._count_bytes, "big") + reply[at + self._count_bytes :]
         return reply
 
     @property
     def _count_bytes(self):
-        return 2 if isinstance(self.layout, Waveform) else self.layout.count.bits // 8
+        return 2 if isinstance(self.layout, WaveformLayout) else self.layout.count.bits // 8
 
     def _count_in(self, pdu):
         """Where in the reply to a request a count is; None if there is none."""
-        if isinstance(self.layout, Fifo):
+        if isinstance(self.layout, FifoLayout):
             return 5 if pdu[0] == 24 else None
         return 2 if pdu[1:] == bytes([0, 0, 0, self._count_bytes // 2]) else None
 
@@ -219,7 +221,7 @@ BEGINNINGS = st.one_of(st.integers(0, 1500), st.integers(0, 2**16 - 1), st.integ
 )
 def test_a_ring_is_read_once_and_its_books_are_exact(seed, count, restarts, depth, bits, link):
     serial, (damaged, stale) = link
-    layout = Ring(1, "input", Count(0, bits), 100, depth, SAMPLE, poll_ns=20_000_000)
+    layout = ring_layout(1, "input", count_at(0, bits), 100, depth, SAMPLE, poll_ns=20_000_000)
     rig, device = play(
         layout, seed, count=count, restarts=restarts, serial=serial, damaged=damaged, stale=stale
     )
@@ -246,7 +248,7 @@ def test_a_queue_is_read_once_and_its_books_are_exact(seed, count, restarts, dep
     serial, (damaged, stale) = link
     # A device that drops what it has handed out has nothing to hand out again.
     stale = stale if waits else 0.0
-    layout = Fifo(1, 33, Count(0, bits), SAMPLE, 700 if waits else None, poll_ns=10_000_000)
+    layout = fifo_layout(1, 33, count_at(0, bits), SAMPLE, 700 if waits else None, poll_ns=10_000_000)
     rig, device = play(
         layout, seed, count=count, restarts=restarts, serial=serial, damaged=damaged, stale=stale, depth=depth
     )
@@ -263,13 +265,13 @@ def test_a_queue_is_read_once_and_its_books_are_exact(seed, count, restarts, dep
     st.integers(0, 2**32),
     st.one_of(st.just(0), st.integers(1, 65_535), st.integers(65_500, 65_535)),
     st.integers(0, 2),
-    st.sampled_from([None, Page(700, 50)]),
+    st.sampled_from([None, page_at(700, 50)]),
     st.one_of(st.tuples(st.just(True), SOUND), st.tuples(st.just(False), SOUND | DAMAGED)),
 )
 def test_waveforms_are_whole_and_each_is_there_once_or_counted(seed, count, restarts, page, link):
     # An old id right behind a page would hide that the block was replaced while that was read.
     serial, (damaged, _) = link
-    layout = Waveform(1, "input", 0, 100, BLOCK, SAMPLE, page, poll_ns=10_000_000)
+    layout = waveform_layout(1, "input", 0, 100, BLOCK, SAMPLE, page, poll_ns=10_000_000)
     rig, _ = play(layout, seed, count=count, restarts=restarts, serial=serial, damaged=damaged, stale=0.0)
     firsts = []
     for block in rig.blocks["s"]:

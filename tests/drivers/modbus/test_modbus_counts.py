@@ -7,15 +7,16 @@ import asyncio
 import numpy as np
 import pytest
 from support.clocks import LoopClock
+from support.modbus_layouts import count_at, fifo_layout, in_sample, page_at, ring_layout, waveform_layout
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
-from drivers.modbus.layouts import Count, Fifo, Page, Ring, Waveform, sample_record
-from drivers.modbus.registers import RegisterField
+from drivers.modbus.registers import RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import PlannedReply
-from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, encode, store_for
+from sim_hw.nodes.modbus_unit import FifoStore, ModbusUnit, store_for
 
 pytestmark = pytest.mark.integration
-SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
+SAMPLE = (in_sample("x", 0, "int16"), in_sample("y", 1, "int16"))
+RECORD = RegisterRecord(SAMPLE, (RegisterRun(0, 2),))
 RATE_HZ = 200.0
 SOUND = lambda *_: PlannedReply()  # noqa: E731
 
@@ -23,7 +24,7 @@ SOUND = lambda *_: PlannedReply()  # noqa: E731
 async def sample(store, numbers, first):
     """Let a device take samples, one by one, by the clock; they are told apart by their numbers."""
     for k, number in enumerate(numbers):
-        store.put(first + k, encode(SAMPLE, ramp(1, first=number)))
+        store.put(first + k, RECORD.encode(ramp(1, first=number)))
         await asyncio.sleep(1 / RATE_HZ)
 
 
@@ -37,7 +38,7 @@ def numbers_of(rig, stream="s"):
 def test_a_ring_whose_counter_goes_back_by_less_than_its_depth_is_not_read_where_nothing_was_written(
     depth, bits
 ):
-    layout = Ring(1, "holding", Count(0, bits), 100, depth, SAMPLE, poll_ns=10_000_000)
+    layout = ring_layout(1, "holding", count_at(0, bits), 100, depth, SAMPLE, poll_ns=10_000_000)
     rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, RATE_HZ)}, clock=LoopClock())
     units = {1: ModbusUnit()}
     alive = [True]
@@ -63,7 +64,7 @@ def test_a_ring_whose_counter_goes_back_by_less_than_its_depth_is_not_read_where
 
 
 def test_a_damaged_write_counter_is_not_believed():
-    layout = Ring(1, "input", Count(0, 32), 16, 1024, SAMPLE, poll_ns=20_000_000)
+    layout = ring_layout(1, "input", count_at(0, 32), 16, 1024, SAMPLE, poll_ns=20_000_000)
     rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, RATE_HZ)}, clock=LoopClock())
     looks = [0]
 
@@ -92,7 +93,7 @@ def test_a_damaged_write_counter_is_not_believed():
 
 
 def test_a_queue_that_overflows_while_acknowledgements_are_lost_gives_each_sample_once():
-    layout = Fifo(1, 40, Count(0, 16), SAMPLE, 50, poll_ns=10_000_000)
+    layout = fifo_layout(1, 40, count_at(0, 16), SAMPLE, 50, poll_ns=10_000_000)
     options = options_of(serial=False, timeout_ms=150.0, demotion_s=0.5) | {
         "writes": [{"unit": 1, "address": 50}]
     }
@@ -118,14 +119,14 @@ def test_a_queue_that_overflows_while_acknowledgements_are_lost_gives_each_sampl
 
 
 def test_streams_that_share_a_page_register_get_their_own_pages():
-    page = Page(90, 150)
+    page = page_at(90, 150)
     layouts = {
-        "x": Waveform(1, "holding", 0, 200, 600, SAMPLE, page, poll_ns=10_000_000),
-        "y": Waveform(1, "holding", 0, 400, 230, SAMPLE, Page(90, 40), poll_ns=10_000_000),
+        "x": waveform_layout(1, "holding", 0, 200, 600, SAMPLE, page, poll_ns=10_000_000),
+        "y": waveform_layout(1, "holding", 0, 400, 230, SAMPLE, page_at(90, 40), poll_ns=10_000_000),
     }
     options = options_of(serial=False) | {"writes": [{"unit": 1, "address": 90}]}
     rig = Rig(options, {name: (layout, 1000.0) for name, layout in layouts.items()}, clock=LoopClock())
-    blocks = {"x": encode(SAMPLE, ramp(600)).tobytes(), "y": encode(SAMPLE, ramp(230, first=5000)).tobytes()}
+    blocks = {"x": RECORD.encode(ramp(600)).tobytes(), "y": RECORD.encode(ramp(230, first=5000)).tobytes()}
     unit = ModbusUnit()
 
     def show(number):
@@ -150,7 +151,7 @@ def test_streams_that_share_a_page_register_get_their_own_pages():
 
 @pytest.mark.parametrize("shows_none", [True, False])
 def test_a_waveform_device_that_restarts_has_not_lost_all_the_ids_between(shows_none):
-    layout = Waveform(1, "holding", 0, 100, 500, SAMPLE, poll_ns=100_000_000)
+    layout = waveform_layout(1, "holding", 0, 100, 500, SAMPLE, poll_ns=100_000_000)
     rig = Rig(options_of(serial=False), {"s": (layout, 1000.0)}, clock=LoopClock())
 
     async def main():
@@ -170,7 +171,7 @@ def test_a_waveform_device_that_restarts_has_not_lost_all_the_ids_between(shows_
 
 
 def test_a_device_that_stands_still_begins_a_new_time_base_and_gives_nothing_twice():
-    layout = Ring(1, "holding", Count(0, 32), 100, 256, SAMPLE, poll_ns=10_000_000)
+    layout = ring_layout(1, "holding", count_at(0, 32), 100, 256, SAMPLE, poll_ns=10_000_000)
     rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, RATE_HZ)}, clock=LoopClock())
     silent = [False]
 

@@ -10,7 +10,7 @@ from support.paths import ROOT
 
 from daqsvc.settings import parse_machine_file
 from drivers.base import BusCounters
-from drivers.modbus.build import modbus_layout
+from drivers.make import stream_layout
 from drivers.modbus.replies import ModbusCounters
 
 TEXT = (ROOT / "docs" / "modbus.md").read_text(encoding="utf-8")
@@ -29,7 +29,7 @@ def test_the_blocks_of_the_page_make_a_machine_file():
         text += f'[[sensors]]\nname = "{name}"\ntype = "velocity"\nunit = "mm/s"\n'
         text += f'stream = "{name}"\nchannel = "{channel}"\n'
     machine = parse_machine_file(text, EXAMPLE)
-    assert [modbus_layout(machine, name).unit for name in machine.streams] == [1, 1]
+    assert [stream_layout(machine, name).unit for name in machine.streams] == [1, 1]
 
 
 def test_every_counter_of_a_fault_is_named():

@@ -9,22 +9,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.bus_tables import modbus_bus
 from support.clocks import LoopClock
 from support.examples import examples
+from support.modbus_layouts import count_at, in_sample, register, registers_layout, ring_layout
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus.client import LineOptions, ModbusClient
-from drivers.modbus.layouts import Count, Ring, TrendLayout, sample_record
+from drivers.modbus.client import ModbusClient
 from drivers.modbus.line import ModbusLine, RetryPolicy, UnitSetAsideError
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from drivers.modbus.registers import RegisterRun
 from drivers.modbus.replies import ModbusCounters, NoReplyError, RequestRefusedError
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 
 pytestmark = pytest.mark.property
 TIMEOUT_NS = 100_000_000
-SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
+SAMPLE = (in_sample("x", 0, "int16"), in_sample("y", 1, "int16"))
 
 
 def marked_units(units):
@@ -64,13 +65,11 @@ def test_no_late_reply_ever_becomes_the_value_of_another_register(seed, requests
     answered = []
 
     async def main():
-        options = LineOptions(
-            "rtu", serial_port=options_of(serial=True)["serial_port"], timeout_ns=TIMEOUT_NS
-        )
+        options = modbus_bus(**options_of(serial=True), timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
         async with responding(marked_units(range(1, 5)), plan, serial=True):
             await client.connect()
-            patience = RetryPolicy(TIMEOUT_NS, options.gap_ns, demote_after=10_000)
+            patience = RetryPolicy(TIMEOUT_NS, RetryPolicy.of(options).gap_ns, demote_after=10_000)
             line = ModbusLine(client, LoopClock(), counters, patience, units=[1, 2, 3, 4])
 
             async def ask(unit, function, address, count):
@@ -95,15 +94,17 @@ def test_late_replies_happen_and_are_counted():
     counters = ModbusCounters()
 
     async def main():
-        options = LineOptions(
-            "rtu", serial_port=options_of(serial=True)["serial_port"], timeout_ns=TIMEOUT_NS
-        )
+        options = modbus_bus(**options_of(serial=True), timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
         late = iter([PlannedReply(delay_ns=150_000_000)])
         async with responding(marked_units([1, 2]), lambda *_: next(late, PlannedReply()), serial=True):
             await client.connect()
             line = ModbusLine(
-                client, LoopClock(), counters, RetryPolicy(TIMEOUT_NS, options.gap_ns), units=[1, 2]
+                client,
+                LoopClock(),
+                counters,
+                RetryPolicy(TIMEOUT_NS, RetryPolicy.of(options).gap_ns),
+                units=[1, 2],
             )
             with pytest.raises(NoReplyError, match=r"unit 1 at .* has not answered within 100 ms"):
                 await line.read(1, 3, RegisterRun(5, 1))
@@ -124,7 +125,7 @@ def test_every_request_has_its_whole_time_out_whenever_it_is_made():
     counters = ModbusCounters()
 
     async def main():
-        options = LineOptions(**options_of(serial=False), timeout_ns=TIMEOUT_NS)
+        options = modbus_bus(**options_of(serial=False), timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
         async with responding(
             marked_units([1]), lambda *_: PlannedReply(delay_ns=next(delays_ns)), serial=False
@@ -170,13 +171,19 @@ def test_what_is_no_reply_is_counted_by_kind_and_the_next_request_is_answered(fa
 
     async def main():
         where = options_of(serial=serial)
-        options = LineOptions(**where, timeout_ns=TIMEOUT_NS)
+        options = modbus_bus(**where, timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
         plan = iter([PlannedReply(fault)])
         async with responding(marked_units([1]), lambda *_: next(plan, PlannedReply()), serial=serial):
             await client.connect()
             quiet_ns = TIMEOUT_NS if serial else 0
-            line = ModbusLine(client, LoopClock(), counters, RetryPolicy(quiet_ns, options.gap_ns), units=[1])
+            line = ModbusLine(
+                client,
+                LoopClock(),
+                counters,
+                RetryPolicy(quiet_ns, RetryPolicy.of(options).gap_ns),
+                units=[1],
+            )
             with pytest.raises(NoReplyError):
                 await line.read(1, 3, RegisterRun(5, 4))
             words = [register_of(1, 3, 5 + k) for k in range(4)]
@@ -190,9 +197,7 @@ def test_what_is_no_reply_is_counted_by_kind_and_the_next_request_is_answered(fa
 
 @pytest.mark.parametrize("fault", ["wrong protocol", "cut off"])
 def test_a_tcp_stream_that_lost_its_frames_is_opened_again(fault):
-    layout = TrendLayout(
-        1, "holding", RegisterRecord((RegisterField("x", 5, "uint16"),), (RegisterRun(5, 1),))
-    )
+    layout = registers_layout(1, "holding", [register("x", 5, "uint16")])
     plan = iter([PlannedReply(), PlannedReply(fault)])
     rig = Rig(options_of(serial=False, timeout_ms=100.0), {"s": (layout, 10.0)}, clock=LoopClock())
 
@@ -215,7 +220,7 @@ def test_a_refusal_is_told_from_silence(serial):
     counters = ModbusCounters()
 
     async def main():
-        options = LineOptions(**options_of(serial=serial), timeout_ns=TIMEOUT_NS)
+        options = modbus_bus(**options_of(serial=serial), timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
         async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=serial):
             await client.connect()
@@ -232,9 +237,7 @@ def test_a_refusal_is_told_from_silence(serial):
 
 
 def trend_of(unit):
-    return TrendLayout(
-        unit, "holding", RegisterRecord((RegisterField("x", unit, "uint16"),), (RegisterRun(unit, 1),))
-    )
+    return registers_layout(unit, "holding", [register("x", unit, "uint16")])
 
 
 @pytest.mark.parametrize("serial", [True, False])
@@ -280,9 +283,11 @@ def test_a_unit_set_aside_is_not_asked_until_its_time_has_come():
     counters = ModbusCounters()
 
     async def main():
-        options = LineOptions(**options_of(serial=True), timeout_ns=TIMEOUT_NS)
+        options = modbus_bus(**options_of(serial=True), timeout_ms=TIMEOUT_NS / 1e6)
         client = ModbusClient(options, LoopClock(), counters)
-        patience = RetryPolicy(TIMEOUT_NS, options.gap_ns, demote_after=2, demotion_ns=NS_PER_S)
+        patience = RetryPolicy(
+            TIMEOUT_NS, RetryPolicy.of(options).gap_ns, demote_after=2, demotion_ns=NS_PER_S
+        )
         async with responding(marked_units([1]), lambda *_: PlannedReply(), serial=True):
             await client.connect()
             line = ModbusLine(client, LoopClock(), counters, patience, units=[1, 9])
@@ -335,7 +340,7 @@ def test_a_line_on_which_nobody_answers_is_lost_and_opened_again():
 def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, serial):
     rng = random.Random(seed)
     rate_hz = 200.0
-    layout = Ring(1, "holding", Count(0, bits), 100, depth, SAMPLE, poll_ns=5_000_000)
+    layout = ring_layout(1, "holding", count_at(0, bits), 100, depth, SAMPLE, poll_ns=5_000_000)
     faults = ["none"] * 60 + ["silent", "exception", "truncated", "oversized", "wrong unit"]
 
     def plan(_unit, _pdu):
@@ -348,13 +353,13 @@ def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, ser
     async def main():
         units = marked_units([1])
         store = store_for(units[1], layout)
-        store.put(first, encode(layout.record, ramp(1, first=first)))
+        store.put(first, encode(layout, ramp(1, first=first)))
         async with responding(units, plan, serial=serial), rig.running():
             sent = first + 1
             for _ in range(250):
                 n = rng.randrange(1, 4)
                 await asyncio.sleep(n / rate_hz)
-                store.put(sent, encode(layout.record, ramp(n, first=sent)))
+                store.put(sent, encode(layout, ramp(n, first=sent)))
                 sent += n
 
     simulate(main)
@@ -369,7 +374,7 @@ def test_a_ring_gives_every_sample_once_or_counts_it_lost(seed, bits, depth, ser
 
 
 def test_a_ring_that_overruns_loses_exactly_what_the_counter_says():
-    layout = Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=10_000_000)
+    layout = ring_layout(1, "holding", count_at(0, 32), 100, 64, SAMPLE, poll_ns=10_000_000)
     silent = [False]
     options = options_of(serial=False, timeout_ms=100.0, demote_after=30)
     rig = Rig(options, {"s": (layout, 100.0)}, clock=LoopClock())
@@ -381,7 +386,7 @@ def test_a_ring_that_overruns_loses_exactly_what_the_counter_says():
         async with responding(units, plan, serial=False), rig.running():
             for k in range(600):
                 silent[0] = 200 <= k < 380
-                store.put(k, encode(layout.record, ramp(1, first=k)))
+                store.put(k, encode(layout, ramp(1, first=k)))
                 await asyncio.sleep(0.01)
 
     simulate(main)
@@ -395,7 +400,7 @@ def test_a_ring_that_overruns_loses_exactly_what_the_counter_says():
 
 
 def test_a_ring_that_begins_again_is_followed_without_what_is_left_from_before():
-    layout = Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=10_000_000)
+    layout = ring_layout(1, "holding", count_at(0, 32), 100, 64, SAMPLE, poll_ns=10_000_000)
     rig = Rig(options_of(serial=False), {"s": (layout, 100.0)}, clock=LoopClock())
 
     async def main():
@@ -403,7 +408,7 @@ def test_a_ring_that_begins_again_is_followed_without_what_is_left_from_before()
         store = store_for(units[1], layout)
         async with responding(units, lambda *_: PlannedReply(), serial=False), rig.running():
             for k in [*range(5000, 5400), *range(400)]:
-                store.put(k, encode(layout.record, ramp(1, first=k)))
+                store.put(k, encode(layout, ramp(1, first=k)))
                 await asyncio.sleep(0.01)
 
     simulate(main)

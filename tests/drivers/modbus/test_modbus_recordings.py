@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
+from support.bus_tables import modbus_bus
 from support.pcap import conversations
 
 from daqsvc.acquisition.clock import SystemClock
-from drivers.modbus.client import LineOptions, ModbusClient
+from drivers.modbus.client import ModbusClient
 from drivers.modbus.replies import (
     EXCEPTIONS,
     READ_INPUT,
@@ -239,7 +240,9 @@ async def test_our_client_asks_in_the_same_bytes_and_reads_the_same_replies(data
     server = ModbusTcpServer(units)
     await server.start()
     counters = ModbusCounters()
-    client = ModbusClient(LineOptions("tcp", host="127.0.0.1", tcp_port=server.port), SystemClock(), counters)
+    client = ModbusClient(
+        modbus_bus(transport="tcp", host="127.0.0.1", tcp_port=server.port), SystemClock(), counters
+    )
     await client.connect()
     try:
         for name, request, reply in exchanges:

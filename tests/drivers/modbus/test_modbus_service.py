@@ -13,12 +13,12 @@ from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import describe, load_machine_file, parse_machine_file
-from drivers.make import bus_drivers
-from drivers.modbus.build import modbus_layout
+from drivers.make import bus_drivers, stream_layout
 from drivers.modbus.driver import ModbusDriver
 from drivers.modbus.line import WriteRefusedError
+from drivers.modbus.registers import RegisterRecord
 from sim_hw.nodes.modbus_node import ModbusNode, ModbusRtuServer, ModbusTcpServer
-from sim_hw.nodes.modbus_unit import ModbusUnit, encode
+from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.pacing import RealTimePacer
 
 pytestmark = pytest.mark.integration
@@ -41,12 +41,13 @@ async def test_probes_on_an_analogue_module_are_read_by_the_service(tmp_path):
     where = f'host = "127.0.0.1"\ntcp_port = {server.port}'
     text = edited(GAPS, ('host = "192.0.2.20"', where), ("rate_hz = 10.0", "rate_hz = 50.0"))
     machine = parse_machine_file(text, GAPS)
-    layout = modbus_layout(machine, "gap")
-    (run,) = layout.record.runs
+    layout = stream_layout(machine, "gap")
+    record = RegisterRecord.of(layout)
+    (run,) = record.runs
     assert (run.address, run.count) == (0, 2)
     gap_v = np.stack([np.linspace(-12.0, -8.0, 60), np.linspace(-8.5, -11.5, 60)], axis=1)
     # From the beginning, however long the service takes before the ramp is played.
-    unit.put(layout.table, run.address, encode(layout.record, gap_v[:1])[0])
+    unit.put(layout.table, run.address, record.encode(gap_v[:1], clip=True)[0])
     async with running(machine, tmp_path) as service:
         node = ModbusNode(unit, layout, gap_v, 50.0)
         await node.play(RealTimePacer(SystemClock()))

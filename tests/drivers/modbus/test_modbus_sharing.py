@@ -11,22 +11,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
 from support.examples import examples
+from support.modbus_layouts import register, registers_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
-from drivers.modbus.layouts import TrendLayout, shared_runs
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun, RunLimits, plan_runs
+from drivers.modbus.registers import RegisterRecord, RegisterRun, shared_runs
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 pytestmark = pytest.mark.integration
-GAP_8 = RunLimits(max_gap=8)
 
 
-def trend(addresses, limits=GAP_8, unit=1, table="holding"):
-    fields = tuple(RegisterField(f"r{address}", address, "uint16") for address in addresses)
-    return TrendLayout(
-        unit, table, RegisterRecord(fields, plan_runs([f.run for f in fields], limits)), limits
-    )
+def trend(addresses, unit=1, table="holding", max_gap=8, **limits):
+    channels = [register(f"r{address}", address, "uint16") for address in addresses]
+    return registers_layout(unit, table, channels, max_gap=max_gap, **limits)
+
+
+def runs_of(layout):
+    return RegisterRecord.of(layout).runs
 
 
 def units():
@@ -58,7 +59,7 @@ def polled(streams, seconds, plan=lambda *_: PlannedReply()):
     simulate(main)
     for name, (layout, _) in streams.items():
         rig.check_books(name)
-        expected = [1000 * layout.unit + field.address for field in layout.record.fields]
+        expected = [1000 * layout.unit + field.address for field in layout.channels]
         assert (rig.samples(name) == expected).all()
     return rig, asked
 
@@ -102,10 +103,10 @@ def test_two_streams_of_one_gateway_are_read_in_one_request():
         (trend([24], table="input"), 10.0),
         (trend([24], unit=2), 10.0),
         (trend([40]), 10.0),  # too far away
-        (trend([24], RunLimits(max_gap=2)), 10.0),  # its own limit is narrower
-        (trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(22, 1),))), 10.0),
+        (trend([24], max_gap=2), 10.0),  # its own limit is narrower
+        (trend([24], forbidden=[(22, 22)]), 10.0),
         (
-            trend([24], RunLimits(max_gap=8, forbidden=(RegisterRun(20, 1),))),
+            trend([24], forbidden=[(20, 20)]),
             10.0,
         ),  # what the first one reads
     ],
@@ -113,7 +114,7 @@ def test_two_streams_of_one_gateway_are_read_in_one_request():
 def test_what_does_not_belong_together_is_read_apart(other, rate_hz):
     streams = {"one": (trend([16, 20]), 10.0), "other": (other, rate_hz)}
     rig, asked = polled(streams, 2.0)
-    assert {run for *_, run in asked} == {RegisterRun(16, 5), *other.record.runs}
+    assert {run for *_, run in asked} == {RegisterRun(16, 5), *runs_of(other)}
     assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 0
 
 
@@ -199,11 +200,13 @@ def test_a_refusal_that_says_nothing_of_the_registers_leaves_them_together():
     assert rig.counters("one").samples_lost == rig.counters("other").samples_lost == 1
 
 
-limits = st.builds(
-    RunLimits,
-    st.integers(0, 20),
-    st.integers(60, 125),
-    st.lists(st.builds(RegisterRun, st.integers(0, 310), st.integers(1, 6)), max_size=3).map(tuple),
+banned = st.tuples(st.integers(0, 310), st.integers(0, 5)).map(lambda pair: (pair[0], sum(pair)))
+limits = st.fixed_dictionaries(
+    {
+        "max_gap": st.integers(0, 20),
+        "max_count": st.integers(60, 125),
+        "forbidden": st.lists(banned, max_size=3),
+    }
 )
 
 
@@ -214,17 +217,16 @@ limits = st.builds(
 def test_shared_requests_are_fewer_and_read_for_each_stream_only_what_it_allows(wishes):
     layouts = []
     for addresses, allowed in wishes:
-        taken = {a for run in allowed.forbidden for a in range(run.address, run.end)}
+        taken = {a for first, last in allowed["forbidden"] for a in range(first, last + 1)}
         if addresses - taken:
-            layouts.append(trend(sorted(addresses - taken), allowed))
+            layouts.append(trend(sorted(addresses - taken), **allowed))
     runs = shared_runs(layouts)
     if runs is None:
         return
-    assert len(runs) < sum(len(layout.record.runs) for layout in layouts)
+    assert len(runs) < sum(len(runs_of(layout)) for layout in layouts)
     read = [address for run in runs for address in range(run.address, run.end)]
     assert len(read) == len(set(read))
     for layout in layouts:
-        assert layout.limits is not None
-        assert {field.address for field in layout.record.fields} <= set(read)
-        assert not set(read) & {a for run in layout.limits.forbidden for a in range(run.address, run.end)}
-        assert all(run.count <= layout.limits.max_count for run in runs)
+        assert {channel.address for channel in layout.channels} <= set(read)
+        assert not set(read) & {a for first, last in layout.forbidden for a in range(first, last + 1)}
+        assert all(run.count <= layout.max_count for run in runs)

@@ -14,26 +14,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
 from support.examples import examples
+from support.modbus_layouts import count_at, fifo_layout, in_sample, register, registers_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
 from daqsvc.acquisition import link as supervision
 from daqsvc.acquisition.clock import NS_PER_S
-from drivers.modbus.layouts import Count, Fifo, TrendLayout, sample_record
 from drivers.modbus.line import Enquiry, RetryPolicy, UnitSetAsideError, UnitSilence
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
 from drivers.modbus.replies import READ_FIFO, WRITE_REGISTERS, ModbusCounters
 from sim_hw.nodes.modbus_node import PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
 
 pytestmark = pytest.mark.property
 TIMEOUT_MS = 100.0
-FIFO = Fifo(1, 7, Count(0, 16), sample_record([RegisterField("n", 0, "uint16")]), poll_ns=10_000_000)
+FIFO = fifo_layout(1, 7, count_at(0, 16), (in_sample("n", 0, "uint16"),), poll_ns=10_000_000)
 
 
 def trend_of(unit, address):
-    return TrendLayout(
-        unit, "holding", RegisterRecord((RegisterField("x", address, "uint16"),), (RegisterRun(address, 1),))
-    )
+    return registers_layout(unit, "holding", [register("x", address, "uint16")])
 
 
 def units(addresses=(1, 2, 3)):
@@ -73,7 +70,7 @@ def test_no_late_reply_becomes_the_value_of_another_stream_however_often_the_lin
         simulate(main)
     for name, (layout, _) in streams.items():
         if rig.blocks[name]:
-            assert (rig.samples(name) == (1 << 10 | layout.record.fields[0].address)).all()
+            assert (rig.samples(name) == (1 << 10 | layout.channels[0].address)).all()
 
 
 def test_a_line_that_was_opened_is_quiet_as_if_somebody_had_just_asked():
@@ -271,7 +268,7 @@ def test_what_is_wrong_with_a_reply_is_told_in_words(fault, words, caplog):
 @pytest.mark.parametrize("values", [[], [70_000], [-1], [1.5], ["1"], [0] * 124])
 def test_what_no_register_holds_is_not_sent(values):
     rig = Rig(
-        options_of(serial=False, timeout_ms=TIMEOUT_MS, writes=[{"unit": 1, "address": 0, "count": 200}]),
+        options_of(serial=False, timeout_ms=TIMEOUT_MS, writes=[{"unit": 1, "address": 0, "count": 123}]),
         {"a": (trend_of(1, 3), 20.0)},
         clock=LoopClock(),
     )

@@ -9,18 +9,27 @@ import random
 import numpy as np
 import pytest
 from support.clocks import LoopClock
+from support.modbus_layouts import (
+    count_at,
+    fifo_layout,
+    in_sample,
+    register,
+    registers_layout,
+    ring_layout,
+    waveform_layout,
+)
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate
 
 from daqsvc.acquisition.alignment import AlignedSource, Aligner
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality, SampleBlock
-from drivers.modbus.layouts import Count, Fifo, Ring, TrendLayout, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from drivers.modbus.registers import RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import PlannedReply
-from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
+from sim_hw.nodes.modbus_unit import ModbusUnit, store_for
 
 pytestmark = pytest.mark.integration
-SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
+SAMPLE = (in_sample("x", 0, "int16"), in_sample("y", 1, "int16"))
+RECORD = RegisterRecord(SAMPLE, (RegisterRun(0, 2),))
 LEAST_NS, MOST_NS = 1_000_000, 15_000_000
 """Between which a reply takes its time."""
 
@@ -41,7 +50,7 @@ def told_truly(off_ns, told_ns):
 def waveforms(poll_ns, most_late_ns, seed, every_s, samples=200, rate_hz=2000.0, seconds=40.0):
     """Blocks that a driver has fetched, and when the device had finished each, by number."""
     rng = random.Random(seed)
-    layout = Waveform(1, "holding", 0, 100, samples, SAMPLE, poll_ns=poll_ns)
+    layout = waveform_layout(1, "holding", 0, 100, samples, SAMPLE, poll_ns=poll_ns)
     rig = Rig(
         options_of(serial=False, timeout_ms=100.0, demote_after=30),
         {"s": (layout, rate_hz)},
@@ -63,7 +72,7 @@ def waveforms(poll_ns, most_late_ns, seed, every_s, samples=200, rate_hz=2000.0,
             while now_ns() < (1000 + seconds) * NS_PER_S:
                 await asyncio.sleep(every_s(rng))
                 number = len(ended_ns)
-                store.put(number * samples, encode(SAMPLE, ramp(samples, first=number * samples)))
+                store.put(number * samples, RECORD.encode(ramp(samples, first=number * samples)))
                 ended_ns.append(now_ns())
             await asyncio.sleep(1.0)
 
@@ -95,12 +104,12 @@ def test_a_waveform_says_when_it_was_taken_and_how_sure_that_is(seed):
 
 
 def test_of_a_block_that_was_there_before_anybody_looked_nothing_is_known():
-    layout = Waveform(1, "holding", 0, 100, 200, SAMPLE, poll_ns=10_000_000)
+    layout = waveform_layout(1, "holding", 0, 100, 200, SAMPLE, poll_ns=10_000_000)
     rig = Rig(options_of(serial=False), {"s": (layout, 2000.0)}, clock=LoopClock())
 
     async def main():
         units = {1: ModbusUnit()}
-        store_for(units[1], layout).put(0, encode(SAMPLE, ramp(200)))
+        store_for(units[1], layout).put(0, RECORD.encode(ramp(200)))
         async with responding(units, lambda *_: PlannedReply(), serial=False), rig.running():
             await asyncio.sleep(1.0)
 
@@ -141,9 +150,7 @@ def trend_beside(rate_hz, neighbour_hz, neighbour_ns, *, serial, seconds=60.0):
     """A trend whose neighbour on the line takes so long to answer, and when each of its samples was taken."""
     rng = random.Random(4)
     layouts = {
-        name: TrendLayout(
-            unit, "holding", RegisterRecord((RegisterField("n", 0, "uint16"),), (RegisterRun(0, 1),))
-        )
+        name: registers_layout(unit, "holding", [register("n", 0, "uint16")])
         for name, unit in (("trend", 1), ("neighbour", 2))
     }
     streams = {"trend": (layouts["trend"], rate_hz), "neighbour": (layouts["neighbour"], neighbour_hz)}
@@ -212,8 +219,8 @@ def stated_of(rig):
 @pytest.mark.parametrize(
     "layout",
     [
-        Fifo(1, 33, Count(0, 32), SAMPLE, poll_ns=20_000_000),
-        Ring(1, "holding", Count(0, 32), 100, 256, SAMPLE, poll_ns=20_000_000),
+        fifo_layout(1, 33, count_at(0, 32), SAMPLE, poll_ns=20_000_000),
+        ring_layout(1, "holding", count_at(0, 32), 100, 256, SAMPLE, poll_ns=20_000_000),
     ],
     ids=["fifo", "ring"],
 )
@@ -233,7 +240,7 @@ def test_samples_that_the_device_counts_are_as_sure_as_is_told(layout):
                     max(0.0, 1000 + k / rate_hz * (1 + 50e-6) - asyncio.get_running_loop().time())
                 )
                 taken_ns.append(now_ns())
-                store.put(k, encode(SAMPLE, ramp(1, first=k)))
+                store.put(k, RECORD.encode(ramp(1, first=k)))
                 if k >= 30 * rate_hz:
                     return
 

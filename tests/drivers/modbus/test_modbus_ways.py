@@ -8,17 +8,27 @@ import contextlib
 import numpy as np
 import pytest
 from support.clocks import LoopClock
+from support.modbus_layouts import (
+    count_at,
+    fifo_layout,
+    in_sample,
+    page_at,
+    register,
+    registers_layout,
+    ring_layout,
+    trigger_at,
+    waveform_layout,
+)
 from support.modbus_lines import Rig, options_of, ramp, responding, simulate, until
 
-from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.samples import Quality
-from drivers.modbus.layouts import Count, Fifo, Page, Ring, TrendLayout, Trigger, Waveform, sample_record
-from drivers.modbus.registers import RegisterField, RegisterRecord, RegisterRun
+from drivers.modbus.registers import RegisterRecord, RegisterRun
 from sim_hw.nodes.modbus_node import ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit, encode, store_for
 
 pytestmark = pytest.mark.integration
-SAMPLE = sample_record([RegisterField("x", 0, "int16"), RegisterField("y", 1, "int16")])
+SAMPLE = (in_sample("x", 0, "int16"), in_sample("y", 1, "int16"))
+RECORD = RegisterRecord(SAMPLE, (RegisterRun(0, 2),))
 
 
 COUNT_REGISTERS = b"\0\2"
@@ -51,17 +61,14 @@ async def serving(layout, rate_hz, **options):
     rig = Rig(given | options, {"s": (layout, rate_hz)})
     store = store_for(unit, layout)
     try:
-        yield rig, faults, lambda first, n: store.put(first, encode(layout.record, ramp(n, first=first)))
+        yield rig, faults, lambda first, n: store.put(first, encode(layout, ramp(n, first=first)))
     finally:
         server.stop()
 
 
 async def test_a_trend_is_polled_on_schedule_and_a_failed_poll_is_a_lost_sample():
-    record = RegisterRecord(
-        (RegisterField("x", 10, "int16"), RegisterField("y", 40, "int16")),
-        (RegisterRun(10, 1), RegisterRun(40, 1)),
-    )
-    async with serving(TrendLayout(1, "input", record), 50.0) as (rig, faults, put):
+    channels = [register("x", 10, "int16"), register("y", 40, "int16")]
+    async with serving(registers_layout(1, "input", channels), 50.0) as (rig, faults, put):
         put(7, 1)
         async with rig.running():
             await until(lambda: rig.counters("s").samples_received >= 5)
@@ -79,7 +86,9 @@ async def test_a_trend_is_polled_on_schedule_and_a_failed_poll_is_a_lost_sample(
 @pytest.mark.parametrize("bits", [16, 32])
 @pytest.mark.parametrize("acknowledge", [None, 700])
 async def test_a_fifo_is_emptied_without_loss_or_repeat(bits, acknowledge):
-    layout = Fifo(1, 33, Count(0, bits, low_word_first=True), SAMPLE, acknowledge, poll_ns=1_000_000)
+    layout = fifo_layout(
+        1, 33, count_at(0, bits, low_word_first=True), SAMPLE, acknowledge, poll_ns=1_000_000
+    )
     writes = [] if acknowledge is None else [{"unit": 1, "address": 700, "count": 2}]
     first = 65_500  # the count of 16 bits wraps on the way
     async with serving(layout, 1000.0, writes=writes) as (rig, _faults, put), rig.running():
@@ -95,7 +104,7 @@ async def test_a_fifo_is_emptied_without_loss_or_repeat(bits, acknowledge):
 async def test_a_lost_fifo_reply_costs_what_was_in_it_unless_the_device_waits_to_be_told():
     lost = {}
     for acknowledge in (None, 700):
-        layout = Fifo(1, 33, Count(0, 32), SAMPLE, acknowledge, poll_ns=1_000_000)
+        layout = fifo_layout(1, 33, count_at(0, 32), SAMPLE, acknowledge, poll_ns=1_000_000)
         writes = [{"unit": 1, "address": 700, "count": 2}]
         async with serving(layout, 1000.0, writes=writes) as (rig, faults, put), rig.running():
             put(0, 10)
@@ -117,7 +126,7 @@ async def test_a_lost_fifo_reply_costs_what_was_in_it_unless_the_device_waits_to
 
 
 async def test_samples_whose_acknowledgement_failed_are_not_delivered_twice():
-    layout = Fifo(1, 33, Count(0, 32), SAMPLE, 700, poll_ns=1_000_000)
+    layout = fifo_layout(1, 33, count_at(0, 32), SAMPLE, 700, poll_ns=1_000_000)
     writes = [{"unit": 1, "address": 700, "count": 2}]
     async with serving(layout, 1000.0, writes=writes) as (rig, faults, put), rig.running():
         await until(lambda: rig.driver.link.state == "up")
@@ -135,7 +144,7 @@ async def test_samples_whose_acknowledgement_failed_are_not_delivered_twice():
 
 
 async def test_a_fifo_reply_that_ends_within_a_sample_is_counted_and_left_out():
-    layout = Fifo(1, 33, Count(0, 16), SAMPLE, poll_ns=1_000_000)
+    layout = fifo_layout(1, 33, count_at(0, 16), SAMPLE, poll_ns=1_000_000)
     unit = ModbusUnit()
     replies = [b"\0\5" + b"\0\1\0\2\0\3"]
     unit.add_queue(33, lambda: replies.pop() if replies else b"")
@@ -150,7 +159,7 @@ async def test_a_fifo_reply_that_ends_within_a_sample_is_counted_and_left_out():
 
 @pytest.mark.parametrize("table", ["holding", "input"])
 async def test_a_ring_is_followed_without_loss_or_repeat_through_failed_requests(table):
-    layout = Ring(1, table, Count(0, 16), 100, 512, SAMPLE, poll_ns=1_000_000)
+    layout = ring_layout(1, table, count_at(0, 16), 100, 512, SAMPLE, poll_ns=1_000_000)
     rng = np.random.default_rng(3)
     first = 65_000
     async with serving(layout, 2000.0, timeout_ms=50.0) as (rig, faults, put), rig.running():
@@ -172,7 +181,7 @@ async def test_a_ring_is_followed_without_loss_or_repeat_through_failed_requests
 
 
 async def test_what_is_overwritten_while_it_is_read_is_lost_and_not_mixed_up():
-    layout = Ring(1, "holding", Count(0, 32), 100, 64, SAMPLE, poll_ns=1_000_000)
+    layout = ring_layout(1, "holding", count_at(0, 32), 100, 64, SAMPLE, poll_ns=1_000_000)
     async with serving(layout, 10_000.0) as (rig, faults, put), rig.running():
         put(0, 10)
         await until(lambda: rig.counters("s").samples_received == 10)
@@ -186,9 +195,9 @@ async def test_what_is_overwritten_while_it_is_read_is_lost_and_not_mixed_up():
     np.testing.assert_array_equal(rig.samples("s"), ramp(100)[indices - indices[0]])
 
 
-@pytest.mark.parametrize("page", [None, Page(90, 200)])
+@pytest.mark.parametrize("page", [None, page_at(90, 200)])
 async def test_waveform_blocks_are_read_whole_and_missed_ones_are_counted(page):
-    layout = Waveform(1, "holding", 0, 100, 600, SAMPLE, page, poll_ns=1_000_000)
+    layout = waveform_layout(1, "holding", 0, 100, 600, SAMPLE, page, poll_ns=1_000_000)
     writes = [] if page is None else [{"unit": 1, "address": 90}]
     async with serving(layout, 20_000.0, writes=writes) as (rig, _faults, put), rig.running():
         put(0, 600)
@@ -206,7 +215,7 @@ async def test_waveform_blocks_are_read_whole_and_missed_ones_are_counted(page):
 
 
 async def test_a_block_that_is_replaced_while_it_is_read_is_dropped_and_counted():
-    layout = Waveform(1, "holding", 0, 100, 600, SAMPLE, poll_ns=1_000_000)
+    layout = waveform_layout(1, "holding", 0, 100, 600, SAMPLE, poll_ns=1_000_000)
     async with serving(layout, 20_000.0) as (rig, faults, put), rig.running():
         await until(lambda: rig.driver.link.state == "up")
         faults.meanwhile = lambda pdu: pdu[1:3] == b"\0\0" or put(600, 600)  # at the first page
@@ -221,7 +230,7 @@ async def test_a_block_that_is_replaced_while_it_is_read_is_dropped_and_counted(
 @pytest.mark.parametrize("unheard", [False, True], ids=["sound", "replies get lost"])
 def test_a_block_is_triggered_as_often_as_is_asked_for_and_no_more(unheard):
     every_s, taking_s = 10.0, 0.3
-    layout = Waveform(1, "holding", 0, 100, 300, SAMPLE, None, Trigger(95, 1, round(every_s * NS_PER_S)))
+    layout = waveform_layout(1, "holding", 0, 100, 300, SAMPLE, None, trigger_at(95, 1, every_s))
     rig = Rig(
         options_of(serial=False, writes=[{"unit": 1, "address": 95}]),
         {"s": (layout, 1000.0)},
@@ -243,7 +252,7 @@ def test_a_block_is_triggered_as_often_as_is_asked_for_and_no_more(unheard):
             for _ in range(1000):  # 100 s
                 await asyncio.sleep(0.1)
                 if len(written_s) > taken and asyncio.get_running_loop().time() - written_s[-1] >= taking_s:
-                    store.put(300 * taken, encode(SAMPLE, ramp(300, first=300 * taken)))
+                    store.put(300 * taken, RECORD.encode(ramp(300, first=300 * taken)))
                     taken += 1
 
     simulate(main)

@@ -13,6 +13,7 @@ import can
 import numpy as np
 import pytest
 from conformance.virtual_can_transport import PER_FRAME, layout
+from support.bus_tables import replay_bus, table_layout
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.settings import load_machine_file
@@ -20,7 +21,6 @@ from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.make import bus_drivers
 from drivers.replay.driver import ReplayDriver
-from drivers.replay.files import ColumnLayout
 from drivers.replay.growing import candump_log
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ class Played:
         self.clock = DrivenClock()
         self.blocks: list[SampleBlock] = []
         spec: list[StreamSpec[Any]] = streams or [StreamSpec("shaft", layout(), RATE_HZ)]
-        port = BusPort("replay", {"file": path, **options}, spec, self.clock, self.blocks.append)
-        self.driver = ReplayDriver(port)
+        port = BusPort("replay", spec, self.clock, self.blocks.append)
+        self.driver = ReplayDriver(replay_bus(file=path, **options), port)
 
     async def to_its_end(self) -> None:
         """Play until the driver has ended by itself."""
@@ -158,7 +158,7 @@ async def test_the_samples_of_a_table_are_counted_on_when_it_is_played_again(tmp
     (tmp_path / "run.csv").write_text(
         "t,probe_x,probe_y\n" + "".join(f"{k},{a},{b}\n" for k, (a, b) in enumerate(zip(x, y, strict=True)))
     )
-    table = ColumnLayout(("x", "y"), ("probe_x", "probe_y"), np.array([2.0, 1.0]), np.array([1.0, 0.0]))
+    table = table_layout(("x", "probe_x", 2.0, 1.0), ("y", "probe_y", 1.0, 0.0))
     for name in ("run.npz", "run.csv"):
         played = Played(tmp_path / name, [StreamSpec("shaft", table, 100.0)], at_end="loop")
         await played.until_received(600)
@@ -208,7 +208,7 @@ async def test_a_file_that_cannot_be_read_is_a_bus_that_cannot_be_opened(
 ) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    table = ColumnLayout(("x", "y"), ("x", "y"), np.ones(2), np.zeros(2))
+    table = table_layout(("x", "x", 1.0, 0.0), ("y", "y", 1.0, 0.0))
     is_table = name.endswith((".csv", ".npz"))
     played = Played(
         tmp_path / name, [StreamSpec("shaft", table if is_table else layout(), RATE_HZ)], at_end="loop"

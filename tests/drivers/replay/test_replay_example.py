@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import can_bus
 from support.can_standin import StandInBus, frame_bytes
 from support.paths import ROOT
 from support.running_drivers import running
@@ -16,6 +17,7 @@ from daqsvc.settings import load_machine_file
 from drivers.base import BusPort, StreamSpec
 from drivers.can.driver import CanDriver
 from drivers.can.plugin import frame_layout
+from drivers.can.record_files import OneLog
 from drivers.make import bus_drivers
 
 if TYPE_CHECKING:
@@ -34,10 +36,13 @@ async def test_a_recording_of_the_fan_plays_through_its_dbc_file(tmp_path: Path)
     felt = (rng.integers(-4000, 4000, (FRAMES, 1, 3)) * 0.0005).astype(np.float32)
     payloads = layout.encode(np.arange(FRAMES), felt)
     bus = StandInBus()
-    options = {"interface": "socketcan", "channel": "can0", "record": {"file": tmp_path / "fan.blf"}}
+    bus_table, logs = can_bus(interface="socketcan", channel="can0"), OneLog(tmp_path / "fan.blf")
     spec = StreamSpec("housing", layout, 1000.0)
     recorded = CanDriver(
-        BusPort("can0", options, [spec], SystemClock(), lambda _: None), open_source=bus.open
+        bus_table,
+        BusPort("can0", [spec], SystemClock(), lambda _: None),
+        open_source=bus.open,
+        logs=logs,
     )
     async with running(recorded):
         for at in range(0, FRAMES, 100):

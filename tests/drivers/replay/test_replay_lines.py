@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.examples import examples
 
-from drivers.can.batches import DecodedBatch
+from drivers.frames import DecodedBatch
 from drivers.replay.can_log import CanLog
 from drivers.replay.lines import TextLog
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import replay_bus
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import DrivenClock
@@ -34,8 +35,8 @@ FRAMES = 300
 
 async def play(path: Path, pace: str = "recorded") -> ReplayDriver:
     clock = DrivenClock()
-    options = {"file": path, "at_end": "stop", "pace": pace}
-    driver = ReplayDriver(BusPort("tape", options, [StreamSpec("s", LAYOUT, 100.0)], clock, lambda _: None))
+    bus = replay_bus(file=path, at_end="stop", pace=pace)
+    driver = ReplayDriver(bus, BusPort("tape", [StreamSpec("s", LAYOUT, 100.0)], clock, lambda _: None))
     task = asyncio.create_task(driver.run())
 
     async def pass_time() -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.bus_tables import line_layout, serial_bus
 from support.clocks import QuickClock
 from support.machine_files import MACHINES
 from support.waiting import eventually
@@ -23,8 +24,6 @@ from drivers.base import BusPort, StreamSpec
 from drivers.make import bus_drivers, stream_layout
 from drivers.serial import reader as serial_reader
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import TextLayout
-from drivers.serial.reader import ReceivedBytes
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
@@ -35,17 +34,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from daqsvc.acquisition.samples import SampleBlock
+    from drivers.frames import DecodedBatch
 
 pytestmark = pytest.mark.integration
 PROBES = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT1AB2C3-if00-port0"
 CASING = "/dev/serial/by-id/usb-Raspberry_Pi_Pico_E66118604B826C2A-if00"
-LINE = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq")
+LINE = line_layout(("seq", "x"), ("x",), counter="seq")
 
 
 def lines_driver(path: Path, blocks: list[SampleBlock], **options: Any) -> SerialDriver:
     given = {"port": str(path), "framing": "lines", **options}
     spec = StreamSpec("x", LINE, 100.0)
-    return SerialDriver(BusPort("ser0", given, [spec], QuickClock(), blocks.append))
+    return SerialDriver(serial_bus(**given), BusPort("ser0", [spec], QuickClock(), blocks.append))
 
 
 @contextlib.asynccontextmanager
@@ -74,7 +74,7 @@ async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) ->
         for stream, bus, cable, seconds in (("shaft", "probes", probes, 2), ("casing", "casing", casing, 2)):
             layout = stream_layout(machine, stream)
             rate_hz = machine.streams[stream].rate_hz
-            framing = framing_of(machine.buses[bus].model_dump(), [StreamSpec(stream, layout, rate_hz)])
+            framing = framing_of(machine.buses[bus], [StreamSpec(stream, layout, rate_hz)])
             sent[stream] = rng.normal(0, 5, (int(seconds * rate_hz), len(layout.channels)))
             nodes[stream] = SerialNode(cable, framing, stream, layout, sent[stream], rate_hz, faults=faults)
         async with running(*drivers):
@@ -227,15 +227,19 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
     blocks: list[SampleBlock] = []
     driver = lines_driver(tmp_path / "port", blocks, checksum="xor")
     begun, released = threading.Event(), threading.Event()
-    cut, take, tick = driver._framing.cut, driver.take, driver.tick
+    cut, accept, tick = driver._framing.cut, driver.accept, driver.tick
 
-    def slowly(data: bytes) -> Any:
+    def slowly(data: bytes, arrivals_of: Any) -> Any:
         begun.set()
         assert released.wait(10)
-        return cut(data)
+        return cut(data, arrivals_of)
+
+    def noted(batch: DecodedBatch) -> None:
+        told.append(f"{batch.notes['bytes_received']} bytes")
+        accept(batch)
 
     driver._framing.cut = slowly  # type: ignore[method-assign]
-    driver.take = lambda batch: (told.append(f"{batch.bytes_read} bytes"), take(batch))[1]  # type: ignore[method-assign]
+    driver.accept = noted  # type: ignore[method-assign]
     driver.tick = lambda now_ns: (told.append("quiet"), tick(now_ns))[1]  # type: ignore[method-assign]
     lines = driver._framing.encode("x", np.arange(2), np.ones((2, 1, 1)))
     with PseudoTerminal(tmp_path / "port") as cable:
@@ -263,18 +267,17 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
 
 
 def test_overtaken_lines_and_numbers_beyond_all_bounds_cost_no_sample(tmp_path: Path) -> None:
-    stamped = TextLayout(("t", "x"), ("x",), np.ones(1), np.zeros(1), time="t", time_unit="ms")
+    stamped = line_layout(("t", "x"), ("x",), time="t", unit="ms")
     specs = [StreamSpec("x", stamped, 100.0)]
-    options = {"port": str(tmp_path), "framing": "lines"}
+    bus = serial_bus(port=str(tmp_path), framing="lines")
     blocks: list[SampleBlock] = []
-    driver = SerialDriver(BusPort("ser0", options, specs, DrivenClock(), blocks.append))
+    driver = SerialDriver(bus, BusPort("ser0", specs, DrivenClock(), blocks.append))
     lines = [b"%d,%d\n" % (10 * k, k) for k in range(800)]
     lines[300], lines[310], lines[320] = b"3000,1e999\n", b"3100,1e39\n", b"3200,-1e400\n"
     lines[500], lines[501] = lines[501], lines[500]
-    framing = framing_of(options, specs)
+    framing = framing_of(bus, specs)
     for k, line in enumerate(lines):
-        found = framing.cut(line)
-        driver.take(ReceivedBytes(len(line), found, {"x": np.full(len(found.frames), 10_000_000 * k)}))
+        driver.accept(framing.cut(line, lambda ends, k=k: np.full(len(ends), 10_000_000 * k)))
     driver._assemblers["x"].flush()
     values = np.concatenate([block.samples[:, 0] for block in blocks])
     expected = np.arange(1, 800, dtype=np.float32)

@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.bus_tables import line_layout
 
 from drivers.frames import FrameLayout
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import LineFraming, TextLayout
+from drivers.serial.lines import LineFraming
 
 if TYPE_CHECKING:
-    from drivers.serial.framing import Found, Framing
+    from drivers.frames import DecodedBatch
+    from drivers.serial.framing import Framing
+    from drivers.serial.settings import LineLayout
 
 pytestmark = pytest.mark.property
 FRAMES = 12
@@ -34,10 +37,8 @@ def packed(stream_id: int, per_frame: int) -> FrameLayout:
     )
 
 
-def text(prefix: str) -> TextLayout:
-    return TextLayout(
-        ("seq", "x", "spare"), ("x",), np.ones(1), np.zeros(1), counter="seq", counter_bits=16, prefix=prefix
-    )
+def text(prefix: str) -> LineLayout:
+    return line_layout(("seq", "x", "spare"), ("x",), counter="seq", bits=16, prefix=prefix)
 
 
 BINARY = {"a": packed(1, 3), "b": packed(0xA5, 7)}
@@ -67,23 +68,22 @@ def make(kind: str, order: tuple[str, ...]) -> tuple[Framing, list[bytes]]:
     return framing, frames
 
 
-def numbers(found: list[Found], kind: str) -> list[int]:
+def numbers(found: list[DecodedBatch], kind: str) -> list[int]:
     """Numbers of the intact frames."""
     got = []
     for part in found:
         for stream, frames in part.frames.items():
             per_frame = KINDS[kind][1][stream].samples_per_frame
-            decoded = frames.decoded
-            good = decoded.intact
-            number = decoded.counter[good] // per_frame
-            samples = decoded.samples[good][:, :, 0]
+            good = frames.intact
+            number = frames.counter[good] // per_frame
+            samples = frames.samples[good][:, :, 0]
             assert (samples[:, :-1] == number[:, None]).all()
             assert (samples[:, -1] == np.where(number % 3, number, 0x5AA5)).all()
             got += number.tolist()
     return sorted(got)
 
 
-def cut_up(framing: Framing, data: bytes, places: list[int]) -> list[Found]:
+def cut_up(framing: Framing, data: bytes, places: list[int]) -> list[DecodedBatch]:
     edges = [0, *sorted(place % (len(data) + 1) for place in places), len(data)]
     return [framing.cut(data[a:b]) for a, b in pairwise(edges)]
 
@@ -94,7 +94,13 @@ def test_wherever_the_bytes_are_cut_every_frame_is_found(kind: str, order, place
     framing, frames = make(kind, order)
     found = cut_up(framing, b"".join(frames), places)
     assert numbers(found, kind) == list(range(FRAMES))
-    assert sum(part.garbage_bytes + part.malformed + part.resyncs for part in found) == 0
+    assert (
+        sum(
+            part.notes["bytes_garbage"] + part.notes["frames_malformed"] + part.notes["resyncs"]
+            for part in found
+        )
+        == 0
+    )
 
 
 @in_kind
@@ -157,11 +163,11 @@ def test_nothing_at_all_makes_a_framing_raise_or_grow(kind: str, chunks) -> None
     framing = KINDS[kind][0]()
     read = sum(map(len, chunks))
     found = [framing.cut(chunk) for chunk in chunks]
-    assert sum(part.garbage_bytes for part in found) <= read
+    assert sum(part.notes["bytes_garbage"] for part in found) <= read
     for part in found:
         for frames in part.frames.values():
-            assert len(frames.ends) == len(frames.decoded.counter) == len(frames.decoded.samples)
-            assert (np.diff(frames.ends) > 0).all()
+            assert len(frames.arrival_ns) == len(frames.counter) == len(frames.samples)
+            assert (np.diff(frames.arrival_ns) > 0).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -169,9 +175,9 @@ def test_nothing_at_all_makes_a_framing_raise_or_grow(kind: str, chunks) -> None
 def test_garbage_without_end_is_counted_and_not_kept(kind: str, filler: bytes) -> None:
     framing, frames = make(kind, ("a",) * FRAMES)
     framing.cut(b"".join(frames))
-    counted = sum(framing.cut(filler * 1000).garbage_bytes for _ in range(50))
-    counted += framing.cut(b"\r\n\0").garbage_bytes
+    counted = sum(framing.cut(filler * 1000).notes["bytes_garbage"] for _ in range(50))
+    counted += framing.cut(b"\r\n\0").notes["bytes_garbage"]
     assert counted > 50 * 1000 * len(filler) - 4000
     found = [framing.cut(b"\r\n\0"), framing.cut(b"".join(frames))]
     assert len(numbers(found, kind)) >= FRAMES - 1
-    assert sum(part.resyncs for part in found) == 1
+    assert sum(part.notes["resyncs"] for part in found) == 1

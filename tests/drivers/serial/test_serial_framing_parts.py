@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import logging
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import line_layout
 
 from drivers.frames import FrameLayout, LayoutError
 from drivers.serial.binary import BodyCodec, CobsFraming, SyncFraming
-from drivers.serial.lines import LATEST_S, DeviceTime, LineFraming, TextLayout
+from drivers.serial.lines import LATEST_S, DeviceTime, LineCodec, LineFraming
+
+if TYPE_CHECKING:
+    from drivers.serial.settings import LineLayout
 
 
 def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:
@@ -24,9 +29,8 @@ def layout(length: int = 4, frame_id: int = 0) -> FrameLayout:
     )
 
 
-def line(**changes) -> TextLayout:
-    values = {"columns": ("seq", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
-    return TextLayout(**(values | {"counter": "seq"} | changes))
+def line(**changes) -> LineLayout:
+    return line_layout(**({"columns": ("seq", "x"), "channels": ("x",), "counter": "seq"} | changes))
 
 
 # The check values of the catalogue of parametrised CRC algorithms: the CRC of "123456789".
@@ -67,9 +71,13 @@ def test_the_end_of_a_frame_that_began_before_the_port_was_opened_is_no_fault():
     framing = CobsFraming(BodyCodec({"a": layout()}))
     frames = framing.encode("a", np.arange(3) * 3, np.full((3, 3, 1), 5.0))
     found = framing.cut(frames[0][3:] + frames[1] + frames[2])
-    assert (found.malformed, found.resyncs, found.garbage_bytes) == (0, 0, len(frames[0]) - 3)
-    assert found.frames["a"].decoded.counter.tolist() == [3, 6]
-    assert found.frames["a"].ends.tolist() == [len(frames[0]) - 3 + len(frames[0]) * k for k in (1, 2)]
+    assert (found.notes["frames_malformed"], found.notes["resyncs"], found.notes["bytes_garbage"]) == (
+        0,
+        0,
+        len(frames[0]) - 3,
+    )
+    assert found.frames["a"].counter.tolist() == [3, 6]
+    assert found.frames["a"].arrival_ns.tolist() == [len(frames[0]) - 3 + len(frames[0]) * k for k in (1, 2)]
 
 
 def test_frames_of_unknown_streams_and_of_the_wrong_length_are_told_apart():
@@ -84,7 +92,7 @@ def test_frames_of_unknown_streams_and_of_the_wrong_length_are_told_apart():
     )
     assert found.unknown == {"0x2a": 1}
     assert found.wrong_length == {"a": (1, 9)}
-    assert (found.malformed, len(found.frames["a"].ends)) == (0, 1)
+    assert (found.notes["frames_malformed"], len(found.frames["a"].arrival_ns)) == (0, 1)
 
 
 def test_a_frame_with_a_bad_crc_is_handed_on_as_corrupt():
@@ -93,18 +101,18 @@ def test_a_frame_with_a_bad_crc_is_handed_on_as_corrupt():
     spoilt = bytearray(b"".join(frames))
     spoilt[len(frames[0]) + 3] ^= 4
     found = framing.cut(bytes(spoilt))
-    assert found.frames["a"].decoded.intact.tolist() == [True, False, True]
-    assert (found.garbage_bytes, found.resyncs) == (0, 0)
+    assert found.frames["a"].intact.tolist() == [True, False, True]
+    assert (found.notes["bytes_garbage"], found.notes["resyncs"]) == (0, 0)
 
 
 def test_without_a_crc_a_sync_word_must_follow():
     framing = SyncFraming(BodyCodec({"a": layout()}, crc="none"), b"\xaa\x55")
     frames = framing.encode("a", np.arange(4) * 3, np.full((4, 3, 1), 5.0))
     assert not framing.cut(frames[0]).frames
-    assert framing.cut(frames[1]).frames["a"].decoded.counter.tolist() == [0]
+    assert framing.cut(frames[1]).frames["a"].counter.tolist() == [0]
     # A frame that lost a byte takes none of the next one's.
     found = framing.cut(frames[2][:-1] + frames[3] + frames[0])
-    counters = found.frames["a"].decoded
+    counters = found.frames["a"]
     assert counters.counter[counters.intact].tolist() == [3, 9]
 
 
@@ -115,9 +123,9 @@ def test_without_a_crc_a_sync_word_must_follow():
         (lambda: BodyCodec({"a": layout(4, 7), "b": layout(4, 7)}, ids=True), "share id 7"),
         (lambda: BodyCodec({"a": layout(4, 256)}, ids=True), "is no byte"),
         (lambda: SyncFraming(BodyCodec({"a": layout()}), b""), "sync word is empty"),
-        (lambda: line(counter=None), "needs a counter or a time"),
-        (lambda: line(time="x"), "not both"),
-        (lambda: line(columns=("seq", "y")), "column 'x' is there 0 times"),
+        (lambda: LineCodec(line(counter=None)), "needs a counter or a time"),
+        (lambda: LineCodec(line(time="x")), "not both"),
+        (lambda: LineCodec(line(columns=("seq", "y"))), "column 'x' is there 0 times"),
         (lambda: LineFraming({"a": line(), "b": line()}, {}), "cannot be told apart"),
         (
             lambda: LineFraming({"a": line(prefix="a"), "b": line(prefix="b", separator=";")}, {}),
@@ -131,30 +139,28 @@ def test_what_cannot_work_is_refused(make, message):
 
 
 def test_a_sentence_of_a_gps_receiver_is_a_line():
-    gll = line(columns=("lat", "ns", "lon", "ew", "utc", "status"), channels=("lat", "lon"), counter="utc")
-    gll = TextLayout(gll.columns, gll.channels, np.ones(2), np.zeros(2), counter="utc", prefix="$GPGLL")
+    columns = ("lat", "ns", "lon", "ew", "utc", "status")
+    gll = line(columns=columns, channels=("lat", "lon"), counter="utc", prefix="$GPGLL")
     framing = LineFraming({"a": gll}, {"a": 1.0}, "xor")
     found = framing.cut(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*28\r\n")
-    decoded = found.frames["a"].decoded
+    decoded = found.frames["a"]
     assert decoded.counter.tolist() == [125926]
     np.testing.assert_allclose(decoded.samples[0, 0], [5300.97914, 259.98174], rtol=1e-7)
     assert decoded.intact.all()
     found = framing.cut(b"$GPGLL,5300.97914,N,00259.98174,E,125927,A*28\r\n")
-    assert not found.frames["a"].decoded.intact.any()
+    assert not found.frames["a"].intact.any()
 
 
 def test_records_with_another_delimiter_are_lines_too():
     # As a telephone's logger wrote them: three averages, three accelerations in m/s^2, ms.
-    layout = TextLayout(
-        ("ax", "ay", "az", "x", "y", "z", "t"), ("x", "y", "z"), np.ones(3), np.zeros(3), time="t"
-    )
+    layout = line_layout(("ax", "ay", "az", "x", "y", "z", "t"), ("x", "y", "z"), time="t")
     framing = LineFraming({"a": layout}, {"a": 30.0}, delimiter=b";")
     text = (
         b"999,999,999,999,999,999,999;-0.4999469,0.038457453,9.345161,-0.4999469,0.15382981,9.460533,0.0;"
         b"-0.4999469,0.038457453,9.345161,-0.9229789,-0.038457453,9.768193,33.5;"
         b"-0.4999469,0.038457453,9.345161,-0.6537767,-0.34611708,9.268247,100.6633;"
     )
-    decoded = framing.cut(text).frames["a"].decoded
+    decoded = framing.cut(text).frames["a"]
     assert decoded.counter.tolist() == [0, 1, 3]
     np.testing.assert_allclose(
         decoded.samples[:, 0],
@@ -185,19 +191,23 @@ def test_records_with_another_delimiter_are_lines_too():
     ],
 )
 def test_what_is_no_sample_is_left_out_and_its_neighbours_are_not(bad):
-    framing = LineFraming({"a": line(counter_bits=16)}, {"a": 1.0})
+    framing = LineFraming({"a": line(bits=16)}, {"a": 1.0})
     framing.cut(b"0,0\n")
     found = framing.cut(b"6,1.5\n" + bad + b"\n\n7, -2e0\r\n")
-    assert found.frames["a"].decoded.counter.tolist() == [6, 7]
-    assert found.frames["a"].decoded.samples[:, 0, 0].tolist() == [1.5, -2.0]
-    assert (found.malformed, found.resyncs, found.garbage_bytes) == (1, 1, len(bad) + 1)
+    assert found.frames["a"].counter.tolist() == [6, 7]
+    assert found.frames["a"].samples[:, 0, 0].tolist() == [1.5, -2.0]
+    assert (found.notes["frames_malformed"], found.notes["resyncs"], found.notes["bytes_garbage"]) == (
+        1,
+        1,
+        len(bad) + 1,
+    )
 
 
 def test_the_first_line_without_a_checksum_may_lack_a_digit():
     framing = LineFraming({"a": line()}, {"a": 1.0})
     found = framing.cut(b"7,1\n18,1\n")
-    assert found.frames["a"].decoded.counter.tolist() == [18]
-    assert found.malformed == 0
+    assert found.frames["a"].counter.tolist() == [18]
+    assert found.notes["frames_malformed"] == 0
 
 
 @pytest.mark.parametrize("rate_error", [-0.003, 0.0, 0.003])
@@ -249,11 +259,11 @@ def test_one_damaged_stamp_moves_no_other(damaged_s):
 
 
 def test_a_corrupt_stamp_moves_no_other():
-    stamped = line(columns=("t", "x"), counter=None, time="t", time_unit="s")
+    stamped = line(columns=("t", "x"), counter=None, time="t", unit="s")
     framing = LineFraming({"a": stamped}, {"a": 10.0}, "xor")
     good = framing.encode("a", np.arange(5), np.ones((5, 1, 1)))
     spoilt = good[2].replace(b"0.2", b"9.2")
-    decoded = framing.cut(good[0] + good[1] + spoilt + good[3] + good[4]).frames["a"].decoded
+    decoded = framing.cut(good[0] + good[1] + spoilt + good[3] + good[4]).frames["a"]
     assert decoded.intact.tolist() == [True, True, False, True, True]
     assert decoded.counter[decoded.intact].tolist() == [0, 1, 3, 4]
 

@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.frames import FrameLayout
-from drivers.serial.kernels import crc16, crcs_match, gather, in_units, unstuff
+from drivers.serial.kernels import crc16, crcs_match, gather, scaled, unstuff
 
 pytestmark = pytest.mark.property
 # Runs without a zero around 254 bytes are where the codes of COBS are special.
@@ -122,6 +122,6 @@ def test_values_in_units_are_those_of_the_arrays(bits, kind, order, data: bytes)
         byte_order=order,
     )
     payloads = np.frombuffer(data, np.uint8).reshape(2, 24)
-    got, want = layout.decode(payloads, in_units), layout.decode(payloads)
+    got, want = layout.decode(payloads, scaling=scaled), layout.decode(payloads)
     assert got.counter.tolist() == want.counter.tolist()
     np.testing.assert_array_equal(got.samples, want.samples)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from support.bus_tables import line_layout
 
 from drivers.serial.framing import Pieces
 from drivers.serial.line_kernels import check_lines
-from drivers.serial.lines import DeviceTime, TextLayout
+from drivers.serial.lines import DeviceTime, LineCodec
 
 pytestmark = pytest.mark.property
 NUMBERS = st.one_of(
@@ -34,10 +35,10 @@ def pieces(lines: list[bytes]) -> Pieces:
     return Pieces(buffer, starts, stops, stops + 1)
 
 
-def layout(**changes) -> TextLayout:
+def codec(**changes) -> LineCodec:
     """A counter or a time, a value, and a column that nobody asked for between them."""
-    given = {"columns": ("seq", "spare", "x"), "channels": ("x",), "scale": np.ones(1), "offset": np.zeros(1)}
-    return TextLayout(**(given | {"counter": "seq"} | changes))
+    given = {"columns": ("seq", "spare", "x"), "channels": ("x",), "counter": "seq"}
+    return LineCodec(line_layout(**(given | changes)))
 
 
 def number(text: str, kind: type) -> float | None:
@@ -53,7 +54,7 @@ def number(text: str, kind: type) -> float | None:
 @example([("1", "", "9007199254740993"), ("1", "", "1e23"), ("1", "", "1e999"), ("1", "", "-0")])
 @example([(counter, "", "1") for counter in (" 7 ", "+7", "-0", "7.", "7e0", "", "9" * 30)])
 def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, str]]) -> None:
-    stream = layout(scale=np.array([0.1]), offset=np.array([-3.0]))
+    stream = codec(channels=[{"name": "x", "scale": 0.1, "offset": -3.0}])
     lines = stream.read(pieces([",".join(row).encode() for row in rows]))
     counters, values = [number(row[0], int) for row in rows], [number(row[2], float) for row in rows]
     good = [
@@ -70,7 +71,7 @@ def test_numbers_are_those_of_python_to_the_last_bit(rows: list[tuple[str, str, 
 
 @given(st.lists(NUMBERS, min_size=1, max_size=8))
 def test_times_are_those_of_python_to_the_last_bit(stamps: list[str]) -> None:
-    stream = layout(counter=None, time="seq", time_unit="ms")
+    stream = codec(counter=None, time="seq", unit="ms")
     lines = stream.read(pieces([f"{stamp},,1".encode() for stamp in stamps]))
     read = [number(stamp, float) for stamp in stamps]
     assert lines.places.tolist() == [ms / 1e3 for ms in read if ms is not None and abs(ms / 1e3) <= 1e12]
@@ -78,7 +79,7 @@ def test_times_are_those_of_python_to_the_last_bit(stamps: list[str]) -> None:
 
 @given(st.lists(st.text("ab,1", max_size=8), min_size=1, max_size=8))
 def test_a_line_belongs_to_the_stream_that_its_first_field_names(texts: list[str]) -> None:
-    lines = layout(prefix="a").read(pieces([text.encode() for text in texts]))
+    lines = codec(prefix="a").read(pieces([text.encode() for text in texts]))
     assert lines.mine.tolist() == [text.split(",")[0] == "a" for text in texts]
     assert lines.good.tolist() == [
         text.split(",")[0] == "a"

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import line_layout
 
 from daqsvc.acquisition.clock import DrivenClock
 from drivers.serial import reader as serial_reader
-from drivers.serial.lines import LineFraming, TextLayout
+from drivers.serial.lines import LineFraming
 from sim_hw.nodes.pacing import DrivenPacer
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
 from sim_hw.nodes.serial_node import SerialNode
@@ -19,7 +20,7 @@ from sim_hw.nodes.serial_node import SerialNode
 if TYPE_CHECKING:
     from pathlib import Path
 
-LAYOUT = TextLayout(("seq", "x"), ("x",), np.ones(1), np.zeros(1), counter="seq", decimals=0)
+LAYOUT = line_layout(("seq", "x"), ("x",), counter="seq")
 
 
 def node(cable: PseudoTerminal, samples: np.ndarray, **options) -> SerialNode:
@@ -36,9 +37,9 @@ async def test_what_is_sent_can_be_read_at_the_path(tmp_path: Path):
         device = node(cable, np.array([[5.0], [6.0]]), first_index=41)
         await device.play(pacer())
         heard = b""
-        while len(heard) < 12:  # the terminal hands on what it has got so far
+        while len(heard) < 26:  # the terminal hands on what it has got so far
             heard += os.read(port, 100)
-        assert heard == b"41,5\r\n42,6\r\n"
+        assert heard == b"41,5.000000\r\n42,6.000000\r\n"
         os.close(port)
     assert (device.samples_sent, device.frames_unsent, device.duration_ns) == (2, 0, 10_000_000)
     assert not cable.path.is_symlink()

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.bus_tables import line_layout, serial_bus
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from drivers.base import BusPort, StreamSpec
 from drivers.serial.driver import SerialDriver, framing_of
-from drivers.serial.lines import LineFraming, TextLayout
-from drivers.serial.reader import ReceivedBytes
+from drivers.serial.lines import LineFraming
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.integration, pytest.mark.data]
 
 COLUMNS = ("mean-x", "mean-y", "mean-z", "x", "y", "z", "t")
 START_OF_FILE, END_OF_FILE = 999.0, 111.0
-MOTOR = TextLayout(COLUMNS, ("x", "y", "z"), np.ones(3), np.zeros(3), time="t", time_unit="ms")
+MOTOR = line_layout(COLUMNS, ("x", "y", "z"), time="t", unit="ms")
 RATE_HZ = 100.0
 
 
@@ -39,12 +39,12 @@ def test_every_record_of_every_motor_is_read_as_it_is_written(data: Path) -> Non
         raw = file.read_bytes()
         framing = LineFraming({"motor": MOTOR}, {"motor": RATE_HZ}, delimiter=b";")
         found = [framing.cut(raw[at : at + 777]) for at in range(0, len(raw), 777)]
-        got = np.concatenate([part.frames["motor"].decoded.samples[:, 0] for part in found if part.frames])
+        got = np.concatenate([part.frames["motor"].samples[:, 0] for part in found if part.frames])
         records = records_of(raw)
         assert (records[0] == START_OF_FILE).all()
         # The first record is left out: without a checksum nothing shows that its beginning is there.
         np.testing.assert_array_equal(got, records[1:, 3:6].astype(np.float32), err_msg=file.name)
-        assert sum(part.malformed for part in found) == 0
+        assert sum(part.notes["frames_malformed"] for part in found) == 0
 
 
 def test_every_record_of_every_motor_comes_through_the_driver_in_its_place(data: Path) -> None:
@@ -55,18 +55,17 @@ def test_every_record_of_every_motor_comes_through_the_driver_in_its_place(data:
         taken = records[1:-1]
         assert (records[-1] == END_OF_FILE).all()
         blocks: list[SampleBlock] = []
-        options = {"port": str(file), "framing": "lines", "delimiter": ";"}
+        bus = serial_bus(port="/dev/null", framing="lines", delimiter=";")
         specs = [StreamSpec("motor", MOTOR, RATE_HZ)]
-        driver = SerialDriver(BusPort("ser0", options, specs, DrivenClock(), blocks.append))
-        framing = framing_of(options, specs)
+        driver = SerialDriver(bus, BusPort("ser0", specs, DrivenClock(), blocks.append))
+        framing = framing_of(bus, specs)
         stamps_ns = NS_PER_S + np.rint(records[:, -1] * 1e6).astype(np.int64)
         stamps_ns[[0, -1]] = stamps_ns[[1, -2]]
         lines = [line + b";" for line in raw.split(b";")[: len(records)]]
         for at in range(0, len(lines), 3):
             chunk = b"".join(lines[at : at + 3])
-            found = framing.cut(chunk)
-            arrivals_ns = {name: stamps_ns[at : at + 3][-len(f.ends) :] for name, f in found.frames.items()}
-            driver.take(ReceivedBytes(len(chunk), found, arrivals_ns))
+            stamps = stamps_ns[at : at + 3]
+            driver.accept(framing.cut(chunk, lambda ends, stamps=stamps: stamps[-len(ends) :]))
         driver._assemblers["motor"].flush()
         got = np.concatenate([block.samples for block in blocks])
         np.testing.assert_array_equal(got, taken[:, 3:6].astype(np.float32), err_msg=file.name)

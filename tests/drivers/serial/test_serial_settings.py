@@ -9,7 +9,6 @@ from support.machine_files import MACHINES, changed, parsed, problems_of
 from daqsvc.settings import load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
 from drivers.serial.driver import SerialDriver
-from drivers.serial.lines import TextLayout as DriverLines
 from drivers.serial.settings import CobsBus, LineLayout, LinesBus, SerialLayout
 
 SERIAL = MACHINES / "serial-probes.toml"
@@ -34,8 +33,9 @@ def test_the_example_as_it_is_read():
     samples = packed.decode(np.zeros((1, 64), np.uint8)).samples
     np.testing.assert_allclose(samples[0, 0], [10 / 7.87e-3, 10 / 7.87e-3, 0.0], rtol=1e-6)
     lines = stream_layout(machine, "casing")
-    assert isinstance(lines, DriverLines)
-    assert (lines.prefix, lines.counter, lines.counter_bits) == ("$ACC", "seq", 16)
+    assert isinstance(lines, LineLayout)
+    assert lines.counter is not None
+    assert (lines.prefix, lines.counter.column, lines.counter.bits) == ("$ACC", "seq", 16)
 
 
 def test_the_driver_is_found_by_its_name():
