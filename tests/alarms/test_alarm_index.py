@@ -63,7 +63,7 @@ class WalkingDoubts(SensorHealth):
         self.assumed = {}
         self.unsettled = {}
 
-    def take(self, diagnosis):
+    def update(self, diagnosis):
         detector, name = diagnosis.detector, quality_alarm(diagnosis.detector, diagnosis.sensors)
         before = self.table.pop(detector, None) or self.assumed.pop(detector, None)
         if diagnosis.quality == "good":
