@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.detectors.rotor_synchronous.recorded import analyse
+from daqsvc.detectors.rotor_synchronous.recorded import analyse, samples_of
 from daqsvc.detectors.rotor_synchronous.recorded_speed import LEAST_JUDGED, speed_of
 from daqsvc.dsp.probes import probes_to_xy, shaft_axes_deg
 from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality import recorded as checks
 from daqsvc.dsp.quality.unit import refuse_size
 from daqsvc.dsp.speed.revolutions import KeyphasorCutter
-from daqsvc.recording.channels import to_um
 from daqsvc.rotor.calibration.file import CalibrationRecord
 from daqsvc.rotor.calibration.run_up import LEAST_SPEED_RATIO, fit_run_up
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, Calibration, NotCalibratableError
@@ -170,10 +169,7 @@ def _sweep(recording: Recording, taken: RotorSetup, sweep_rpm: tuple[float, floa
     """
     if taken.keyphasor is None and sweep_rpm is None:
         return None
-    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    samples = samples[:, [recording.names.index(name) for name in taken.names]]
-    samples[:, :2] = to_um(samples[:, :2], taken.unit)
-    checks.refuse_unreadable(tuple(taken.names), samples)
+    samples = samples_of(recording, taken)
     if sweep_rpm is not None:
         sweep = _even_sweep(recording, taken, samples, sweep_rpm)
         period = 120.0 * recording.rate_hz / sum(sweep_rpm)

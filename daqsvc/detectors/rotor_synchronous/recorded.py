@@ -162,7 +162,7 @@ class _Watched:
     reports: list[WatchReport] = field(default_factory=list)
     vectors: list[SynchronousVectors] = field(default_factory=list)
 
-    def take(self, report: WatchReport, vectors: SynchronousVectors) -> None:
+    def add(self, report: WatchReport, vectors: SynchronousVectors) -> None:
         """The detector's listener."""
         self.reports.append(report)
         self.vectors.append(vectors)
@@ -199,6 +199,19 @@ def analyse(recording: Recording, setup: RotorSetup, progress: Progress | None =
         )
 
 
+def samples_of(recording: Recording, setup: RotorSetup) -> Floats:
+    """The samples float64 ``[n, channels]`` of ``setup.names``: probes in um, NaN where missing.
+
+    Raises:
+        RefusedError: a channel holds nothing, or one value only.
+    """
+    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
+    samples = samples[:, [recording.names.index(name) for name in setup.names]]
+    samples[:, :2] = to_um(samples[:, :2], setup.unit)
+    checks.refuse_unreadable(setup.names, samples)
+    return samples
+
+
 def _judge(
     recording: Recording,
     setup: RotorSetup,
@@ -206,10 +219,7 @@ def _judge(
     watched: _Watched,
     progress: Progress | None,
 ) -> RotorVerdict:
-    samples = np.where(np.isfinite(recording.samples), recording.samples, np.nan)
-    samples = samples[:, [recording.names.index(name) for name in setup.names]]
-    samples[:, :2] = to_um(samples[:, :2], setup.unit)
-    checks.refuse_unreadable(tuple(setup.names), samples)
+    samples = samples_of(recording, setup)
     refuse_size(samples[:, :2], setup.rotor.clearance_um, setup.unit)
     speed, quality = speed_of(recording, setup, samples, quality)
     period = 60.0 * recording.rate_hz / abs(speed.rpm)
@@ -234,7 +244,7 @@ def _judge(
         rules=replace(setup.rules, speed_uncertainty=speed.uncertainty),
         calibration=healthy,
         ac_coupled=setup.ac_coupled or checks.lacks_mean(samples[:, :2]),
-        listener=watched.take,
+        listener=watched.add,
     )
     complaints = _feed(detector, samples, recording.rate_hz, period, progress)
     revolutions = detector.watch.revolutions
@@ -242,8 +252,8 @@ def _judge(
     if detector.ac_coupled and not setup.ac_coupled:
         quality = quality.with_problem(_NO_MEAN)
     vectors = SynchronousVectors.joined(watched.vectors)
-    reading = _Reading(recording, setup, detector, tuple(watched.reports), vectors, complaints)
-    return reading.verdict(quality)
+    conclusion = _Conclusion(recording, setup, detector, tuple(watched.reports), vectors, complaints)
+    return conclusion.verdict(quality)
 
 
 def _healthy_state(setup: RotorSetup, speed_rpm: float) -> Calibration | None:
@@ -291,7 +301,7 @@ def _feed(
 
 
 @dataclass(frozen=True, slots=True)
-class _Reading:
+class _Conclusion:
     """A recording, and what the detector has made of it."""
 
     recording: Recording
