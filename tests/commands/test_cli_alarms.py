@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from support.brokers import free_port
 from support.can_gateway import MACHINE, CanGateway, daqsvc_run
-from support.waiting import eventually
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome
@@ -66,7 +66,8 @@ async def alarms(store: Path, *arguments: object) -> list[dict[str, Any]]:
 
 async def stands(store: Path, alarm: str, state: str) -> dict[str, Any]:
     """Wait until the journal tells that an alarm is in a state; the event that says so."""
-    for _ in range(100):
+    until_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until_s:
         told = [one for one in await alarms(store, "--all") if one["alarm"] == alarm]
         if told and told[0]["state"] == state:
             return told[0]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from conformance.transport import CHANNELS, STREAM
+from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import NS_PER_S
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock
     from drivers.base import Driver, StartPolicy
 
-PATIENCE_S = 20.0
 LOOK_S = 0.0005
 WRAP = 30_000
 

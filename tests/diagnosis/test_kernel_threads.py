@@ -97,7 +97,7 @@ async def test_a_call_that_hangs_is_given_up_and_its_thread_replaced(
 ) -> None:
     threads = kernels(1)
     may_end = threading.Event()
-    job = threads.submit(lambda: may_end.wait(20))
+    job = threads.submit(lambda: may_end.wait(60))
     waiting = threads.submit(lambda: 4)
     await eventually(lambda: job.thread is not None, "it has begun")
     assert not threads.replace(waiting), "it has not begun"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -39,7 +40,7 @@ class Listener:
         self.warmed = True
 
     def process(self, window: Window) -> list[Diagnosis]:
-        self.go_on.wait(5)
+        self.go_on.wait(PATIENCE_S)
         self.threads.add(threading.current_thread().name)
         self.windows.append(window)
         if len(self.windows) - 1 == self.fail_at:

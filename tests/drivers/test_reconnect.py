@@ -169,7 +169,7 @@ async def test_a_link_that_cannot_be_opened_is_absent() -> None:
 
 def _call_that_waits(go_on: threading.Event) -> Callable[[], str]:
     def call() -> str:
-        go_on.wait(10)
+        go_on.wait(60)
         return "opened"
 
     return call
@@ -259,7 +259,7 @@ async def test_what_failed_needs_no_undoing() -> None:
     go_on, undone = threading.Event(), []
 
     def fails() -> str:
-        go_on.wait(10)
+        go_on.wait(60)
         message = "taken"
         raise OSError(message)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LOOPBACK = "127.0.0.1"
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 BrokerName = Literal["mosquitto", "amqtt"]
 
 # Below the ports that the system gives to connections: while a broker is down, none takes its port.

@@ -12,7 +12,7 @@ from typing import Any, Self
 import paho.mqtt.client as paho
 
 LOOPBACK = "127.0.0.1"
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @dataclass(frozen=True)

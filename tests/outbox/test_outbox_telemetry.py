@@ -52,12 +52,12 @@ async def test_the_next_is_waited_for(outbox):
     await asyncio.sleep(0.05)
     assert not waiting.done()
     outbox.telemetry(TOPIC, b"first")
-    [message] = await asyncio.wait_for(waiting, 10)
+    [message] = await asyncio.wait_for(waiting, 60)
     waiting = asyncio.create_task(outbox.next_telemetry(message.number, 10))
     await asyncio.sleep(0.05)
     assert not waiting.done()
     outbox.telemetry(TOPIC, b"second")
-    assert [m.payload for m in await asyncio.wait_for(waiting, 10)] == [b"second"]
+    assert [m.payload for m in await asyncio.wait_for(waiting, 60)] == [b"second"]
 
 
 async def test_the_oldest_are_dropped_beyond_the_limit_and_the_file_stays_within(tmp_path):

@@ -43,7 +43,7 @@ def disk(tmp_path):
 
 
 @contextlib.asynccontextmanager
-async def desk_at(store, port, *, stop_s=2.0):
+async def desk_at(store, port, *, stop_s=20.0):
     """The alarms of a service with a broker, from its start to its stop."""
     desk = AlarmService(
         Identity("lab", "edge-1", "rig"), RULES, store, CLOCK, outputs(mqtt(port)), limits=LIMITS
@@ -170,7 +170,7 @@ async def test_a_stop_on_a_full_disk_hands_everything_over(disk, mosquitto, capl
 
 
 async def test_without_a_broker_what_is_lost_at_the_stop_is_said_with_number_and_topics(disk, caplog):
-    async with desk_at(disk.directory / "store", free_port()) as desk:
+    async with desk_at(disk.directory / "store", free_port(), stop_s=0.5) as desk:
         await desk.outbox.pending(0, 1)
         disk.fill()
         counters = desk.outbox.counters

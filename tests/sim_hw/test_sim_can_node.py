@@ -24,7 +24,7 @@ LAYOUT = FrameLayout.plain(
     first_byte=2,
     crc_byte=62,
 )
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 SAMPLES = np.random.default_rng(7).normal(0, 50, (2000, 1))
 
 

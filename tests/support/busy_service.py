@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import can
 import numpy as np
 from support.machine_files import MACHINES
+from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.settings import parse_machine_file
@@ -140,13 +141,13 @@ class Devices(threading.Thread):
 
     def __enter__(self) -> Self:
         self.start()
-        assert self._listening.wait(20)
+        assert self._listening.wait(PATIENCE_S)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._playing.set()
-        self.join(20)
+        self.join(PATIENCE_S)
         os.close(self._master)
         os.close(self._slave)
 

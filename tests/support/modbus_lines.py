@@ -12,6 +12,7 @@ import numpy as np
 from pymodbus.transport import CommParams, CommType, ModbusProtocol
 from support.bus_tables import modbus_bus
 from support.clocks import LoopClock
+from support.waiting import PATIENCE_S
 
 from daqsvc.acquisition.clock import SystemClock
 from drivers.base import BusPort, StreamSpec
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from drivers.modbus.settings import ModbusLayout
     from sim_hw.nodes.modbus_node import FaultPlan
     from sim_hw.nodes.modbus_unit import ModbusUnit
-
-PATIENCE_S = 20.0
 
 
 class Rig:

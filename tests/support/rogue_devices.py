@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import can
 import numpy as np
+from support.waiting import PATIENCE_S
 
 from drivers.base import StreamSpec
 from drivers.make import stream_layout
@@ -226,13 +227,13 @@ class RogueDevices(threading.Thread):
 
     def __enter__(self) -> Self:
         self.start()
-        assert self._listening.wait(20)
+        assert self._listening.wait(PATIENCE_S)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._playing.set()
-        self.join(20)
+        self.join(PATIENCE_S)
         assert not self.is_alive()
         for bus in self._buses.values():
             bus.shutdown()

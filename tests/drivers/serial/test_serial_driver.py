@@ -16,7 +16,7 @@ import pytest
 from support.bus_tables import line_layout, serial_bus
 from support.clocks import QuickClock
 from support.machine_files import MACHINES
-from support.waiting import eventually
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.settings import parse_machine_file
@@ -180,7 +180,7 @@ async def test_a_port_that_takes_its_time_to_close_does_not_hold_the_loop(
     close = serial_reader.close_port
 
     def slow(device: Any) -> None:
-        assert released.wait(10)
+        assert released.wait(PATIENCE_S)
         close(device)
 
     monkeypatch.setattr(serial_reader, "close_port", slow)
@@ -231,7 +231,7 @@ async def test_reading_goes_on_while_a_batch_is_cut_and_all_is_told_in_order(tmp
 
     def slowly(data: bytes, arrivals_of: Any) -> Any:
         begun.set()
-        assert released.wait(10)
+        assert released.wait(PATIENCE_S)
         return cut(data, arrivals_of)
 
     def noted(batch: DecodedBatch) -> None:
