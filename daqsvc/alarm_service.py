@@ -28,8 +28,7 @@ from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.messages import OutboxError, event_id
 from daqsvc.outbox.store import Outbox
 from daqsvc.publish.output import EarlierState, OutputPort, OutputSet, Watched, output_name
-from daqsvc.publish.payloads import alarm_json
-from daqsvc.publish.restore import restore_alarms
+from daqsvc.publish.payloads import alarm_json, restore_alarms
 from daqsvc.publish.topics import Topics
 from daqsvc.self_check import JOURNAL, SelfCheck, Vitals, conditions
 from daqsvc.supervision import Supervisor

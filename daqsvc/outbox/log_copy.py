@@ -15,7 +15,7 @@ from daqsvc.outbox.log_rows import rows_in
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.outbox.sound import Row
+    from daqsvc.outbox.tables import Row
 
 log = logging.getLogger(__name__)
 

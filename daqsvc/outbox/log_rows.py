@@ -12,13 +12,13 @@ import struct
 from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
-from daqsvc.outbox.sound import sound_row
+from daqsvc.outbox.tables import sound_row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from mmap import mmap
 
-    from daqsvc.outbox.sound import Row
+    from daqsvc.outbox.tables import Row
 
     Salts: TypeAlias = tuple[int, int]
     Frame: TypeAlias = tuple[int, bytes]

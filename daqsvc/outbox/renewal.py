@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
-    from daqsvc.outbox.sound import Row
+    from daqsvc.outbox.tables import Row
 
 log = logging.getLogger(__name__)
 

@@ -11,13 +11,13 @@ from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 from daqsvc.outbox.log_rows import rows_in_pages
-from daqsvc.outbox.sound import sound_row
+from daqsvc.outbox.tables import sound_row
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
 
-    from daqsvc.outbox.sound import Row
+    from daqsvc.outbox.tables import Row
 
 log = logging.getLogger(__name__)
 

@@ -5,6 +5,7 @@ A change that an old consumer would not survive gets a new version number; a new
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,9 +20,13 @@ from daqsvc.dsp.quality import Quality  # noqa: TC001 - pydantic reads it
 from daqsvc.outbox.messages import event_id
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from daqsvc.acquisition.clock import Clock
+    from daqsvc.outbox.messages import OutboxMessage
+    from daqsvc.publish.topics import Topics
+
+log = logging.getLogger(__name__)
 
 
 def _finite_or_none(value: Any) -> Any:
@@ -376,3 +381,42 @@ def _ends(low: float | None, high: float | None) -> tuple[float, float]:
 
 def _or_nan(figures: Mapping[str, float | None]) -> dict[str, float]:
     return {name: math.nan if value is None else value for name, value in figures.items()}
+
+
+def restore_alarms(messages: Iterable[OutboxMessage], topics: Topics) -> list[AlarmEvent]:
+    """The events that the alarm messages of a box tell of, in their order.
+
+    Messages below other topics are left alone. What cannot be read is left out and logged, once for all.
+
+    Args:
+        messages: from `Outbox.latest`.
+        topics: the box.
+    """
+    events: list[AlarmEvent] = []
+    unread: list[str] = []
+    for message in messages:
+        if not (message.topic.startswith(f"{topics.base}/") and "/alarms/" in message.topic):
+            continue
+        try:
+            events.append(_event(message, topics))
+        except ValueError as error:
+            unread.append(f"{message.sequence} of {message.topic} ({_in_short(error)})")
+    if unread:
+        log.warning(
+            "%d alarm states of the journal cannot be read; these alarms start from normal: %s",
+            len(unread),
+            "; ".join(unread),
+        )
+    return events
+
+
+def _event(message: OutboxMessage, topics: Topics) -> AlarmEvent:
+    event = alarm_event(message.payload)
+    if message.topic != topics.alarm(event.identity.machine, event.alarm):
+        raise ValueError(f"it is about {event.alarm!r} of {event.identity.machine!r}")
+    return event
+
+
+def _in_short(error: ValueError) -> str:
+    """The first of the problems that are found in a payload, in one line."""
+    return " ".join(line.strip() for line in str(error).splitlines()[:3])

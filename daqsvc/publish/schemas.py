@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.publish.home_assistant.readings import ReadingsPayload
 from daqsvc.publish.home_assistant.summary import SummaryPayload
-from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.mqtt.commands import CommandPayload, ResponsePayload
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 
 if TYPE_CHECKING:

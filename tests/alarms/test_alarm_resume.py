@@ -15,8 +15,7 @@ from daqsvc.alarms.setpoints import Setpoint
 from daqsvc.alarms.states import AlarmState, Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import OutboxMessage
-from daqsvc.publish.payloads import alarm_event, alarm_payload
-from daqsvc.publish.restore import restore_alarms
+from daqsvc.publish.payloads import alarm_event, alarm_payload, restore_alarms
 from daqsvc.publish.topics import Topics
 
 RIG = Identity("lab", "edge-1", "rig")

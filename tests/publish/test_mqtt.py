@@ -17,7 +17,7 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import AlarmManager, DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.connection import Connection
+from daqsvc.publish.mqtt.connection import Connection
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, alarm_payload, status_payload
 from daqsvc.publish.topics import Topics
 from sim_hw.demo.broker import EmbeddedBroker
@@ -305,8 +305,8 @@ async def test_without_a_broker_it_stops_at_once_and_keeps_everything(outbox, ca
 
 async def test_a_silent_broker_does_not_hold_up_the_stop(outbox, monkeypatch):
     # Whoever waited for it would do so for longer than anybody waits here, however slow the machine is.
-    monkeypatch.setattr("daqsvc.publish.connection.CONSENT_S", 10 * PATIENCE_S)
-    monkeypatch.setattr("daqsvc.publish.spoken.CONSENT_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.CONSENT_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("daqsvc.publish.mqtt.spoken.CONSENT_S", 10 * PATIENCE_S)
     server = await silent_server()
     async with server, publishing(outbox, server.sockets[0].getsockname()[1]) as publisher:
         await asyncio.sleep(0.1)
@@ -316,7 +316,7 @@ async def test_a_silent_broker_does_not_hold_up_the_stop(outbox, monkeypatch):
 
 @pytest.mark.mosquitto
 async def test_a_half_open_connection_does_not_hold_up_the_stop(tmp_path, outbox, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 10 * PATIENCE_S)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.PUBACK_S", 10 * PATIENCE_S)
     with running_mosquitto(tmp_path) as mosquitto:
         async with TcpProxy(mosquitto.port) as wire, publishing(outbox, wire.port) as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
@@ -340,6 +340,6 @@ async def test_a_refused_alarm_stays_on_disk(tmp_path, outbox, caplog):
 
 
 async def test_an_old_broker_is_met_with_the_old_protocol(outbox, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.connection.CONSENT_S", 0.3)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.CONSENT_S", 0.3)
     async with EmbeddedBroker() as embedded, publishing(outbox, embedded.port, "auto") as publisher:
         await eventually(lambda: publisher.counters.connected, "connected by MQTT 3.1.1")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tls_files import authority, self_signed, signed
 
-from daqsvc.publish.mqtt.certificates import CertificateError, certificate, certificates, issuer_of
+from daqsvc.publish.mqtt.credentials import CertificateError, certificate, certificates, issuer_of
 
 VERSION_1 = """-----BEGIN CERTIFICATE-----
 MIIBGDCBvwIUX0aMDqtCAguYylZfBo25dZoWBEwwCgYIKoZIzj0EAwIwDjEMMAoG

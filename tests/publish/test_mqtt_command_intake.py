@@ -17,9 +17,8 @@ from support.mqtt_publishing import commands
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.commands import AlarmCommand, CommandOutcome, Verb
 from daqsvc.outbox.command_ids import CommandIds
-from daqsvc.publish.connection import Incoming
-from daqsvc.publish.mqtt.command_intake import CommandIntake
-from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
+from daqsvc.publish.mqtt.commands import CommandIntake, CommandPayload, ResponsePayload
+from daqsvc.publish.mqtt.connection import Incoming
 from daqsvc.publish.topics import Topics
 
 NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=UTC)

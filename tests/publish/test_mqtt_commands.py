@@ -16,7 +16,7 @@ from support.mqtt_publishing import Desk, commands, publishing, say
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
-from daqsvc.publish.mqtt.command_payloads import ResponsePayload
+from daqsvc.publish.mqtt.commands import ResponsePayload
 
 pytestmark = [pytest.mark.integration, pytest.mark.mosquitto]
 ACKNOWLEDGE = "daqsvc/lab/edge-1/rig/commands/acknowledge"

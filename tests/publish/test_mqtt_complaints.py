@@ -16,8 +16,8 @@ from support.picky_broker import PickyBroker, only_availability
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.delivery import IN_FLIGHT
 from daqsvc.publish.mqtt import credentials
+from daqsvc.publish.mqtt.delivery import IN_FLIGHT
 from daqsvc.publish.mqtt.publisher import FIRST_RETRY_NS
 
 pytestmark = pytest.mark.integration
@@ -150,7 +150,7 @@ async def test_a_broker_that_tells_of_a_rival_is_believed_at_once(mosquitto, out
 
 async def test_a_connected_broker_without_traffic_is_reconnected_to_in_a_storm(outbox, monkeypatch):
     """telegraf#16038: connected, nothing gets through, a new connection, and so on at the same pace."""
-    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 0.1)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.PUBACK_S", 0.1)
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.PUBACK_S", 0.1)
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.05)
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 10_000_000)

@@ -95,13 +95,13 @@ class OldBroker(PickyBroker):
 async def test_a_broker_that_knows_no_mqtt_5_is_found_out_once(outbox, monkeypatch):
     """And asked for it again when it may be another one."""
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
-    monkeypatch.setattr("daqsvc.publish.spoken.HASTE_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.spoken.HASTE_S", 0.05)
     async with OldBroker() as broker:
         for _ in range(3):
             async with publishing(outbox, broker.port, "auto") as publisher:
                 await eventually(lambda p=publisher: p.counters.connected, "connected")
         assert broker.asked == [5, 4, 4, 4]
-        monkeypatch.setattr("daqsvc.publish.spoken.REMEMBERED_NS", 0)
+        monkeypatch.setattr("daqsvc.publish.mqtt.spoken.REMEMBERED_NS", 0)
         async with publishing(outbox, broker.port, "auto") as publisher:
             await eventually(lambda: publisher.counters.connected, "connected")
         assert broker.asked == [5, 4, 4, 4, 5, 4]
@@ -110,8 +110,8 @@ async def test_a_broker_that_knows_no_mqtt_5_is_found_out_once(outbox, monkeypat
 async def test_a_broker_of_mqtt_5_that_takes_its_time_gets_it(outbox, monkeypatch):
     """It is asked in 3.1.1, does not answer to that either, and then is waited for."""
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
-    monkeypatch.setattr("daqsvc.publish.spoken.HASTE_S", 0.05)
-    monkeypatch.setattr("daqsvc.publish.spoken.CONSENT_S", 1.0)
+    monkeypatch.setattr("daqsvc.publish.mqtt.spoken.HASTE_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.spoken.CONSENT_S", 1.0)
 
     class Slow(PickyBroker):
         async def _serve(self, reader, writer):

@@ -11,8 +11,7 @@ import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
-from daqsvc.publish.errors import MqttCodeError, MqttError
-from daqsvc.publish.outage import MOST_REASONS, Outage, has_expired, in_words
+from daqsvc.publish.mqtt.errors import MOST_REASONS, MqttCodeError, MqttError, Outage, has_expired, in_words
 
 
 def unverified(code, message):

@@ -19,8 +19,8 @@ from daqsvc.alarms.events import Identity
 from daqsvc.alarms.manager import DiagnosisRule
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.store import Outbox
-from daqsvc.publish.connection import Connection
-from daqsvc.publish.errors import MqttError
+from daqsvc.publish.mqtt.connection import Connection
+from daqsvc.publish.mqtt.errors import MqttError
 
 pytestmark = pytest.mark.integration
 BASE = "daqsvc/lab/edge-1"
@@ -171,7 +171,7 @@ async def test_a_broker_that_ends_the_connection_for_a_size_loses_nothing_else(o
 
 async def test_a_broker_that_says_nothing_about_one_topic_loses_nothing_else(outbox, caplog, monkeypatch):
     """No PUBACK for one, though later ones are acknowledged: a refusal without a word."""
-    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 0.3)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.PUBACK_S", 0.3)
     async with PickyBroker(lambda topic, _size: None if topic == BAD else True) as broker:
         await append(outbox, BAD)
         good = await append(outbox, GOOD, 5)
@@ -183,7 +183,7 @@ async def test_a_broker_that_says_nothing_about_one_topic_loses_nothing_else(out
 
 
 async def test_each_message_has_the_whole_time_for_its_own_acknowledgement(monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.connection.PUBACK_S", 0.6)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.PUBACK_S", 0.6)
     async with PickyBroker(lambda topic, _size: None if topic == BAD else True) as broker:
         connection = Connection("127.0.0.1", broker.port, in_flight=20, mqtt5=False, identifier="box")
         await connection.open()
@@ -223,7 +223,7 @@ async def test_a_message_overtaken_while_it_was_refused_does_not_become_the_late
 async def test_a_disk_that_takes_no_refused_messages_keeps_them_in_the_journal(
     tmp_path, outbox, caplog, monkeypatch
 ):
-    monkeypatch.setattr("daqsvc.publish.delivery.TRY_AGAIN_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.delivery.TRY_AGAIN_S", 0.05)
     path = tmp_path / "alarms-refused.sqlite"
     outbox.dead_letters._path = path
     path.mkdir()
@@ -264,7 +264,7 @@ async def test_a_store_that_cannot_be_read_makes_no_outage_of_the_broker(outbox,
 @pytest.mark.mosquitto
 async def test_an_alarm_names_what_is_refused_and_returns_when_it_is_taken(tmp_path, monkeypatch):
     """Also where its own topic is among the refused."""
-    monkeypatch.setattr("daqsvc.publish.delivery.TRY_AGAIN_S", 0.1)
+    monkeypatch.setattr("daqsvc.publish.mqtt.delivery.TRY_AGAIN_S", 0.1)
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.STABLE_S", 0.3)
     store = tmp_path / "store"
     alarm = f"{BASE}/rig/alarms/broker/refused"

@@ -25,10 +25,10 @@ from support.waiting import eventually
 from test_mqtt_schemas import rig
 
 from daqsvc.alarms.commands import CommandOutcome, Verb
-from daqsvc.publish.connection import OWED, Connection
 from daqsvc.publish.home_assistant.settings import HomeAssistant
+from daqsvc.publish.mqtt.connection import OWED, Connection
+from daqsvc.publish.mqtt.wire import Wire
 from daqsvc.publish.output import Watched
-from daqsvc.publish.wire import Wire
 
 pytestmark = pytest.mark.integration
 ALARM = "daqsvc/lab/edge-1/rig/alarms/rotor-fault"
@@ -102,8 +102,8 @@ async def listening(outbox, port, protocol, desk):
 async def rogue_broker(outbox, caplog, monkeypatch, protocol, packets):
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.TAKEN_OVER_S", 0.001)
     monkeypatch.setattr("daqsvc.publish.home_assistant.link.EARLIER_S", 0.01)
-    monkeypatch.setattr("daqsvc.publish.suspects.FIRST_BAR_S", 0.001)
-    monkeypatch.setattr("daqsvc.publish.suspects.LONGEST_BAR_S", 0.001)
+    monkeypatch.setattr("daqsvc.publish.mqtt.suspects.FIRST_BAR_S", 0.001)
+    monkeypatch.setattr("daqsvc.publish.mqtt.suspects.LONGEST_BAR_S", 0.001)
     desk = Desk()
     with nothing_but_counters_move(caplog):
         async with (
@@ -333,7 +333,7 @@ class Flooding(RogueBroker):
 
 
 async def test_a_flood_of_messages_waits_in_the_brokers_socket(outbox, caplog, monkeypatch):
-    monkeypatch.setattr("daqsvc.publish.connection.FLOOD_PER_S", 2000)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.FLOOD_PER_S", 2000)
     with nothing_but_counters_move(caplog):
         async with Flooding(1, 0) as broker, listening(outbox, broker.port, "5", Desk()) as box:
             await eventually(lambda: box.counters.ignored + box.counters.overlooked > 1000, "it floods")

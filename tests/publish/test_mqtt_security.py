@@ -14,8 +14,7 @@ from support.tls_files import authority, self_signed, signed
 from support.waiting import eventually
 
 from daqsvc.acquisition.clock import SystemClock
-from daqsvc.publish.mqtt.certificates import CertificateError
-from daqsvc.publish.mqtt.credentials import read_credentials
+from daqsvc.publish.mqtt.credentials import CertificateError, read_credentials
 from daqsvc.publish.mqtt.publisher import MqttPublisher
 from daqsvc.publish.payloads import status_payload
 
@@ -300,7 +299,7 @@ async def test_password_and_key_may_be_systemd_credentials(tmp_path, outbox, mon
 async def test_secrets_are_in_no_log_and_in_nothing_that_is_published(tmp_path, outbox, caplog):
     """Every log record of every library, everything on the broker, and what the publisher says of itself."""
     caplog.set_level(1)
-    caplog.set_level(1, "daqsvc.publish.connection.library")
+    caplog.set_level(1, "daqsvc.publish.mqtt.connection.library")
     mine = tmp_path / "mine"
     mine.write_bytes(b"\xff" + SECRET.encode())
     with running_mosquitto(tmp_path, config=password_config(tmp_path), anonymous=False) as mosquitto:

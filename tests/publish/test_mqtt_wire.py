@@ -7,8 +7,8 @@ import socket
 
 import pytest
 
-from daqsvc.publish.suspects import FIRST_BAR_S, LONGEST_BAR_S, REASON, Suspects
-from daqsvc.publish.wire import CUT_TO, LARGEST_PACKET, ProtocolViolationError, Wire
+from daqsvc.publish.mqtt.suspects import FIRST_BAR_S, LONGEST_BAR_S, REASON, Suspects
+from daqsvc.publish.mqtt.wire import CUT_TO, LARGEST_PACKET, ProtocolViolationError, Wire
 
 CONSENT = b"\x20\x02\x00\x00"
 

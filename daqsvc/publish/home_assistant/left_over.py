@@ -12,14 +12,14 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from daqsvc.outbox.files import replace_durably
-from daqsvc.publish.errors import PublishRefusedError
+from daqsvc.publish.mqtt.errors import PublishRefusedError
 from daqsvc.publish.mqtt.link import MqttLink
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from daqsvc.publish.connection import Connection
+    from daqsvc.publish.mqtt.connection import Connection
 
 log = logging.getLogger(__name__)
 

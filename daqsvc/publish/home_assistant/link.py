@@ -9,18 +9,18 @@ import logging
 import random
 from typing import TYPE_CHECKING
 
-from daqsvc.publish.errors import PublishRefusedError
 from daqsvc.publish.home_assistant.discovery import Discovery
 from daqsvc.publish.home_assistant.left_over import LeftOver
 from daqsvc.publish.home_assistant.readings import Readings
 from daqsvc.publish.home_assistant.summary import Summary
+from daqsvc.publish.mqtt.errors import PublishRefusedError
 from daqsvc.publish.mqtt.link import MqttLink
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.publish.connection import Connection, Incoming
     from daqsvc.publish.home_assistant.settings import HomeAssistant
+    from daqsvc.publish.mqtt.connection import Connection, Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
     from daqsvc.publish.output import OutputPort
 

@@ -10,7 +10,7 @@ from daqsvc.settings.section import Section
 if TYPE_CHECKING:
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.publish.connection import Connection, Incoming
+    from daqsvc.publish.mqtt.connection import Connection, Incoming
     from daqsvc.publish.mqtt.settings import Mqtt
     from daqsvc.publish.output import OutputPort
     from daqsvc.settings.models import MachineFile

@@ -12,27 +12,27 @@ from typing import TYPE_CHECKING, Any, Literal
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.connection import PUBACK_S, Connection, Will
-from daqsvc.publish.counters import PublishCounters
-from daqsvc.publish.delivery import IN_FLIGHT
-from daqsvc.publish.errors import (
+from daqsvc.publish.mqtt.commands import CommandIntake
+from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
+from daqsvc.publish.mqtt.connection import PUBACK_S, Connection, Will
+from daqsvc.publish.mqtt.credentials import CertificateError, certificate, issuer_of, read_credentials
+from daqsvc.publish.mqtt.delivery import IN_FLIGHT
+from daqsvc.publish.mqtt.errors import (
+    Faults,
     MqttError,
+    Outage,
     PublishRefusedError,
     SilentBrokerError,
     TakenOverError,
+    has_expired,
+    in_words,
+    unless,
 )
-from daqsvc.publish.faults import Faults
-from daqsvc.publish.mqtt.certificates import CertificateError, certificate, issuer_of
-from daqsvc.publish.mqtt.command_intake import CommandIntake
-from daqsvc.publish.mqtt.conditions import NS_PER_DAY, BrokerCheck, BrokerVitals
-from daqsvc.publish.mqtt.credentials import read_credentials
-from daqsvc.publish.mqtt.session import CredentialsReplacedError, Session
-from daqsvc.publish.outage import Outage, has_expired, in_words
+from daqsvc.publish.mqtt.session import CredentialsReplacedError, PublishCounters, Session
+from daqsvc.publish.mqtt.spoken import Spoken
+from daqsvc.publish.mqtt.suspects import FIRST_BAR_S, Suspects
 from daqsvc.publish.output import Output
 from daqsvc.publish.payloads import availability_payload, diagnosis_payload, status_payload
-from daqsvc.publish.spoken import Spoken
-from daqsvc.publish.stopping import unless
-from daqsvc.publish.suspects import FIRST_BAR_S, Suspects
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

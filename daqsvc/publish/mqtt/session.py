@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.outbox.messages import OutboxError
-from daqsvc.publish.delivery import Delivery
-from daqsvc.publish.errors import MqttError, PublishRefusedError
 from daqsvc.publish.mqtt.credentials import read_credentials, stamp_of
-from daqsvc.publish.stopping import unless
-from daqsvc.publish.telemetry_delivery import TelemetryDelivery
+from daqsvc.publish.mqtt.delivery import Delivery, TelemetryDelivery
+from daqsvc.publish.mqtt.errors import MqttError, PublishRefusedError, unless
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -19,11 +18,10 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.messages import OutboxMessage
     from daqsvc.outbox.store import Outbox
-    from daqsvc.publish.connection import Connection, Incoming
-    from daqsvc.publish.counters import PublishCounters
-    from daqsvc.publish.faults import Faults
-    from daqsvc.publish.mqtt.command_intake import CommandIntake
+    from daqsvc.publish.mqtt.commands import CommandIntake
+    from daqsvc.publish.mqtt.connection import Connection, Incoming
     from daqsvc.publish.mqtt.credentials import Credentials
+    from daqsvc.publish.mqtt.errors import Faults
     from daqsvc.publish.mqtt.link import MqttLink
     from daqsvc.publish.mqtt.settings import Mqtt
     from daqsvc.publish.output import EarlierState
@@ -42,6 +40,55 @@ EARLIER_S = 3.0
 
 ANSWER_EXPIRY_S = 60.0
 """How long the answer to a command is of use."""
+
+
+@dataclass(slots=True)
+class PublishCounters:
+    """What the publisher has done.
+
+    Attributes:
+        connected: whether there is a connection now.
+        connections: how many there have been.
+        published: alarm messages handed to the broker, repeats included.
+        acknowledged: alarm messages for which a PUBACK came.
+        telemetry_sent: telemetry messages for which a PUBACK came.
+        telemetry_refused: telemetry messages that the broker would not take.
+        refused: alarm messages that the broker would not take, repeats included; they are kept.
+        overlooked: messages from the broker dropped because too many came at a time.
+        ignored: messages from the broker that the box has not subscribed to, or that came before its consent.
+        faults: mistakes of this program, each of which the log names once.
+    """
+
+    connected: bool = False
+    connections: int = 0
+    published: int = 0
+    acknowledged: int = 0
+    telemetry_sent: int = 0
+    telemetry_refused: int = 0
+    refused: int = 0
+    overlooked: int = 0
+    ignored: int = 0
+    faults: int = 0
+
+    def count_published(self) -> None:
+        """One more was handed to the broker."""
+        self.published += 1
+
+    def count_telemetry_sent(self) -> None:
+        """One more telemetry message was acknowledged."""
+        self.telemetry_sent += 1
+
+    def count_telemetry_refused(self) -> None:
+        """One more telemetry message was refused."""
+        self.telemetry_refused += 1
+
+    def count_overlooked(self) -> None:
+        """One more message from the broker was dropped."""
+        self.overlooked += 1
+
+    def count_ignored(self) -> None:
+        """One more message from the broker was none of the box's."""
+        self.ignored += 1
 
 
 class CredentialsReplacedError(Exception):

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.alarms.commands import Verb
-from daqsvc.publish.connection import Incoming
-from daqsvc.publish.mqtt.command_intake import CommandIntake
+from daqsvc.publish.mqtt.commands import CommandIntake
+from daqsvc.publish.mqtt.connection import Incoming
 from daqsvc.publish.sparkplug.codec import DataType, Metric
 
 if TYPE_CHECKING:

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 import daqsvc
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
-from daqsvc.publish.connection import Connection, Will
-from daqsvc.publish.delivery import IN_FLIGHT
-from daqsvc.publish.errors import MqttError
-from daqsvc.publish.faults import Faults
+from daqsvc.publish.mqtt.connection import Connection, Will
 from daqsvc.publish.mqtt.credentials import read_credentials
-from daqsvc.publish.outage import Outage
+from daqsvc.publish.mqtt.delivery import IN_FLIGHT
+from daqsvc.publish.mqtt.errors import Faults, MqttError, Outage, unless
+from daqsvc.publish.mqtt.spoken import Spoken
 from daqsvc.publish.output import Output
 from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands
 from daqsvc.publish.sparkplug.host import HostReports
@@ -35,8 +34,6 @@ from daqsvc.publish.sparkplug.metrics import (
 )
 from daqsvc.publish.sparkplug.node import EdgeNode
 from daqsvc.publish.sparkplug.session import EdgeSession, HostAwayError, SparkplugCounters
-from daqsvc.publish.spoken import Spoken
-from daqsvc.publish.stopping import unless
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

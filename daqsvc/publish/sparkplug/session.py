@@ -7,7 +7,7 @@ import logging
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.publish.errors import MqttError
+from daqsvc.publish.mqtt.errors import MqttError
 from daqsvc.publish.sparkplug.alarm_commands import MOST_AT_A_TIME
 from daqsvc.publish.sparkplug.codec import PayloadError
 from daqsvc.publish.sparkplug.host import STATES, HostReports, PrimaryHost
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
     from daqsvc.outbox.messages import OutboxMessage
-    from daqsvc.publish.connection import Connection, Incoming
+    from daqsvc.publish.mqtt.connection import Connection, Incoming
     from daqsvc.publish.output import OutputPort
     from daqsvc.publish.sparkplug.alarm_commands import AlarmCommands, HostCommand
     from daqsvc.publish.sparkplug.codec import Metric

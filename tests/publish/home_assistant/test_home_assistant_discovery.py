@@ -19,7 +19,7 @@ from daqsvc.publish.home_assistant.discovery import Discovery
 from daqsvc.publish.home_assistant.readings import Readings
 from daqsvc.publish.home_assistant.settings import HomeAssistant
 from daqsvc.publish.make import watched
-from daqsvc.publish.mqtt.command_payloads import CommandPayload
+from daqsvc.publish.mqtt.commands import CommandPayload
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.publish.output import Watched
 from daqsvc.publish.topics import Topics

@@ -13,15 +13,23 @@ import logging
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import ValidationError
+from pydantic import AwareDatetime, Field, ValidationError
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.alarms.commands import CommandOutcome, Verb, faults_of
+from daqsvc.alarms.commands import (
+    CommandMessage,
+    CommandOutcome,
+    DurationS,
+    Line,
+    Person,
+    Reason,
+    Verb,
+    faults_of,
+)
 from daqsvc.outbox.command_ids import REMEMBERED
-from daqsvc.publish.mqtt.command_payloads import CommandPayload, ResponsePayload
-from daqsvc.publish.payloads import stamp_now
+from daqsvc.publish.payloads import Stamped, stamp_now
 from daqsvc.publish.topics import ANSWER
 
 if TYPE_CHECKING:
@@ -30,7 +38,7 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.clock import Clock
     from daqsvc.alarms.commands import AlarmCommand, CommandHandler
     from daqsvc.outbox.command_ids import CommandIds
-    from daqsvc.publish.connection import Incoming
+    from daqsvc.publish.mqtt.connection import Incoming
     from daqsvc.publish.mqtt.settings import MqttCommands
     from daqsvc.publish.topics import CommandTopic, Topics
 
@@ -47,6 +55,38 @@ _RESERVED = ("$", "daqsvc/", "homeassistant/", "spBv1.0/", "STATE/")
 brokers."""
 
 _SHOWN_FAULTS = 500
+
+
+class CommandPayload(CommandMessage):
+    """One command; what is asked, and of which machine, stands in the topic."""
+
+    schema_: Literal["daqsvc.command/1"] = Field(alias="schema")
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:-]{1,64}$")] = Field(
+        description="chosen by the sender, new for every command, e.g. a UUID"
+    )
+    alarm: Annotated[str, Field(pattern=r"^[A-Za-z0-9_./-]{1,200}$")] = Field(description="name of the alarm")
+    by: Person = Field(description="who asks")
+    issued_at: AwareDatetime = Field(description="when, ISO 8601 with the offset from UTC")
+    expires_s: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="how old the command may become, if less than the machine file allows"
+    )
+    duration_s: DurationS | None = Field(default=None, description="how long to shelve; for shelve only")
+    occurrence: Annotated[Line, Field(min_length=1, max_length=64)] | None = Field(
+        default=None, description="refuse the command if another activation stands by now"
+    )
+    reason: Reason = Field(default="", description="why")
+
+
+class ResponsePayload(Stamped):
+    """What came of a command."""
+
+    schema_: Literal["daqsvc.response/1"] = Field("daqsvc.response/1", alias="schema")
+    id: str | None = Field(description="id of the command; null if it could not be read")
+    machine: str
+    verb: str
+    accepted: bool
+    reason: str = Field(description="why it was refused; empty if it was not")
+    events: tuple[str, ...] = Field(description="ids of the alarm events that followed")
 
 
 class CommandRefusedError(Exception):

@@ -17,16 +17,16 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from daqsvc.publish.errors import (
+from daqsvc.publish.mqtt.errors import (
     MqttCodeError,
     MqttError,
     NoConsentError,
     PublishRefusedError,
     SilentBrokerError,
     TakenOverError,
+    in_words,
 )
-from daqsvc.publish.outage import in_words
-from daqsvc.publish.wire import LARGEST_PACKET, Wire, WireContext
+from daqsvc.publish.mqtt.wire import LARGEST_PACKET, Wire, WireContext
 
 if TYPE_CHECKING:
     import ssl

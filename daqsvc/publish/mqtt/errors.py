@@ -1,17 +1,24 @@
-"""Why a broker is away, in words for a person, and each reason once while that lasts."""
+"""What goes wrong between the box and a broker: its names, its words for a person, each said once."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import socket
 import ssl
-from typing import TYPE_CHECKING
+import traceback
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from paho.mqtt.client import error_string
 
-from daqsvc.publish.errors import MqttCodeError
-
 if TYPE_CHECKING:
-    import logging
+    from collections.abc import Coroutine
+
+    from paho.mqtt.reasoncodes import ReasonCode
+
+log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
 
 MOST_REASONS = 8
 """Reasons that are told of in one outage: one that has a number in it must not fill the log."""
@@ -33,6 +40,42 @@ _CODES = {
     141: "nothing was heard for longer than the keep-alive",
 }
 """Reason codes of MQTT 5 (2.4) that have better words than their name; paho makes them of those of 3.1.1."""
+
+MOST_CAUSES: Final = 32
+"""Causes that are remembered as said; after these nothing more is said, only counted."""
+
+
+class MqttError(Exception):
+    """The broker refuses, or the connection to it is lost."""
+
+
+class MqttCodeError(MqttError):
+    """The broker, or the library, has given a code as the reason.
+
+    Args:
+        rc: a reason code of MQTT 5 (paho makes them of those of 3.1.1), or a number of the library's.
+        text: what could not be done.
+    """
+
+    def __init__(self, rc: ReasonCode | int, text: str = "") -> None:
+        super().__init__(f"{text}: {rc}" if text else str(rc))
+        self.rc = rc
+
+
+class NoConsentError(MqttError):
+    """The broker was reached, but did not say whether it accepts the connection."""
+
+
+class PublishRefusedError(MqttError):
+    """The broker will not take one message; the connection stands."""
+
+
+class SilentBrokerError(MqttError):
+    """The connection stands, but no acknowledgement came over it in time."""
+
+
+class TakenOverError(MqttError):
+    """Another client has connected with the same client id."""
 
 
 class Outage:
@@ -121,3 +164,44 @@ def _coded(error: MqttCodeError) -> str:
     if isinstance(error.rc, int):
         return error_string(error.rc).rstrip(".")  # a number of the library's, not of the standard
     return _CODES.get(getattr(error.rc, "value", 0), str(error.rc))
+
+
+class Faults:
+    """What went wrong that nobody has thought of.
+
+    Attributes:
+        count: how often.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._said: set[tuple[str, str]] = set()
+
+    def note(self, what: str, error: Exception) -> None:
+        """Count an error, and say each cause once, in one line that names where it came from.
+
+        Args:
+            what: what could not be done, and what follows.
+            error: the reason.
+        """
+        self.count += 1
+        frames = traceback.extract_tb(error.__traceback__)
+        where = f"{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}" if frames else "?"
+        cause = (what, f"{type(error).__name__} at {where}")
+        if cause in self._said or len(self._said) >= MOST_CAUSES:
+            return
+        self._said.add(cause)
+        log.error("%s: %s (%.200s); please report this", what, cause[1], ascii(str(error)))
+
+
+async def unless(stopping: asyncio.Event, work: Coroutine[Any, Any, _T]) -> _T | None:
+    """The result of ``work``; None, and ``work`` cancelled, if ``stopping`` is set before."""
+    task = asyncio.ensure_future(work)
+    told = asyncio.ensure_future(stopping.wait())
+    try:
+        await asyncio.wait({task, told}, return_when=asyncio.FIRST_COMPLETED)
+        return task.result() if task.done() else None
+    finally:
+        for each in (task, told):
+            each.cancel()
+        await asyncio.gather(task, told, return_exceptions=True)

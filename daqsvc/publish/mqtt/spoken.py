@@ -12,8 +12,8 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from daqsvc.outbox.files import replace_durably
-from daqsvc.publish.connection import CONSENT_S
-from daqsvc.publish.errors import NoConsentError
+from daqsvc.publish.mqtt.connection import CONSENT_S
+from daqsvc.publish.mqtt.errors import NoConsentError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
