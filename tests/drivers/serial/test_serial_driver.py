@@ -205,7 +205,7 @@ async def test_a_framing_that_fails_costs_the_link_and_not_the_service(
 ) -> None:
     driver = lines_driver(tmp_path / "port", [])
 
-    def fail(data: bytes) -> None:
+    def fail(data: bytes, arrivals_of: Any) -> None:
         raise ZeroDivisionError("as if by mistake")
 
     with PseudoTerminal(tmp_path / "port") as cable, monkeypatch.context() as patch:
