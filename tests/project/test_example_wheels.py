@@ -9,7 +9,7 @@ import sysconfig
 from pathlib import Path
 
 import pytest
-from support.example_packages import DETECTOR, DRIVER
+from support.example_packages import DETECTOR, DRIVER, OUTPUT
 from support.paths import ROOT
 
 pytestmark = [pytest.mark.integration, pytest.mark.long, pytest.mark.sources]
@@ -22,14 +22,22 @@ alert = 5.0
 [[alarms]]
 name = "knocks"
 detector = "crest"
+
+[event_file]
+path = "events.jsonl"
 """
-# Frames of 30 samples with a knock among them, sent to the driver; its samples given to the detector.
+# Frames of 30 samples with a knock among them, sent to the driver; its samples given to the detector; what
+# that says, to the alarms, which the output tells.
 RUN = """
-import asyncio, sys, numpy as np, tcp_frames, crest
+import asyncio, json, sys, numpy as np, tcp_frames, crest, event_file
 from pathlib import Path
 from daqsvc import api
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.alarm_service import AlarmService
+from daqsvc.alarms.events import Identity
+from daqsvc.alarms.make import alarm_rule
 from daqsvc.detectors.make import detectors
+from daqsvc.publish.make import output_set
 from daqsvc.settings import load_machine_file, parse_machine_file
 from drivers.make import bus_drivers, stream_layout
 
@@ -62,13 +70,30 @@ async def main():
     assert isinstance(detector, crest.CrestDetector), detector
     samples = np.concatenate([block.samples for block in blocks])[:1000]
     [said] = detector.process(api.Window(0, samples, 10**9, 1e6))
+    identity = Identity(machine.site, machine.box, machine.machine.name)
+    rules = [alarm_rule(alarm) for alarm in machine.alarms]
+    alarms = AlarmService(identity, rules, path.parent / "store", SystemClock(), output_set(machine))
+    output = alarms.outputs["event_file"]
+    assert isinstance(output, event_file.EventFileOutput), output
+    await alarms.open()
+    await alarms.resume({"crest": ("casing-x",)})
+    telling = asyncio.create_task(output.run())
+    alarms.take(said)
+    events = path.parent / "events.jsonl"
+    while not events.exists() or not events.read_text():
+        await asyncio.sleep(0.02)
+    telling.cancel()
+    await asyncio.gather(telling, return_exceptions=True)
+    await alarms.settle(2.0)
+    await alarms.close(2.0)
+    assert json.loads(events.read_text().splitlines()[0])["alarm"] == "knocks"
     print(said.decision, round(said.statistics["crest_factor"], 1), len(samples))
 
 asyncio.run(main())
 """
 
 
-def test_both_are_built_installed_and_run(tmp_path: Path) -> None:
+def test_all_are_built_installed_and_run(tmp_path: Path) -> None:
     def run(*command: object) -> str:
         done = subprocess.run(  # noqa: PLW1510 - looked at below
             [str(part) for part in command],
@@ -78,7 +103,7 @@ def test_both_are_built_installed_and_run(tmp_path: Path) -> None:
         return done.stdout
 
     # Copies: building leaves files beside the sources.
-    trees = {"daqsvc": ROOT, "driver": DRIVER, "detector": DETECTOR}
+    trees = {"daqsvc": ROOT, "driver": DRIVER, "detector": DETECTOR, "output": OUTPUT}
     spare = shutil.ignore_patterns(".*", "tests", "__pycache__", "build", "*.egg-info", "docs")
     for name, tree in trees.items():
         shutil.copytree(tree, tmp_path / name, ignore=spare)
@@ -107,6 +132,11 @@ def test_both_are_built_installed_and_run(tmp_path: Path) -> None:
     told = " ".join(run(venv / "bin" / "daqsvc", "check", machine).split())
     assert "driver tcp-frames, host 127.0.0.1, tcp_port 4001" in told
     assert "crest sensor casing-x, alert 5" in told
+    assert "event_file path events.jsonl" in told
     assert run(python, "-c", RUN, machine).split()[::2] == ["alert", "1000"]
-    where = run(python, "-c", "import crest, daqsvc, drivers; print(crest.__file__, daqsvc.__file__)").split()
+    where = run(
+        python,
+        "-c",
+        "import crest, daqsvc, event_file as e; print(crest.__file__, daqsvc.__file__, e.__file__)",
+    ).split()
     assert all(Path(file).is_relative_to(site) for file in where), where

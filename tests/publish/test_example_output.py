@@ -24,7 +24,7 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.reading import read_journal
 from daqsvc.publish.make import output_set
-from daqsvc.settings import describe, parse_machine_file
+from daqsvc.settings import describe, parse_machine_file, registry
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -161,6 +161,23 @@ def test_what_an_output_has_said_is_over_once_its_table_is_gone(tmp_path: Path) 
     alarms.manager.condition("certificate/ca", Level.ALERT, "it ends soon")
     said = Condition("certificate/ca", Level.NORMAL, "it is no longer in use")
     assert list(alarms._of_outputs()) == [said]
+
+
+def test_one_that_cannot_be_loaded_is_said_and_one_at_a_table_of_ours_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    info = tmp_path / "more" / "spoilt-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt\nVersion: 1.0\n")
+    points = "gone = no_such_module:Plugin\nalarms = event_file:EventFilePlugin\n"
+    (info / "entry_points.txt").write_text(f"[daqsvc.outputs]\n{points}")
+    monkeypatch.syspath_prepend(str(info.parent))
+    registry.forget()
+    [problem] = problems_of(f"{MOTOR.read_text()}\n[gone]\npath = 'x'", MOTOR)
+    assert problem.message.startswith("the output cannot be loaded from no_such_module:Plugin: ")
+    assert problem.remedy == "install the package that brings it again, or remove [gone]"
+    assert parse_machine_file(MOTOR.read_text(), MOTOR).alarms
+    assert "output alarms is left out: [alarms] is a table of daqsvc itself" in caplog.text
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:
