@@ -15,7 +15,7 @@
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
-# Tests run side by side, one process a core; a file's tests stay together. Of the long ones many wait.
+# Tests run side by side, one process a core, each from its end of the list until one helps the other. Of the long ones many wait.
 WORKERS ?= auto
 LONG_WORKERS ?= 3
 # Without ROOM all of them.
@@ -50,7 +50,7 @@ demo: $(READY)
 	@$(BIN)/daqsvc demo $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long" $(TESTS) $(ARGS)
+	@$(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not long" $(TESTS) $(ARGS)
 
 # Property tests are tried with all their examples here, with a third of them in `make test`.
 test-long: $(READY)
@@ -86,7 +86,7 @@ test-wheel: dist
 	@$(DIST)/venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
 	@$(DIST)/venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-index $(DIST)/*.whl
 	@mkdir $(DIST)/tree && git archive HEAD | tar -x -C $(DIST)/tree --exclude=daqsvc --exclude=drivers --exclude=sim_hw
-	@cd $(DIST)/tree && ../venv/bin/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m "not long and not sources" $(ARGS)
+	@cd $(DIST)/tree && ../venv/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not long and not sources" $(ARGS)
 
 hooks: $(READY)
 	@$(BIN)/pre-commit install
