@@ -1,7 +1,8 @@
-"""For how long an alarm may be shelved, and what all alarms count."""
+"""Shelving: for how long, and which ends next; what holds where nothing is said; what all alarms count."""
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -10,14 +11,18 @@ from daqsvc.alarms.states import CommandNotAllowedError
 from daqsvc.settings.alarms import AlarmHandling
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from daqsvc.alarms.commands import AlarmCommand
 
-_UNITS = ((86_400, "d"), (3600, "h"), (60, "m"))
 CALM: Final = AlarmHandling(chatter_raises=0, flood_alarms=0, shelve_at_most_s=86_400.0)
 """Where nothing is said of it: no alarm chatters, and no number of them is a flood."""
 
+_UNITS = ((86_400, "d"), (3600, "h"), (60, "m"))
 _LONGEST_S = 1e9
 """Longer times are no more of use in days than in seconds."""
+_SLACK = 64
+"""Ends of shelving that no longer hold and may stay in the heap, besides as many as hold."""
 
 
 def shelving_ns(command: AlarmCommand, longest_s: float) -> int:
@@ -38,6 +43,34 @@ def shelving_ns(command: AlarmCommand, longest_s: float) -> int:
             f"state a time above 0 and up to {in_units(longest_s)}"
         )
     return round(duration_s * 1e9)
+
+
+class ShelvingEnds:
+    """The ends of shelving, by the monotonic clock, soonest first.
+
+    An alarm that is uncovered before its time may stay in it: whoever asks looks at the alarm itself.
+    """
+
+    def __init__(self) -> None:
+        self._until_ns: dict[str, int] = {}
+        self._heap: list[tuple[int, str]] = []
+
+    def put(self, alarm: str, until_ns: int) -> None:
+        """``alarm`` is shelved until ``until_ns``, whatever was said of it before."""
+        self._until_ns[alarm] = until_ns
+        heapq.heappush(self._heap, (until_ns, alarm))
+        if len(self._heap) > 2 * len(self._until_ns) + _SLACK:
+            # Somebody shelves the same alarms again and again.
+            self._heap = [(until_ns, name) for name, until_ns in self._until_ns.items()]
+            heapq.heapify(self._heap)
+
+    def due(self, now_ns: int) -> Iterator[str]:
+        """The alarms whose time is over by ``now_ns``, each once."""
+        while self._heap and self._heap[0][0] <= now_ns:
+            until_ns, alarm = heapq.heappop(self._heap)
+            if self._until_ns.get(alarm) == until_ns:
+                del self._until_ns[alarm]
+                yield alarm
 
 
 def in_units(duration_s: float) -> str:

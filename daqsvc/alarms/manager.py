@@ -24,11 +24,10 @@ from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
 from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
-from daqsvc.alarms.handling import CALM, AlarmCounters, shelving_ns
+from daqsvc.alarms.handling import CALM, AlarmCounters, ShelvingEnds, shelving_ns
 from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms
 from daqsvc.alarms.rules import Circumstances, DiagnosisRule, LevelRule, RuleFinding
-from daqsvc.alarms.shelving import ShelvingEnds
 from daqsvc.alarms.start_up import StartUpSignal
 from daqsvc.alarms.states import AlarmState, CommandNotAllowedError, Hold, Level
 from daqsvc.alarms.status import ClockReading, HandlingRequest
