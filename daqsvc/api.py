@@ -16,19 +16,19 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.detector import Detector, Window
 from daqsvc.diagnosis.plugin import DetectorPlugin
 from daqsvc.diagnosis.reading import Reading
-from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.recorded import Evaluated, Recorded, RecordedDetector, RecordingOptions, statements_of
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.outbox.messages import OutboxMessage
 from daqsvc.publish.output import Output, OutputPort, Watched
 from daqsvc.publish.plugin import OutputPlugin
-from daqsvc.settings.buses import Bus, Layout
+from daqsvc.settings.buses import Bus, Device, Layout
 from daqsvc.settings.models import MachineFile, Sensor, Stream
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.plugins import StreamWords
 from daqsvc.settings.problems import AssemblyError, Finding, choice
 from daqsvc.settings.section import Name, Section, Text
-from drivers.base import BusCounters, BusPort, Driver, StreamSpec
+from drivers.base import BusCounters, BusOptionError, BusPort, DeviceAbsentError, Driver, StreamSpec
 from drivers.frames import FrameLayout, LayoutError
 from drivers.plugin import DriverPlugin
 from drivers.reconnect import Attempt, CannotOpenError, in_thread, run_with_reconnect
@@ -39,12 +39,15 @@ __all__ = [
     "Attempt",
     "Bus",
     "BusCounters",
+    "BusOptionError",
     "BusPort",
     "CannotOpenError",
     "Clock",
     "Condition",
     "Detector",
     "DetectorPlugin",
+    "Device",
+    "DeviceAbsentError",
     "Diagnosis",
     "Driver",
     "DriverPlugin",
@@ -70,6 +73,7 @@ __all__ = [
     "SampleBlock",
     "Section",
     "Sensor",
+    "Severity",
     "Stream",
     "StreamAssembler",
     "StreamDriver",

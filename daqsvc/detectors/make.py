@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.settings.plugins import configured
+from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,11 +30,22 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
         store: directory of the state that survives restarts; None to begin without any and leave none.
 
     Raises:
-        AssemblyError: a calibration that the machine file names cannot be used.
+        AssemblyError: a calibration that the machine file names cannot be used, or a plugin makes a detector
+            under a name that no alarm can follow.
     """
-    return [
-        detector for plugin, given in plugins(machine) for detector in plugin.build(machine, given, store)
-    ]
+    made: dict[str, Detector] = {}
+    for plugin, given in plugins(machine):
+        for detector in plugin.build(machine, given, store):
+            if detector.name in made:
+                raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")
+            named = plugin.detector
+            if named is not None and detector.name.partition("/")[0] != named.partition("/")[0]:
+                raise AssemblyError(
+                    f"the plugin of {named!r} makes a detector {detector.name!r}, which no alarm follows; "
+                    f"name it {named!r}, or set `detector` of the plugin"
+                )
+            made[detector.name] = detector
+    return list(made.values())
 
 
 def check_files(machine: MachineFile) -> None:

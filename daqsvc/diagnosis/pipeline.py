@@ -186,6 +186,8 @@ class Pipeline:
         ]
         try:
             await over(following)
+            while not all(ring.is_closed for ring in self._rings.values()):  # nobody follows some of them
+                await self._clock.sleep_ns(LOOK_NS)
         finally:
             for part in (listening, *following):
                 part.stop()
@@ -236,6 +238,8 @@ class Pipeline:
             return
         self._let_go(stream)
         self._silent_until_ns[stream] = now_ns
+        if not any(detector.stream == stream for detector in self.detectors):
+            logger.warning("%s; no detector reads them", silence_reason(stream, silence_s))
         for detector in self.detectors:
             if detector.stream == stream:
                 self._say_silent(detector, silence_s, now_ns)
@@ -252,7 +256,7 @@ class Pipeline:
                 if window is None:
                     self._let_go(detector.stream)
                     return
-                work = partial(_process, detector, window, self.counters[detector.name])
+                work = partial(self._process, detector, window)
                 self._under_way[detector.name] = kernels.submit(work)
             job = self._under_way[detector.name]
             await self._until_made(detector, job, kernels)
@@ -303,6 +307,31 @@ class Pipeline:
                 hangs = f"it has computed on one window for {HANG_S:g} s"
                 self._supervisor.failed(_part(detector), hangs, "the other detectors go on without it")
 
+    def _process(self, detector: Detector, window: Window) -> Sequence[Diagnosis]:
+        """What a detector says of a window; on a kernel thread.
+
+        One that raises has judged nothing: what it said before is held, and its sensors are in doubt.
+        """
+        counters = self.counters[detector.name]
+        # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
+        begun_ns = time.perf_counter_ns()
+        try:
+            return detector.process(window)
+        except Exception as error:  # noqa: BLE001 - said and counted
+            counters.failures += 1
+            self._supervisor.failed(_part(detector), error, "it goes on with the next window")
+            reason = f"detector {detector.name} has failed: {type(error).__name__}: {error}"
+            with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
+                return [
+                    replace(held, quality="missing", reason=reason)
+                    for held in detector.silent(0.0, window.t_end_ns)
+                ]
+            return []
+        finally:
+            counters.windows += 1
+            counters.samples += len(window.samples)
+            counters.busy_ns += time.perf_counter_ns() - begun_ns
+
 
 def _part(detector: Detector) -> str:
     return f"detector {detector.name}"
@@ -310,25 +339,3 @@ def _part(detector: Detector) -> str:
 
 def _is_closed(ring: SampleRing) -> bool:
     return ring.is_closed
-
-
-def _process(detector: Detector, window: Window, counters: DetectorCounters) -> Sequence[Diagnosis]:
-    # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
-    begun_ns = time.perf_counter_ns()
-    try:
-        return detector.process(window)
-    except Exception:
-        counters.failures += 1
-        if counters.failures == 1:
-            logger.exception(
-                "detector %s failed on samples %d to %d of %r; it goes on with the next window",
-                detector.name,
-                window.first_index,
-                window.first_index + len(window.samples),
-                detector.stream,
-            )
-        return []
-    finally:
-        counters.windows += 1
-        counters.samples += len(window.samples)
-        counters.busy_ns += time.perf_counter_ns() - begun_ns

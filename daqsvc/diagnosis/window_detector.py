@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from numbers import Real
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.settings.problems import AssemblyError, choice
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from daqsvc.acquisition.samples import Samples
     from daqsvc.diagnosis.detector import Window
-    from daqsvc.diagnosis.record import Severity
     from daqsvc.dsp.quality import Quality
-    from daqsvc.settings.models import MachineFile
+    from daqsvc.settings.models import MachineFile, Sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +25,29 @@ class Judgement:
     """What a window shows.
 
     Attributes:
-        severity: how bad it is; an alarm that follows the detector goes by it.
+        severity: how bad it is, ``"normal"``, ``"alert"`` or ``"danger"``; an alarm that follows the detector
+            goes by it.
         statistics: what was measured, by name.
         decision: in a word; the severity unless given.
+        units: of the statistics that have one.
+        thresholds: what the statistics were held against, by name.
+
+    Raises:
+        ValueError: there is no such severity, or a statistic or threshold is not a number.
     """
 
     severity: Severity
     statistics: Mapping[str, float] = field(default_factory=dict)
     decision: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    thresholds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.severity not in get_args(Severity):
+            raise ValueError(f"there is no severity {self.severity!r}; {choice('', get_args(Severity))}")
+        for name, value in (*self.statistics.items(), *self.thresholds.items()):
+            if not isinstance(value, Real):
+                raise ValueError(f"{name} is {value!r}, which is not a number")  # noqa: TRY004 - of the value
 
 
 class WindowDetector:
@@ -42,10 +58,19 @@ class WindowDetector:
         name: of the detector, as alarms follow it.
         sensors: names of its sensors, all in one stream.
         window_s: length of a window.
+
+    Raises:
+        AssemblyError: there is no such sensor, or they are not all in one stream.
     """
 
     def __init__(self, machine: MachineFile, name: str, sensors: Sequence[str], window_s: float) -> None:
-        found = [machine.sensor(sensor) for sensor in sensors]
+        found = [_sensor(machine, name, sensor) for sensor in sensors]
+        streams = {sensor.stream for sensor in found}
+        if len(streams) != 1:
+            raise AssemblyError(
+                f"detector {name} takes samples of one stream together, and its sensors "
+                f"{', '.join(sensors)} are in {', '.join(sorted(streams)) or 'none'}; give it sensors of one"
+            )
         self.name = name
         self.stream = found[0].stream
         self.block = max(round(window_s * machine.streams[self.stream].rate_hz), 1)
@@ -94,6 +119,8 @@ class WindowDetector:
         if missing:
             return said
         judged = self.judge(samples)
+        if not isinstance(judged, Judgement):
+            raise TypeError(f"judge() returned {judged!r}; return a Judgement")
         decision = judged.decision or judged.severity
         changed = decision != self._held.decision
         self._held = replace(
@@ -101,6 +128,15 @@ class WindowDetector:
             decision=decision,
             severity=judged.severity,
             statistics=judged.statistics,
+            units=judged.units,
+            thresholds=judged.thresholds,
             changed=changed,
         )
         return self._held
+
+
+def _sensor(machine: MachineFile, name: str, sensor: str) -> Sensor:
+    try:
+        return machine.sensor(sensor)
+    except KeyError as error:
+        raise AssemblyError(f"detector {name}: {error.args[0]}") from error

@@ -5,14 +5,17 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated
 
+import numpy as np
 import pytest
 from pydantic import Field
 from support.machine_files import MACHINES, problems_of
 
 from daqsvc.detectors.make import detectors
+from daqsvc.diagnosis.detector import Window
 from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.settings import describe, parse_machine_file, registry
-from daqsvc.settings.problems import Finding
+from daqsvc.settings.problems import AssemblyError, Finding
 from daqsvc.settings.section import Name, Section
 
 EXAMPLE = MACHINES / "motor-accelerometer.toml"
@@ -117,3 +120,73 @@ def test_one_that_cannot_be_loaded_is_said_where_it_is_asked_for(installed):
     assert "the detector cannot be loaded from nobody_has_this:KurtosisPlugin: No module" in str(problem)
     assert "install the package that brings it again, or remove [pipeline.kurtosis]" in str(problem)
     assert problem.line == text(TABLE).splitlines().index("[pipeline.kurtosis]") + 1
+
+
+class Misnamed(KurtosisPlugin):
+    def build(self, machine, given, store):
+        made = Knocks(given.sensor)
+        made.name = "kurt"
+        return (made,)
+
+
+class Twice(KurtosisPlugin):
+    def build(self, machine, given, store):
+        return Knocks(given.sensor), Knocks(given.sensor)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "words"),
+    [
+        ("Misnamed", "the plugin of 'kurtosis' makes a detector 'kurt', which no alarm follows"),
+        ("Twice", "two detectors are named 'kurtosis'"),
+    ],
+)
+def test_detectors_that_no_alarm_can_tell_are_refused(installed, plugin, words):
+    installed(kurtosis=f"{__name__}:{plugin}")
+    with pytest.raises(AssemblyError, match=words):
+        detectors(parse_machine_file(text(TABLE, ALARM), EXAMPLE))
+
+
+class Peak(WindowDetector):
+    """Says what it is told to."""
+
+    answer = Judgement("alert", {"peak": 2.0}, units={"peak": "g"}, thresholds={"peak.alert": 1.0})
+
+    def judge(self, samples):
+        return self.answer
+
+
+def one_window(made, machine):
+    columns = len(machine.streams[made.stream].layout.channel_names)
+    samples = np.zeros((made.block, columns), np.float32)
+    return made.process(Window(0, samples, 10**9, 1e9 / made.block))
+
+
+def test_a_judgement_is_shown_with_units_and_thresholds():
+    machine = parse_machine_file(text(), EXAMPLE)
+    [said] = one_window(Peak(machine, "peak", ["accel-de"], 0.5), machine)
+    assert (said.severity, said.statistics, said.units) == ("alert", {"peak": 2.0}, {"peak": "g"})
+    assert said.thresholds == {"peak.alert": 1.0}
+
+
+def test_a_judgement_that_nobody_can_read_is_refused():
+    with pytest.raises(ValueError, match="no severity 'WARNING'; take one of: alert, danger, normal"):
+        Judgement("WARNING")
+    with pytest.raises(ValueError, match="peak is 'much', which is not a number"):
+        Judgement("alert", {"peak": "much"})
+    machine = parse_machine_file(text(), EXAMPLE)
+    made = Peak(machine, "peak", ["accel-de"], 0.5)
+    made.answer = None
+    with pytest.raises(TypeError, match=r"judge\(\) returned None; return a Judgement"):
+        one_window(made, machine)
+
+
+def test_sensors_that_are_not_sampled_together_are_refused():
+    two = MACHINES / "rotor-two-buses.toml"
+    machine = parse_machine_file(two.read_text(), two)
+    names = [sensor.name for sensor in machine.sensors]
+    assert len({machine.sensor(name).stream for name in names}) > 1
+    with pytest.raises(AssemblyError, match=r"takes samples of one stream .* give it sensors of one"):
+        Peak(machine, "peak", names, 0.5)
+    with pytest.raises(AssemblyError, match="detector peak: no sensor 'nosuch'; there are"):
+        Peak(machine, "peak", ["nosuch"], 0.5)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support.waiting import PATIENCE_S
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
@@ -16,6 +17,7 @@ from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.diagnosis.pipeline import Pipeline
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.dsp.quality.missing import Patience
+from daqsvc.supervision import Supervisor
 
 if TYPE_CHECKING:
     from daqsvc.diagnosis.detector import Window
@@ -132,8 +134,55 @@ async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.L
     ring.close()
     await running
     assert pipeline.counters["broken"].failures == 1
-    assert [d.first_index for d in said] == [10, 20]
-    assert sum("detector broken failed on samples 0 to 10" in r.message for r in caplog.records) == 1
+    assert [(d.first_index, d.decision, d.quality) for d in said] == [
+        (0, "N", "missing"),
+        (10, "N", "good"),
+        (20, "N", "good"),
+    ]
+    assert said[0].reason == "detector broken has failed: ZeroDivisionError: a detector broke its contract"
+    errors = [r.message for r in caplog.records if r.levelno >= logging.ERROR]
+    assert len(errors) == 1
+    assert "detector broken: failed with ZeroDivisionError" in errors[0]
+
+
+async def test_one_that_raises_each_time_is_in_doubt_all_the_time() -> None:
+    ring = SampleRing("s", ("a",), 50)
+    broken = Listener("broken", 10)
+    broken.process = always_failing  # type: ignore[method-assign,assignment]
+    said: list[Diagnosis] = []
+    supervisor = Supervisor()
+    pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK, supervisor=supervisor)
+    running = asyncio.create_task(pipeline.run())
+    for count in range(1, 4):
+        write(ring, 10)
+        await eventually(lambda count=count: len(said) == count)
+    ring.close()
+    await running
+    assert {d.quality for d in said} == {"missing"}
+    assert supervisor.failures["detector broken"] == 3
+
+
+def always_failing(window: Window) -> list[Diagnosis]:
+    raise RuntimeError("boom")
+
+
+async def test_without_detectors_it_lasts_as_long_as_the_rings_and_says_what_falls_silent(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock, ring = DrivenClock(), SampleRing("s", ("a",), 50)
+    running = asyncio.create_task(Pipeline({"s": ring}, [], lambda _: None, clock).run())
+    write(ring, 10)
+    for _ in range(40):
+        await asyncio.sleep(0.002)
+        clock.advance_to(clock.monotonic_ns() + 250_000_000)
+    assert not running.done(), "it is not started again and again"
+    assert [r.message for r in caplog.records] == [
+        "no samples of s for 2.0 s; check bus and device; no detector reads them"
+    ]
+    ring.close()
+    await asyncio.sleep(0.002)
+    clock.advance_to(clock.monotonic_ns() + 1_000_000_000)
+    await running
 
 
 async def test_a_silence_is_said_once_and_again_after_the_next() -> None:

@@ -9,6 +9,7 @@ from daqsvc import api
 NAMES = {
     *("Driver", "DriverPlugin", "StreamDriver", "BusPort", "BusCounters", "StreamSpec", "Link", "Clock"),
     *("StreamAssembler", "assembler_of", "SampleBlock", "FrameLayout", "LayoutError"),
+    *("Device", "DeviceAbsentError", "BusOptionError", "Severity"),
     *("Attempt", "CannotOpenError", "in_thread", "run_with_reconnect"),
     *("Detector", "DetectorPlugin", "WindowDetector", "Judgement", "Window", "Diagnosis", "Reading"),
     *("Output", "OutputPlugin", "OutputPort", "OutboxMessage", "Watched", "Condition", "Level"),
@@ -16,7 +17,7 @@ NAMES = {
     *("RecordedDetector", "Recorded", "RecordingOptions", "Evaluated", "statements_of"),
     *("AssemblyError", "Finding", "StreamWords", "choice"),
 }
-TYPE_ALIASES = {"Name", "Text", "Sensor"}
+TYPE_ALIASES = {"Name", "Text", "Sensor", "Severity"}
 
 
 def test_the_names_are_these() -> None:
