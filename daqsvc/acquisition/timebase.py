@@ -27,6 +27,7 @@ from daqsvc.acquisition.arrivals import ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.clock_line import PARTS, Bucket, ClockLine, clock_line
 from daqsvc.acquisition.counter import CounterUnwrapper
+from daqsvc.dsp.quality.rate import AS_BEFORE, FITS, PLAUSIBLE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 BUCKET_NS = 100_000_000
 WINDOW_BUCKETS = 600
 SETTLING_NS = 2 * NS_PER_S
-MAX_DRIFT = 0.05
 RECENT_DELAYS = 1024
 CONTRADICTION_NS = NS_PER_S // 2
 """How far arrivals must be off the line, beyond what it may err, to contradict it."""
@@ -46,14 +46,12 @@ FELL_BEHIND_NS = 10 * NS_PER_S
 """How long arrivals must be later and later until the device is taken to be slower than it was."""
 RATE_SURE_NS = 3 * NS_PER_S
 """Of how much time the arrivals must agree on another rate than the nominal one."""
-PLAUSIBLE, PLAUSIBLE_NS = 0.15, 2 * NS_PER_S // 5
-"""The nominal rate is taken for the device's if the first arrivals of so long are so close to it."""
+PLAUSIBLE_NS = 2 * NS_PER_S // 5
+"""The nominal rate is taken for the device's if the first arrivals of so long fit within `PLAUSIBLE`."""
 STRAIGHT = 1.0 / 20.0
 """How far they may lie off a line of that rate, as a share of what they are off one of the nominal rate."""
 BEND, BEND_BUCKETS = 0.85, 30
 """Arrivals of so many buckets that take a smaller part of their time are of a faster device."""
-AS_BEFORE = 0.1
-"""Another rate that differs by less from the last one is the same."""
 MOST_RATIO = 1000.0
 """How many times its nominal rate a device may seem to send, and the other way round."""
 CLOCK_DRIFT = 300e-6
@@ -344,7 +342,7 @@ class TimeBase:
             (k for k, one in enumerate(reversed(self._late), 1) if _apart(one, last) >= duration_ns), 0
         )
         late = list(self._late)[-first:] if first >= PARTS else []
-        steady = late and abs(last.off_ns - late[0].off_ns) <= MAX_DRIFT * _apart(late[0], last)
+        steady = late and abs(last.off_ns - late[0].off_ns) <= FITS * _apart(late[0], last)
         return late if steady else []
 
     def _ever_later(self) -> list[Late]:
@@ -357,7 +355,7 @@ class TimeBase:
         growth = off[-1] - off[0]
         straight = np.abs(off - off[0] - growth * t / t[-1]).max() <= growth / 8.0
         counted = late[-1].bucket.x > late[0].bucket.x
-        return late if counted and straight and growth > MAX_DRIFT * t[-1] else []
+        return late if counted and straight and growth > FITS * t[-1] else []
 
     @property
     def _doubt_ns(self) -> float:
@@ -384,7 +382,7 @@ class TimeBase:
         """Lay the line under the window's arrivals."""
         if np.ptp(self._buckets[:, 1]) < SETTLING_NS:
             return
-        drift_ns = MAX_DRIFT * self._nominal_ns
+        drift_ns = FITS * self._nominal_ns
         line = self._line_of_any_rate() or clock_line(self._buckets, self._nominal_ns, (-drift_ns, drift_ns))
         off = line is not None and abs(line.slope_ns) > drift_ns
         if line is None or (off and np.ptp(self._buckets[:, 1]) < RATE_SURE_NS):
@@ -404,7 +402,7 @@ class TimeBase:
         None if they are of a stall, or of frames that were held up: such tell no rate. Where the device has
         had another rate before, the arrivals of that time are forgotten.
         """
-        drift_ns = MAX_DRIFT * self._nominal_ns
+        drift_ns = FITS * self._nominal_ns
         any_slope = (self._nominal_ns / MOST_RATIO - self._nominal_ns, self._nominal_ns * MOST_RATIO)
         line = clock_line(self._buckets, self._nominal_ns, any_slope)
         if line is None or abs(line.slope_ns) <= drift_ns or np.ptp(self._buckets[:, 1]) < RATE_SURE_NS:

@@ -48,7 +48,7 @@ _NEIGHBOURS = 51
 """Stamps that the one in their middle is held against."""
 
 FITS = 0.05
-"""How far the rate may be off the nominal one."""
+"""How far the rate may be off the nominal one; so in the time base (`daqsvc.acquisition.timebase`)."""
 BIN_NS = _NS_PER_S // 4
 GROUPS = 16
 PLAUSIBLE = 0.15
