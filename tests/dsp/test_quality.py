@@ -103,6 +103,6 @@ def test_a_wrong_rate_is_seen_by_stamps_and_by_arrivals() -> None:
     assert not stamps.agrees(1000.0)
     assert stamps.agrees(1000.0 * rate_hz * (1.0 + 0.9 * SAME_RATE))
     arrivals = ArrivalRate(1000.0)
-    arrivals.take(np.rint(np.arange(20_000) * 1e6 / rate_hz).astype(np.int64))
+    arrivals.add(np.rint(np.arange(20_000) * 1e6 / rate_hz).astype(np.int64))
     assert arrivals.rate_hz == pytest.approx(1000.0 * rate_hz, rel=1e-3)
     assert not arrivals.fits

@@ -104,7 +104,7 @@ def count_bad(names: Sequence[str], samples: Floats) -> DataQuality:
     return quality
 
 
-class Recorded(Protocol):
+class _Channels(Protocol):
     """What is looked at of a `daqsvc.recording.recording.Recording`."""
 
     @property
@@ -123,7 +123,7 @@ class Recorded(Protocol):
         ...
 
 
-def known_against(recording: Recorded) -> DataQuality:
+def known_against(recording: _Channels) -> DataQuality:
     """What is known against a recording before anybody looks at its signals."""
     quality = count_bad(recording.names, recording.samples)
     return replace(quality, problems=(*recording.notes, *quality.problems))
