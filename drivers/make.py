@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.acquisition.standing import tell_nobody
-from daqsvc.settings.problems import AssemblyError
+from daqsvc.settings.problems import AssemblyError, mend_or_remove, raised
 from daqsvc.settings.registry import bus_tables, driver_of_layout
 from drivers.base import BusOptionError, BusPort, StreamSpec
+from drivers.frames import LayoutError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,7 +69,7 @@ def bus_driver(
         tell: see `drivers.base.BusPort`.
 
     Raises:
-        AssemblyError: a driver cannot use an option.
+        AssemblyError: a driver cannot use an option, or fails when it is made.
         LayoutError: see `DriverPlugin.stream_layout`.
     """
     bus = machine.buses[name]
@@ -77,6 +78,11 @@ def bus_driver(
         return plugin.build(plugin.absolute(machine, bus), bus_port(machine, name, clock, deliver, tell))
     except BusOptionError as error:
         raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
+    except (AssemblyError, LayoutError):
+        raise
+    except Exception as error:
+        said = f"{raised(error, plugin, 'build')}; {mend_or_remove(f'buses.{name}')}"
+        raise AssemblyError(f"{machine.path}: buses.{name}: {said}") from error
 
 
 def bus_port(

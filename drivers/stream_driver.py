@@ -30,6 +30,14 @@ class StreamDriver:
     Args:
         port: streams with a `FrameLayout` each, clock and where to deliver.
         link_name: what a person calls the link, e.g. ``"logger 'fan' (192.0.2.10:4001)"``.
+
+    Attributes:
+        name: of the bus in the machine file.
+        port: what was given: `read` takes the streams from ``port.streams``, the time from ``port.clock``.
+        link: whether the device is there: `read` says ``link.up()``, and why it is lost by what it returns.
+        counters: what is no frame of a stream: `read` adds to ``counters.frames_unknown``. A frame of a
+            stream that is too short or too long goes to ``streams[name][0].frames_wrong_length``. All else
+            (losses, repeats, checksums) is counted by `take`.
     """
 
     def __init__(self, port: BusPort, link_name: str) -> None:
@@ -63,6 +71,7 @@ class StreamDriver:
 
         Raises:
             OSError: the link cannot be opened, or broke.
+            CannotOpenError: it cannot be opened, in words of the driver's own.
         """
         raise NotImplementedError
 
@@ -86,6 +95,9 @@ class StreamDriver:
         ticking = asyncio.create_task(self._tick(), name=f"tick of {self.link.name}")
         try:
             reason = await self.read()
+        except CannotOpenError:
+            self.counters.open_failures += 1
+            raise
         except OSError as error:
             if self.link.state != "up":
                 self.counters.open_failures += 1

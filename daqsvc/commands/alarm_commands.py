@@ -54,7 +54,6 @@ class AlarmVerb:
             metavar="ID",
             help="name of the alarm, or how its id begins in daqsvc alarms",
         )
-        add_store(parser)
         if self._verb == "shelve":
             parser.add_argument(
                 "--for",
@@ -69,6 +68,7 @@ class AlarmVerb:
         )
         parser.add_argument("--reason", type=one_line, default="", metavar="TEXT", help="why")
         parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

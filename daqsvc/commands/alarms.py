@@ -40,7 +40,6 @@ class AlarmsCommand:
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """See `daqsvc.cli.Command.add_arguments`."""
-        add_store(parser)
         parser.add_argument("--all", action="store_true", help="those that are normal, too")
         parser.add_argument(
             "--history",
@@ -55,6 +54,7 @@ class AlarmsCommand:
             action="store_true",
             help="one JSON object a line: the alarm messages as they go over MQTT",
         )
+        add_store(parser)
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""

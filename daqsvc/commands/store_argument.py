@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ def store_directory(machine: MachineFile) -> Path:
 
 
 def add_store(parser: argparse.ArgumentParser) -> None:
-    """``[FILE | --store DIR]``: whose alarms."""
+    """``[FILE | --store DIR]``: whose alarms; to be called when all other arguments are there."""
     either = parser.add_mutually_exclusive_group()
     either.add_argument(
         "file", type=Path, nargs="?", metavar="FILE", help="the machine file that the service runs (TOML)"
@@ -54,6 +55,9 @@ def add_store(parser: argparse.ArgumentParser) -> None:
         help="directory of its alarm journal (default: $STATE_DIRECTORY, else the one there is in "
         "~/.local/state/daqsvc)",
     )
+    # argparse shows each for itself, as if both could be given.
+    usage = re.sub(r"\[--store DIR\]\s+", "", parser.format_usage())
+    parser.usage = usage.removeprefix("usage: ").rstrip().replace("[FILE]", "[FILE | --store DIR]")
 
 
 def chosen_store(arguments: argparse.Namespace, load: Load) -> Path:

@@ -7,11 +7,13 @@ where it asks for a value that is not (`UnusableValueError`): one mistake never 
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.bus_checks import check_devices, check_drivers, check_unused
+from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.layout_checks import (
     check_channel_use,
     check_channels,
@@ -21,6 +23,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
+from daqsvc.settings.problems import Finding, mend_or_remove, raised
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
@@ -32,11 +35,11 @@ from daqsvc.settings.sensor_checks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.plugins import BusTable
-    from daqsvc.settings.problems import Finding, KeyPath
+    from daqsvc.settings.problems import KeyPath
 
 _MOST_FINDINGS = 200
 """Whoever has mended these may ask again."""
@@ -66,29 +69,52 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
             at: KeyPath = ("streams", name)
             yield check_stream_bus(draft, stream, at)
             for plugin in _drivers_of(draft, stream):
-                with suppress(UnusableValueError):
-                    yield from plugin.stream_checks(draft, stream, facts.get(name), at)
+                checks = partial(plugin.stream_checks, draft, stream, facts.get(name), at)
+                yield from _of_plugin(plugin, "stream_checks", checks, at)
             with suppress(UnusableValueError):
                 yield check_channels(stream.layout, (*at, "layout"))
     yield check_unused(draft)
     yield check_drivers(draft)
     yield check_devices(draft)
     for plugin in _drivers(draft):
-        with suppress(UnusableValueError):
-            yield from plugin.checks(draft, facts)
+        bus = _bus_of(draft, plugin)
+        yield from _of_plugin(plugin, "checks", partial(plugin.checks, draft, facts), bus)
     yield from _sensor_checks(draft, facts)
     yield check_memory(draft)
     yield _names(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
-        for _, detector, given in configured(draft.pipeline, valid_only=True):
-            with suppress(UnusableValueError):
-                yield from detector.checks(draft, given)
+        for key, detector, given in configured(draft.pipeline, valid_only=True):
+            checks = partial(detector.checks, draft, given)
+            yield from _of_plugin(detector, "checks", checks, ("pipeline", key))
     yield from alignment_checks(draft)
     yield from alarm_checks(draft)
-    for _, output, given in configured_outputs(draft, valid_only=True):
-        with suppress(UnusableValueError):
-            yield from output.checks(draft, given)
+    for path, output, given in configured_outputs(draft, valid_only=True):
+        checks = partial(output.checks, draft, given)
+        yield from _of_plugin(output, "checks", checks, tuple(path.split(".")))
+
+
+def _of_plugin(
+    plugin: object, part: str, checks: Callable[[], Iterator[Iterator[Finding]]], at: KeyPath
+) -> Iterator[Iterator[Finding]]:
+    """The checks of a plugin; one that fails is a finding about its table, and costs no other."""
+    remedy = mend_or_remove(dotted(at))
+
+    def each(found: Iterator[Finding]) -> Iterator[Finding]:
+        try:
+            yield from found
+        except UnusableValueError:
+            return
+        except Exception as error:  # noqa: BLE001  whatever a plugin does, the rest is checked
+            yield Finding(at, raised(error, plugin, part), remedy)
+
+    try:
+        for found in checks():
+            yield each(found)
+    except UnusableValueError:
+        return
+    except Exception as error:  # noqa: BLE001  see above
+        yield iter([Finding(at, raised(error, plugin, part), remedy)])
 
 
 def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
@@ -101,6 +127,13 @@ def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
         if not any(plugin is not None and type(stream.layout) in plugin.layouts for plugin in used):
             used.add(driver_of_layout(stream.layout))
     return [plugin for plugin in bus_tables().values() if plugin in used]
+
+
+def _bus_of(draft: MachineFile, plugin: BusTable) -> KeyPath:
+    """Where the first bus of a driver stands."""
+    with suppress(UnusableValueError):
+        return next((("buses", name) for name, bus in draft.buses.items() if type(bus) in plugin.buses), ())
+    return ()
 
 
 def _drivers(draft: MachineFile) -> list[BusTable]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
@@ -15,10 +16,11 @@ from daqsvc.settings.plugins import (
     driver_of_layout,
     output_tables,
 )
+from daqsvc.settings.problems import raised
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from daqsvc.settings.models import MachineFile, Sensor, Stream
 
@@ -79,7 +81,17 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
 
 def _bus(machine: MachineFile, name: str) -> str:
     bus = machine.buses[name]
-    return f"{bus_tables()[bus.driver].describe_bus(machine, name)}; if absent at start: {bus.start}"
+    plugin = bus_tables()[bus.driver]
+    words = _words(plugin, "describe_bus", partial(plugin.describe_bus, machine, name))
+    return f"{words}; if absent at start: {bus.start}"
+
+
+def _words(plugin: object, part: str, say: Callable[[], str]) -> str:
+    """What a plugin says of its table; if that fails, why."""
+    try:
+        return str(say())
+    except Exception as error:  # noqa: BLE001  whatever a plugin does, the rest is shown
+        return raised(error, plugin, part)
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
@@ -94,7 +106,10 @@ def _streams(machine: MachineFile) -> list[str]:
 
 def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
     plugin = driver_of_layout(stream.layout)
-    words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
+    try:
+        words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
+    except Exception as error:  # noqa: BLE001  see `_words`
+        words = StreamWords(frame=raised(error, plugin, "describe_stream"))
     rate = f"{stream.rate_hz:g} Hz"
     return name, stream.bus, words.frame_id, rate, words.frames, words.frame, words.counter, words.share
 
@@ -142,7 +157,7 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
         yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
     for key, plugin, given in configured(pipeline):
-        yield plugin.detector or key, plugin.describe(machine, given)
+        yield plugin.detector or key, _words(plugin, "describe", partial(plugin.describe, machine, given))
 
 
 _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband and delays")
@@ -181,7 +196,10 @@ def _limits(low: float | None, high: float | None, unit: str) -> str:
 
 
 def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
-    told = [(path, plugin.describe(machine, given)) for path, plugin, given in configured_outputs(machine)]
+    told = [
+        (path, _words(plugin, "describe", partial(plugin.describe, machine, given)))
+        for path, plugin, given in configured_outputs(machine)
+    ]
     for path, plugin in output_tables().items():
         below = [words for at, words in told if f"{at}.".startswith(f"{path}.") and words]
         if "." not in path and (below or plugin.absent):

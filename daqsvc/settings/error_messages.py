@@ -73,7 +73,8 @@ class ErrorFormatter:
         say: Callable[[KeyPath, Mapping[str, Any]], tuple[str, str]]
         say = getattr(self, f"_{error['type']}", self._other)
         message, remedy = say(path, context)
-        return message or f"is not valid: {error['msg']}", remedy
+        # Of a validator that raises a ValueError pydantic says "Value error, " before its words.
+        return message or f"is not valid: {str(context.get('error', '')) or error['msg']}", remedy
 
     # Each method below is named after the pydantic error type it puts into words.
 

@@ -17,7 +17,14 @@ from daqsvc.settings.files import UnreadableFileError, read_bounded
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin, machine_file_model
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
-from daqsvc.settings.registry import broken_detectors, broken_outputs, driver_of_layout
+from daqsvc.settings.registry import (
+    broken_detectors,
+    broken_drivers,
+    broken_outputs,
+    bus_tables,
+    detector_tables,
+    driver_of_layout,
+)
 from daqsvc.settings.schema import declared_at, only_follows, section_of, valid_part, value_at
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.toml_text import MOST_BYTES, TomlTextError, decoded, parse
@@ -92,6 +99,7 @@ class _Reading:
         self._spots = spots
         self._path = path
         self._written_as: dict[KeyPath, str] = {}
+        self._lacks_detector = False
         self.findings: list[Finding] = []
 
     def leave_out_broken(self) -> None:
@@ -105,6 +113,7 @@ class _Reading:
                     del table[path[-1]]
                     remedy = f"install the package that brings it again, or remove [{name}]"
                     self.findings.append(Finding(path, why, remedy))
+                    self._lacks_detector |= path[0] == "pipeline"
 
     def validate(self) -> MachineFile:
         """Check every value for itself; returns the file, or what is valid of it."""
@@ -152,10 +161,26 @@ class _Reading:
 
     def problems(self) -> tuple[list[Problem], list[Problem]]:
         """What makes the file unusable, and what is worth a warning; both in the order of the file."""
-        found = dict.fromkeys(self.findings)
+        found = [one for one in dict.fromkeys(self.findings) if not self._only_follows(one.path)]
         fatal = [self._problem(finding) for finding in found if finding.fatal]
         warnings = [self._problem(finding) for finding in found if not finding.fatal]
         return sorted(fatal, key=_place), sorted(warnings, key=_place)
+
+    def _only_follows(self, path: KeyPath) -> bool:
+        """Whether nobody can tell what is wrong there before a plugin can be loaded; that is said itself."""
+        with suppress(LookupError, TypeError):
+            match path:
+                case ("streams", stream, "layout", *_):
+                    bus = value_at(self._document, ("streams", stream, "bus"))
+                    if value_at(self._document, ("buses", bus, "driver")) not in broken_drivers():
+                        return False
+                    layout = value_at(self._document, path[:3])
+                    kinds = {kind for plugin in bus_tables().values() for kind in plugin.layouts}
+                    return not any(kind.mark and kind.mark in layout for kind in kinds)
+                case ("alarms" | "alarm_handling", *_, "detector") if self._lacks_detector:
+                    known = {plugin.detector for plugin in detector_tables().values()}
+                    return value_at(self._document, self._as_written(path)) not in known
+        return False
 
     def _problem(self, finding: Finding) -> Problem:
         path = self._as_written(finding.path)

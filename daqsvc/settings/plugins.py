@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
 from daqsvc.settings import registry
+from daqsvc.settings.buses import UnknownBus
 from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.problems import Finding
@@ -135,6 +136,8 @@ class BusTable(DriverKind):
     def _fits(self, draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
         """The driver's bus carries its own layouts, and its layouts come over its own bus."""
         bus, layout = draft.buses.get(stream.bus), stream.layout
+        if isinstance(bus, UnknownBus):
+            return  # its driver is the finding
         if bus is not None and isinstance(bus, self.buses) != isinstance(layout, self.layouts):
             remedy = "correct bus, or describe what comes over it; docs/drivers.md has the layouts"
             yield Finding((*at, "layout"), f'is {layout.kind}, and bus "{stream.bus}" is {bus.kind}', remedy)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+import traceback
 from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 """A place in the file: keys, and 0-based positions in arrays, e.g. ``("sensors", 0, "name")``."""
@@ -80,6 +82,28 @@ class MachineFileError(Exception):
 
 class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there, or cannot be made."""
+
+
+def raised(error: Exception, by: object, part: str) -> str:
+    """What code of a plugin has raised, in words for its author, with the line of the plugin's file.
+
+    Args:
+        error: as it was caught.
+        by: the plugin, or one of its tables.
+        part: the method or property that was asked.
+    """
+    kind = type(by)
+    home = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    frames = traceback.extract_tb(error.__traceback__)
+    place = next((frame for frame in reversed(frames) if frame.filename == home), frames[-1])
+    said = ": ".join(word for word in (type(error).__name__, " ".join(f"{error}".split())) if word)
+    where = f"{Path(place.filename).name}, line {place.lineno}"
+    return f"{part} of {kind.__module__}.{kind.__qualname__} has failed: {said} ({where})"
+
+
+def mend_or_remove(table: str) -> str:
+    """A remedy for a plugin that fails: the table of it; empty if none is known."""
+    return "have the package that brings it mended" + (f", or remove [{table}]" if table else "")
 
 
 def choice(wanted: str, known: Iterable[str]) -> str:

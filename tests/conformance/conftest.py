@@ -1,8 +1,12 @@
-"""Every transport that a module ``*_transport.py`` of this folder brings is put through the whole suite."""
+"""Every transport that a module ``*_transport.py`` of this folder brings is put through the whole suite.
+
+So is what the modules bring that ``DAQSVC_TRANSPORTS`` names, with a colon between them.
+"""
 
 from __future__ import annotations
 
 import importlib
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +19,12 @@ if TYPE_CHECKING:
 
     from conformance.transport import Transport
 
+OURS = sorted(f"conformance.{file.stem}" for file in Path(__file__).parent.glob("*_transport.py"))
+BROUGHT = [module for module in os.environ.get("DAQSVC_TRANSPORTS", "").split(":") if module]
 FACTORIES = {
     name: factory
-    for file in sorted(Path(__file__).parent.glob("*_transport.py"))
-    for name, factory in transports_of(importlib.import_module(f"conformance.{file.stem}")).items()
+    for module in [*OURS, *BROUGHT]
+    for name, factory in transports_of(importlib.import_module(module)).items()
 }
 
 

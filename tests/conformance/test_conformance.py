@@ -65,6 +65,7 @@ async def test_a_driver_that_was_stopped_can_run_again(transport: Transport) -> 
     assert rig.counters.frames_received == 15, "something was read twice"
 
 
+@pytest.mark.needs("be absent")
 async def test_absent_at_start_is_an_error_if_the_machine_file_says_so(transport: Transport) -> None:
     transport.device.go_away()
     rig = Rig(transport, start="error")
@@ -76,6 +77,7 @@ async def test_absent_at_start_is_an_error_if_the_machine_file_says_so(transport
     assert rig.driver.counters.open_failures == 1
 
 
+@pytest.mark.needs("be absent")
 async def test_absent_at_start_is_left_alone_if_the_machine_file_says_so(transport: Transport) -> None:
     transport.device.go_away()
     rig = Rig(transport, start="ignore")
@@ -86,6 +88,7 @@ async def test_absent_at_start_is_left_alone_if_the_machine_file_says_so(transpo
     assert rig.driver.link.reason
 
 
+@pytest.mark.needs("be absent")
 async def test_absent_at_start_is_tried_again_until_it_is_there(transport: Transport) -> None:
     transport.device.go_away()
     async with Rig(transport) as rig:
@@ -107,6 +110,7 @@ def _no_log() -> Iterator[None]:
 
 
 @pytest.mark.long
+@pytest.mark.needs("be absent")
 @pytest.mark.usefixtures("_no_log")
 async def test_a_hundred_losses_leave_nothing_behind(transport: Transport) -> None:
     held: list[_Held] = []
@@ -157,6 +161,7 @@ async def _held(rig: Rig) -> _Held:
     return _Held(tasks, threads, files, tracemalloc.get_traced_memory()[0])
 
 
+@pytest.mark.needs("be absent")
 async def test_losses_at_any_moment_are_counted(transport: Transport) -> None:
     rng = np.random.default_rng(5)
     async with Rig(transport) as rig:

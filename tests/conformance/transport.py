@@ -16,6 +16,9 @@ whole numbers within +-32 000, so that 16-bit fields with scale 1 carry them exa
 
 What a transport cannot do physically is named in `Transport.cannot` with the reason: the tests of that are
 reported as skipped with this very text. Nothing else is ever skipped.
+
+A transport of a package outside this tree is a module with such a table that can be imported; the environment
+variable ``DAQSVC_TRANSPORTS`` names it, or several with a colon between them.
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ CHANNELS = ("x", "y")
 STREAM = "shaft"
 """The name of the one stream that the driver of a transport delivers."""
 
-Ability = Literal["drop", "duplicate", "reorder", "corrupt", "reset counter", "overflow"]
+Ability = Literal["drop", "duplicate", "reorder", "corrupt", "reset counter", "overflow", "be absent"]
+"""The last: a device that is not there can be told from one that is silent, e.g. by a refused connection."""
 
 
 class Time(Protocol):

@@ -22,6 +22,8 @@ from daqsvc.settings.problems import AssemblyError
 from drivers.can.plugin import frame_layout
 
 pytestmark = pytest.mark.integration
+FAILED = " has failed: "
+"""What is said of a plugin that raises (`daqsvc.settings.problems.raised`)."""
 RING_BYTES = 200_000_000
 DEVICE = MACHINES.parent / "devices" / "triaxial-accelerometer.dbc"
 _TOKEN = re.compile(r'"[^"]*"|[A-Za-z_]+|[0-9.]+|[|@()\[\],:;+-]')
@@ -42,11 +44,12 @@ def checked(folder, name, data):
     path.write_bytes(data)
     try:
         machine = load_machine_file(path)
-        describe(machine)
+        assert FAILED not in describe(machine)
         check_files(machine)
     except MachineFileError as error:
         for problem in error.problems:
             assert problem.message
+            assert FAILED not in problem.message
             assert problem.remedy
             assert "\n" not in str(problem)
         return False
