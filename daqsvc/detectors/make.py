@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.settings.plugins import configured
-from daqsvc.settings.problems import AssemblyError
+from daqsvc.settings.problems import AssemblyError, mend_or_remove, raised
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,12 +31,14 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
         store: directory of the state that survives restarts; None to begin without any and leave none.
 
     Raises:
-        AssemblyError: a calibration that the machine file names cannot be used, or a plugin makes a detector
-            under a name that no alarm can follow.
+        AssemblyError: a calibration that the machine file names cannot be used, or a plugin fails, or makes a
+            detector under a name that no alarm can follow.
     """
     made: dict[str, Detector] = {}
     for plugin, given in plugins(machine):
-        for detector in plugin.build(machine, given, store):
+        with _naming(machine, plugin, "build"):
+            built = list(plugin.build(machine, given, store))
+        for detector in built:
             if detector.name in made:
                 raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")
             named = plugin.detector
@@ -52,7 +55,21 @@ def check_files(machine: MachineFile) -> None:
     """See whether the calibrations that a machine file names can be used, and its bearings are known.
 
     Raises:
-        AssemblyError: one cannot, or is not; the message names file, key, value and remedy.
+        AssemblyError: one cannot, or is not, or a plugin fails; the message names file, key and remedy.
     """
     for plugin, given in plugins(machine):
-        plugin.check_files(machine, given)
+        with _naming(machine, plugin, "check_files"):
+            plugin.check_files(machine, given)
+
+
+@contextmanager
+def _naming(machine: MachineFile, plugin: DetectorPlugin[Any], part: str) -> Iterator[None]:
+    """Whatever a plugin raises becomes an `AssemblyError` that names its table."""
+    try:
+        yield
+    except AssemblyError:
+        raise
+    except Exception as error:
+        table = next(f"pipeline.{key}" for key, one, _ in configured(machine.pipeline) if one is plugin)
+        said = f"{raised(error, plugin, part)}; {mend_or_remove(table)}"
+        raise AssemblyError(f"{machine.path}: {table}: {said}") from error

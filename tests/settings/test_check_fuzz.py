@@ -53,7 +53,9 @@ def checked(folder, name, data):
             assert problem.remedy
             assert "\n" not in str(problem)
         return False
-    except AssemblyError:
+    except AssemblyError as error:
+        if FAILED in str(error):
+            raise
         return False
     service = Service(machine, folder / "store")
     taken = sum(ring._data.nbytes for ring in service.rings.values())

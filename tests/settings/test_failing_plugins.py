@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
@@ -13,6 +14,7 @@ from support.example_packages import DETECTOR, DRIVER, OUTPUT, installed
 from support.machine_files import MOTOR, problems_of
 
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.detectors.make import check_files, detectors
 from daqsvc.settings import describe, parse_machine_file, registry
 from daqsvc.settings.problems import AssemblyError
 from drivers.make import bus_drivers
@@ -114,6 +116,17 @@ def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.
     )
     assert str(caught.value).startswith(said)
     assert "(tcp_frames.py, line " in str(caught.value)
+
+
+def test_a_detector_that_cannot_be_made_is_named_with_its_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = parse_machine_file(TABLES, MACHINE)
+    for part, ask in (("build", detectors), ("check_files", check_files)):
+        break_(monkeypatch, f"crest.CrestPlugin.{part}")
+        said = (
+            f"{MACHINE}: pipeline.crest: {part} of crest.CrestPlugin has failed: KeyError: 'no such thing' ("
+        )
+        with pytest.raises(AssemblyError, match=re.escape(said)):
+            ask(machine)
 
 
 @pytest.mark.parametrize(
