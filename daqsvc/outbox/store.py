@@ -259,7 +259,7 @@ class Outbox:
         self._writer.close()
         return self._writer.join(timeout_s)
 
-    async def close(self, timeout_s: float = 1.0) -> None:
+    async def close(self, timeout_s: float = 30.0) -> None:
         """Write what waits, once, and close the files; takes at most ``timeout_s``."""
         if self._ended is None or self._writer.is_closing:
             return
