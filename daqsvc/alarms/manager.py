@@ -224,6 +224,7 @@ class AlarmManager:
             self._ruled.rest(ruled, frozenset(named) or ruled.sensors)
         self._first_out.resume(event for event in told if event.identity == self._identity)
         withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, active_detectors)]
+        self._excuse(told)
         self._unlooked = True
         for ruled in self._ruled:
             if (
@@ -426,6 +427,25 @@ class AlarmManager:
         else:
             return False
         return True
+
+    def _excuse(self, told: Sequence[AlarmEvent]) -> None:
+        """Take back that a sensor was not OK where later events show that this was over.
+
+        Whoever says good while others have not spoken since a restart changes nothing that a person could
+        tell, so the last event of the quality alarm still has its doubt; the alarms that it had suppressed
+        know better.
+        """
+        place = {event.alarm: number for number, event in enumerate(told) if event.identity == self._identity}
+        for name, doubt in self._doubts.not_ok():
+            since = place.get(name, len(told))
+            blamed = set(doubt.sensors) if len(doubt.sensors) == 1 else set()
+            if any(
+                place.get(ruled.alarm.name, -1) > since and not ruled.alarm.is_held(Hold.SUPPRESSED)
+                for ruled in self._ruled
+                if ruled.rule.spare == 0
+                and (doubt.detector in ruled.rule.detectors or not blamed.isdisjoint(ruled.sensors))
+            ):
+                self._doubts.excuse(doubt.detector)
 
     def _resume_ruled(self, ruled: Ruled, event: AlarmEvent) -> None:
         level = event.to_level if event.own_state.is_active else Level.NORMAL

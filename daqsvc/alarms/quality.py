@@ -209,6 +209,15 @@ class SensorHealth:
             self._forget(doubt.detector)
             self._remember(quality_alarm(doubt.detector, doubt.sensors), doubt)
 
+    def not_ok(self) -> list[tuple[str, Doubt]]:
+        """Who has found sensors not OK, each with the quality alarm that says so."""
+        return [(name, doubt) for name, doubt in self._by_detector.values() if doubt.not_ok]
+
+    def excuse(self, detector: str) -> None:
+        """A detector has said since that the sensors are OK."""
+        if (before := self._forget(detector)) is not None:
+            self._remember(before[0], before[1]._replace(not_ok=False))
+
     def expect(self, name: str, speakers: Mapping[str, Sequence[str]], t_ns: int) -> None:
         """Have the quality alarm ``name`` wait, after `resume`, for who may doubt its sensor, too.
 

@@ -228,3 +228,31 @@ def test_a_payload_whose_covers_contradict_each_other_is_refused(forged):
     payload = json.loads(alarm_payload(event, 7, "series").to_json()) | forged
     with pytest.raises(ValueError, match="none of this program's"):
         alarm_event(json.dumps(payload).encode())
+
+
+def test_missing_data_after_two_restarts_suppress_nothing_that_was_good_between_them():
+    """Who says good while another has not spoken yet makes no event of the sensor; those it lifts say so."""
+    speakers = {"levels/probe-x": ("probe-x",), "bearing": ("probe-x",), "bearing-fe": ("probe-x",)}
+
+    def bearing(quality):
+        return dataclasses.replace(rms(1.0, quality), detector="bearing")
+
+    journal = {}
+
+    def take(subject, diagnosis):
+        events = subject.take(diagnosis)
+        for event in events:
+            journal.pop(event.alarm, None)
+            journal[event.alarm] = event
+        return kinds(events)
+
+    first = manager(LEVEL)
+    assert first.resume([], speakers) == []
+    assert ("vibration-x", K.SUPPRESSED) in take(first, bearing("not_ok"))
+    second = manager(LEVEL)
+    second.resume(list(journal.values()), speakers)
+    assert take(second, bearing("good")) == [("vibration-x", K.UNSUPPRESSED)]
+    third = manager(LEVEL)
+    third.resume(list(journal.values()), speakers)
+    assert take(third, bearing("missing")) == []
+    assert ("vibration-x", K.SUPPRESSED) in take(third, bearing("not_ok"))
