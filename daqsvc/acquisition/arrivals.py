@@ -67,22 +67,35 @@ class ArrivalCount:
             raw: int64 ``[n]``, anything.
             arrival_ns: int64 ``[n]``, host monotonic, in the order of arrival.
         """
-        due_ns = self._due_ns
-        while due_ns is not None and len(arrival_ns):
-            missing = self._missing(arrival_ns, due_ns)
+        return self._sure(arrival_ns) < len(arrival_ns)
+
+    def sure(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> int:  # noqa: ARG002
+        """How many frames at the beginning of a batch that `wants_more` need not wait for what comes.
+
+        They are better placed at once: each wait has an end, and the frames that came last have waited least.
+        """
+        return self._sure(arrival_ns)
+
+    def _sure(self, arrival_ns: NDArray[np.int64]) -> int:
+        due_ns, at, lost_at = self._due_ns, 0, None
+        while due_ns is not None and at < len(arrival_ns):
+            rest_ns = arrival_ns[at:]
+            missing = self._missing(rest_ns, due_ns)
             if not missing.any():
-                return False
+                break
             late = int(np.argmax(missing > 0))
-            end = np.searchsorted(arrival_ns, arrival_ns[late] + self.watch_ns, side="right")
+            end = np.searchsorted(rest_ns, rest_ns[late] + self.watch_ns, side="right")
             watched = missing[late:end]
             lost = int(watched.min())
-            if lost and late + len(watched) == len(arrival_ns):
-                return True
+            if lost and lost_at is None:
+                lost_at = at + late  # what comes after it tells how many are missing: it is placed with that
+            if lost and late + len(watched) == len(rest_ns):
+                return at + late if lost_at is None else lost_at
             # Past the gap, or to where they have caught up.
             seen = late + 1 if lost else late + int(np.argmin(watched)) + 1
             due_ns += (seen + lost) * self._period_ns
-            arrival_ns = arrival_ns[seen:]
-        return False
+            at += seen
+        return len(arrival_ns)
 
     def place(
         self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]

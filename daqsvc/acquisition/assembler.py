@@ -243,8 +243,13 @@ class StreamAssembler:
             counter, samples, arrival_ns = map(np.concatenate, zip(*self._unplaced, strict=True))
         if until_sure and self._time.wants_more(counter, arrival_ns):
             self._asked_ns = newest_ns
-            return
-        self._unplaced = []
+            sure = self._time.sure(counter, arrival_ns)
+            if not sure:
+                return
+            self._unplaced = [(counter[sure:], samples[sure:], arrival_ns[sure:])]
+            counter, samples, arrival_ns = counter[:sure], samples[:sure], arrival_ns[:sure]
+        else:
+            self._unplaced = []
         indices, fits, restarts, anew = self._time.place(counter, arrival_ns)
         before = self.counters.frames_rejected
         self._reject(int((~fits).sum()))

@@ -330,6 +330,10 @@ class CounterUnwrapper:
         watched_ns = int(arrival_ns[-1] - arrival_ns[at])
         return watched_ns < self.watch_ns and float(late[-1] - late[at]) > doubt
 
+    def sure(self, raw: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> int:  # noqa: ARG002
+        """How many frames at the beginning of a batch that `wants_more` need not wait: none."""
+        return 0
+
     def begin_afresh(self, first: int) -> None:
         """Take the next frame as the first one of a sender that begins anew, whatever its counter is.
 

@@ -189,6 +189,15 @@ class TimeBase:
         """
         return self._unwrapper.wants_more(counter, arrival_ns)
 
+    def sure(self, counter: NDArray[np.int64], arrival_ns: NDArray[np.int64]) -> int:
+        """How many frames at the beginning of a batch that `wants_more` need not wait for what comes.
+
+        Args:
+            counter: int64 ``[n]``, as sent.
+            arrival_ns: int64 ``[n]``, host monotonic, not decreasing.
+        """
+        return self._unwrapper.sure(counter, arrival_ns)
+
     def begin_afresh(self, first_index: int) -> None:
         """Take the next frame as the first one of a sender that begins anew, with a clock of its own.
 
