@@ -60,7 +60,7 @@ class ModbusUnit:
         self._queues[address] = read
 
     def watch(self, address: int, written: Callable[[int], None]) -> None:
-        """Call ``told`` with the value whenever a holding register is written by request."""
+        """Call ``written`` with the value whenever a holding register is written by request."""
         self.map("holding", address, 1)
         self._watchers[address] = written
 

@@ -54,7 +54,9 @@ class Polls(NamedTuple):
 
 async def serve() -> None:
     """The other process: answer until standard input is closed."""
-    server = ModbusTcpServer({UNIT: ModbusUnit()})
+    unit = ModbusUnit()
+    unit.map("input", 0, CHANNELS)
+    server = ModbusTcpServer({UNIT: unit})
     await server.start()
     print(server.port, flush=True)
     await asyncio.to_thread(sys.stdin.read)

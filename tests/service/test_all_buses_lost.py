@@ -21,6 +21,8 @@ from daqsvc.settings import parse_machine_file
 from drivers.base import StreamSpec
 from drivers.can.plugin import frame_layout
 from drivers.make import stream_layout
+from drivers.modbus.registers import RegisterRecord
+from drivers.serial.settings import SerialBus
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit, RingStore
 from sim_hw.nodes.pseudo_terminal import PseudoTerminal
@@ -112,7 +114,7 @@ class ModbusDevice:
         self._store = RingStore(self._unit, self._layout)
 
     def flood(self, first_index: int, samples: NDArray[np.float32]) -> None:
-        self._store.put(first_index, self._layout.record.encode(samples))
+        self._store.put(first_index, RegisterRecord.of(self._layout).encode(samples))
 
     def go_away(self) -> None:
         self._server.stop()
@@ -133,12 +135,13 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
     await modbus.start()
     machine = parse_machine_file(machine_text(channel, tmp_path, modbus.tcp_port), tmp_path / "machine.toml")
     layout = frame_layout(machine, "can-a")
+    serial_bus = machine.buses["serial"]
+    assert isinstance(serial_bus, SerialBus)
     serial_spec = StreamSpec(STREAM, stream_layout(machine, "serial"), RATE_HZ)
-    serial_options = machine.buses["serial"].model_dump()
     devices = {
         "can-a": CanDevice(f"{channel}-a", layout),
         "can-b": CanDevice(f"{channel}-b", layout),
-        "serial": CableDevice(PseudoTerminal(tmp_path / "port"), serial_options, serial_spec),
+        "serial": CableDevice(PseudoTerminal(tmp_path / "port"), serial_bus, serial_spec),
         "log": LogDevice(tmp_path / "can.log", SystemClock(), layout),
         "modbus": modbus,
     }

@@ -35,8 +35,8 @@ TICK_S = 0.005
 NOMINAL_HZ = 50.0
 SLOW_HZ = 200.0
 STILL = 77
-LEVELS = {"calm": 0.1, "loud": 5.0, "huge": 1e9}
-"""RMS of what is measured, in the unit of the sensor."""
+LEVELS = {"calm": 0.1, "loud": 8.0, "huge": 1e9}
+"""RMS of what is measured, in the unit of the sensor: of 25 loud values never less than 3 by chance."""
 FAULTS = (
     "none", "silent", "exception", "wrong unit", "wrong transaction", "wrong function", "wrong protocol",
     "truncated", "cut off", "oversized", "corrupt", "garbage",
