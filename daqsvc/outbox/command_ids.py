@@ -2,8 +2,9 @@
 
 A broker that has not seen our acknowledgement sends a command again, after a restart of the service too.
 Each id is a line of a small file, with a checksum; the file is written anew when it has grown to twice what
-is needed. It is there from the first start on, with one line at least. So a file that is missing, empty or
-has a damaged line has lost ids, and commands that were issued before the start are refused.
+is needed. It is there before the journal of a new store is, with one line at least. So beside a journal a file
+that is missing, empty or has a damaged line has lost ids, and commands that were issued before the start are
+refused.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import zlib
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Literal
 
-from daqsvc.outbox.files import NEW_MODE, replace_durably, sync_directory
+from daqsvc.outbox.files import NEW_MODE, may_pass, replace_durably
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,6 +85,22 @@ class CommandIds:
                 log.warning("the ids of commands in %s cannot be written: %s", self._path, error)
             return True
 
+    def begin(self) -> None:
+        """Have the file of a new store on disk, before its journal is: else it would look lost. Blocks.
+
+        Raises:
+            OSError: the disk is full or takes no writes; what will not pass by itself is only logged.
+        """
+        with self._one_at_a_time:
+            if os.path.lexists(self._path):
+                return
+            try:
+                self._rewrite()
+            except OSError as error:
+                if may_pass(error):
+                    raise
+                log.warning("the ids of commands in %s cannot be written: %s", self._path, error)
+
     def is_from_before(self, issued_ns: int) -> bool:
         """Whether a command of that time may have come before, with its id lost; wall clock."""
         return issued_ns <= self._lost_until_ns
@@ -112,7 +129,7 @@ class CommandIds:
         self, machine: str, identifier: str, until_ns: int, now_ns: int
     ) -> Literal["new", "known", "full"]:
         if self._lines is None and self._read() is None:
-            self._lines = 0
+            self._rewrite()  # at once or not at all: a full disk must not leave it empty
         key = machine, identifier
         if self._until_ns.get(key, now_ns) > now_ns:
             return "known"
@@ -157,7 +174,6 @@ class CommandIds:
         return is_whole
 
     def _append(self, line: bytes) -> None:
-        is_new = self._lines == 0
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         handle = os.open(self._path, flags, NEW_MODE)
         try:
@@ -168,8 +184,6 @@ class CommandIds:
             os.fsync(handle)
         finally:
             os.close(handle)
-        if is_new:
-            sync_directory(self._path.parent)
         self._lines = (self._lines or 0) + 1
 
     def _rewrite(self) -> None:

@@ -90,9 +90,16 @@ class Journal:
         path: the SQLite file; its directory is created.
         wall_ns: wall clock, ns since the Unix epoch.
         limits: how much is kept of what is sent.
+        before_new: called on the thread before a new file is made; what it raises is an error of the disk.
     """
 
-    def __init__(self, path: Path, wall_ns: Callable[[], int], limits: OutboxLimits) -> None:
+    def __init__(
+        self,
+        path: Path,
+        wall_ns: Callable[[], int],
+        limits: OutboxLimits,
+        before_new: Callable[[], None] = lambda: None,
+    ) -> None:
         self.path = path
         self.quarantined = 0
         self.vanished = 0
@@ -103,6 +110,7 @@ class Journal:
         self._known_topics = KnownTopics(path.with_name(path.name + ".topics"))
         self._wall_ns = wall_ns
         self._limits = limits
+        self._before_new = before_new
         self._ballast = Ballast(
             path.with_name(path.name + ".ballast"), limits.ballast_bytes, limits.reserve_bytes
         )
@@ -217,6 +225,8 @@ class Journal:
         self.quarantined, self.vanished = untold.quarantined, untold.vanished
         self._log_copy.copy()
         known_gone = self.vanished
+        if not self.path.exists():
+            self._before_new()
         try:
             self._connect()
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:

@@ -80,7 +80,7 @@ class Outbox:
         self.command_ids = CommandIds(path.with_name("command-ids"))
         self.dead_letters = DeadLetters(path.with_name(f"{path.stem}-refused{path.suffix}"), clock.wall_ns)
         self._limits = OutboxLimits() if limits is None else limits
-        self._journal = Journal(path, clock.wall_ns, self._limits)
+        self._journal = Journal(path, clock.wall_ns, self._limits, self.command_ids.begin)
         self._telemetry = Telemetry(telemetry_path(path), clock, self._limits, self.counters.telemetry)
         self._telemetry.file.is_ours = lambda: self._journal.is_held
         self._books = _Books(self.counters, self._journal)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import random
 
 import pytest
@@ -62,7 +63,7 @@ def test_of_a_damaged_file_every_whole_line_counts(tmp_path):
         path.write_bytes(spoilt[: dice.randrange(len(spoilt) + 1)])
         lines = set(path.read_bytes().split(b"\n"))
         ids = CommandIds(path)
-        for number, line in enumerate(line for line in whole.split(b"\n") if line):
+        for number, line in enumerate([line for line in whole.split(b"\n") if line][1:]):  # without its head
             assert remember(ids, f"n{number}") == ("known" if line in lines else "new")
 
 
@@ -113,6 +114,29 @@ def test_what_was_issued_before_a_start_without_the_ids_is_refused(tmp_path, dam
     ids, lost = opened(path, begun_ns)
     assert not lost, "it is told once"
     assert remember(ids, "third") == "known"
+
+
+def test_a_first_id_that_a_full_disk_refuses_leaves_no_list_that_looks_damaged(tmp_path, monkeypatch):
+    path = tmp_path / "ids"
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command_ids, "replace_durably", full)
+        ids, lost = opened(path, is_new=True)
+        assert not lost
+        with pytest.raises(OSError, match="No space"):
+            ids.begin()
+        with pytest.raises(OSError, match="No space"):
+            remember(ids, "a")
+    assert not path.exists()
+    ids.begin()
+    assert remember(ids, "a") == "new"
+    whole = path.read_bytes()
+    ids.begin()
+    assert path.read_bytes() == whole, "what is there stays"
+    assert opened(path)[1] is False
 
 
 @pytest.mark.parametrize("what", ["directory", "link"])

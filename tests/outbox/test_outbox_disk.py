@@ -117,6 +117,30 @@ async def test_a_store_on_a_full_disk_is_opened_again_and_delivers(disk):
     await outbox.close()
 
 
+@pytest.mark.parametrize("room", ["before the next start", "while it runs"])
+async def test_a_store_begun_on_a_full_disk_has_not_lost_its_list_of_commands(disk, room, caplog):
+    fill(disk)
+    outbox = await opened(disk)
+    assert outbox.counters.shut
+    with pytest.raises(OSError, match="No space"):
+        outbox.command_ids.remember("rig", "a", until_ns=10**18, now_ns=0)
+    if room == "while it runs":
+        make_room(disk)
+        await outbox.append(TOPIC, kilobyte, retain=True)
+        assert (disk / "command-ids").stat().st_size
+    await outbox.close()
+    if room != "while it runs":
+        make_room(disk)
+    outbox = await opened(disk)
+    assert not outbox.command_ids_lost
+    assert "missing or damaged" not in caplog.text
+    await outbox.close()
+    (disk / "command-ids").unlink()
+    outbox = await opened(disk)
+    assert outbox.command_ids_lost, "a list that was there and is gone is told"
+    await outbox.close()
+
+
 async def test_telemetry_gives_its_room_to_alarms(disk):
     """A nearly full disk costs telemetry, oldest first; every message of it is accounted for."""
     limits = OutboxLimits(reserve_bytes=2 * MIB, ballast_bytes=0, telemetry_max_bytes=4 * MIB)
