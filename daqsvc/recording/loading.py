@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from daqsvc.confined.limits import ResourceLimits
+from daqsvc.dsp.quality import UnfitError
+from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
 from daqsvc.recording.contents import NUMERIC
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import read
@@ -40,6 +42,7 @@ def load(
     file = Path(path)
     contents = read(file, ResourceLimits(memory_bytes))
     left_out: dict[str, int] = {}
+    named = bool(channels)
     if not channels:
         channels, left_out = _longest(file, contents)
     columns = {name: _channel(file, contents, variable) for name, variable in channels.items()}
@@ -56,6 +59,8 @@ def load(
     }
     del contents
     samples = _together(columns, length, timing.rows)
+    if named:  # what nobody asked for may be anything, e.g. a time in nanoseconds
+        _refuse_impossible(file, about["names"], samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
     return about, (samples,)
 
@@ -135,6 +140,14 @@ def _together(columns: dict[str, NDArray[np.generic]], length: int, rows: NDArra
         with np.errstate(invalid="ignore"):  # signalling NaN
             samples[place, i] = columns.pop(name)
     return samples
+
+
+def _refuse_impossible(path: Path, names: list[str], samples: Floats) -> None:
+    for name, signal in zip(names, samples.T, strict=True):
+        try:
+            refuse_beyond_any_unit(signal, f"{name} of {path}")
+        except UnfitError as error:
+            raise RecordingError(f"{error}") from None
 
 
 def _count_bad(samples: Floats) -> tuple[int, int]:

@@ -15,9 +15,12 @@ from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing
 from daqsvc.detectors.bearing.recorded import analyse_bearings
 from daqsvc.detectors.bearing.verdict import BearingSetup
+from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector
 from daqsvc.diagnosis.detector import Window
+from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.clipped import clipped_at, ends_cut_off, refuse_clipped
 from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE, lacking
+from daqsvc.dsp.quality.probes import RevolutionJudge
 from daqsvc.dsp.quality.rate import SAME_RATE, ArrivalRate, rate_of_stamps
 from daqsvc.recording.recording import Recording
 
@@ -70,6 +73,45 @@ def test_an_accelerometer_is_refused_in_the_same_words_live_and_recorded(
     samples = spoilt(spoil)
     assert word in live(samples)
     assert live(samples) == recorded(samples)
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [(1e37, "at sample 0"), (1e13, "beyond 1e+12"), (1e-14, "moves by"), (1e-30, "moves by")],
+)
+def test_what_no_sensor_measures_in_any_unit_is_refused_before_it_overflows(scale: float, words: str) -> None:
+    samples = scale * spoilt(lambda _: None)
+    if scale > 1.0:
+        samples[0] = scale
+    samples = samples.astype(np.float32).astype(np.float64)
+    said = live(samples)
+    assert words in said
+    assert "which no sensor" in said
+    assert "; correct its scale or unit, or replace" in said
+    assert recorded(samples).split(": ")[-1].removeprefix("channel ") == said.split(": ")[-1].removeprefix(
+        f"{SENSOR} "
+    ).removeprefix("channel ")
+
+
+@pytest.mark.parametrize("value", [1e37, -1e37])
+def test_one_impossible_sample_costs_a_look_a_revolution_and_a_level_their_trust(value: float) -> None:
+    samples = spoilt(lambda _: None)
+    samples[100] = value
+    assert f"{SENSOR}: {SENSOR} holds {value:.4g} at sample 100 (1 of" in live(samples)
+    level = LevelDetector("motor", "housing", RATE_HZ, [LevelChannel(SENSOR, 0, "g")], window_s=LOOK_S)
+    column = samples.astype(np.float32)[:, np.newaxis]
+    (said,) = level.process(Window(0, column, NS_PER_S, NS_PER_S / RATE_HZ))
+    assert (said.quality, dict(said.statistics)) == ("not_ok", {})
+    assert said.reason.startswith(f"{SENSOR} holds {value:.4g} at sample 100")
+    turn = np.random.default_rng(1).standard_normal((64, 2))
+    judge = RevolutionJudge((Probe("x", 0, 0.0), Probe("y", 1, 90.0)))
+    assert judge.judge(turn, 0.0).quality == "good"
+    turn[5, 1] = value
+    judged = judge.judge(turn, 0.0)
+    assert judged.quality == "not_ok"
+    assert judged.reason.startswith(f"y holds {value:.4g} at sample 5 (1 of 64")
+    turn[5, 1] = 0.0
+    assert judge.judge(turn, 0.0).quality == "good", "it is not looked at again"
 
 
 @pytest.mark.parametrize(("share", "unfit"), [(0.9, False), (1.1, True)])

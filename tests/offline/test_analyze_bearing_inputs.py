@@ -61,6 +61,29 @@ def test_a_rate_that_contradicts_the_file_is_refused(verb: Run, tmp_path: Path) 
     assert (code, found["verdict"]) == (0, "inner")
 
 
+@pytest.mark.parametrize("spoil", ["one sample", 1e300, 1e38, 1e-50, 1e-200])
+def test_what_no_sensor_measures_is_refused_in_one_sentence(
+    verb: Run, tmp_path: Path, spoil: float | str
+) -> None:
+    noise = np.random.default_rng(1).standard_normal(round(4.0 * RATE_HZ))
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    np.savez(good, de=noise, fs=RATE_HZ)
+    spoilt = noise * (1.0 if isinstance(spoil, str) else spoil)
+    if isinstance(spoil, str):
+        spoilt[5000] = 1e300
+    np.savez(bad, de=spoilt, fs=RATE_HZ)
+    options = (*KNOWN, "--speed-rpm", 1797)
+    code, found, _ = verb("analyze", bad, *options)
+    assert (code, found["verdict"]) == (3, None)
+    code, _, baseline = verb("analyze", good, *options, "--baseline", bad)
+    assert code == 2
+    code, calibrated, _ = verb("calibrate", bad, *options, "--out", tmp_path / "calibration.toml")
+    assert code == 3
+    for said in (found["refused"], baseline, calibrated["refused"]):
+        assert "which no sensor" in said
+        assert "; correct its scale or unit, or replace" in said
+
+
 @pytest.mark.parametrize("rate_hz", [10_000, 16_000])
 def test_a_wrong_rate_names_no_part(verb: Run, tmp_path: Path, rate_hz: int) -> None:
     path = damaged(tmp_path / "rig.npz")

@@ -26,6 +26,7 @@ from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import refuse_clipped
 from daqsvc.dsp.quality.missing import lacking
+from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
 from daqsvc.dsp.speed.steadiness import SpeedError, measure_speed
 
 if TYPE_CHECKING:
@@ -242,6 +243,8 @@ class BearingDetector:
                 unfit.append(("missing", lost))
                 continue
             try:
+                for name, column in zip(bearing.sensors, bearing.columns, strict=True):
+                    refuse_beyond_any_unit(samples[:, column], name)
                 refuse_clipped(signal)
                 race = self._watches[bearing.name].evaluate(signal)
                 departed = self._departed(bearing, samples)

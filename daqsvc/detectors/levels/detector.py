@@ -21,7 +21,7 @@ from daqsvc.dsp.quality.missing import (
     partly_missing,
 )
 from daqsvc.dsp.quality.stuck import StandstillWatch
-from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
+from daqsvc.dsp.quality.unit import M_S2_PER_UNIT, RESCALE, beyond_any_unit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -175,8 +175,10 @@ class LevelDetector:
                 "or the device had none; check bus, device and sensor"
             )
             return self._state(channel, evidence, {}, "missing", reason, share)
-        statistics, bounds = self._measure(channel, samples, share)
         known = samples[present]
+        if wrong := beyond_any_unit(known):
+            return self._state(channel, evidence, {}, "not_ok", f"{channel.sensor} {wrong}; {RESCALE}", share)
+        statistics, bounds = self._measure(channel, samples, share)
         still = self._standstills[channel.sensor].push(known)
         if reason := _beyond_gap(channel, statistics, known) or _dead(channel, len(known), still):
             return self._state(channel, evidence, statistics, "not_ok", reason, share)

@@ -18,6 +18,7 @@ from daqsvc.dsp.quality.clipped import CLIPPED_NOTE_SHARE, CLIPPED_SHARE, clippe
 from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE
 from daqsvc.dsp.quality.outliers import Prewhitening, blanked, despiked, find_transients, merged, runs
 from daqsvc.dsp.quality.stuck import DEAD_SHARE, dropouts
+from daqsvc.dsp.quality.unit import refuse_beyond_any_unit, refuse_still
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,7 +90,9 @@ def checked(samples: Real, rate_hz: float, speed_rpm: float, band_hz: tuple[floa
             f"is too short: {len(x) / rate_hz:.3g} s are {revolutions:.3g} revolutions",
             f"give {LEAST_REVOLUTIONS:g} revolutions or more, better 75",
         )
+    refuse_beyond_any_unit(x)
     x, gaps, notes, repairs = _bridged(x, rate_hz)
+    refuse_still(x)
     mended = repaired(x, rate_hz, round(60.0 * rate_hz / speed_rpm), (low_hz, top_hz))
     x = mended.values
     clipped = clipped_share(x)

@@ -17,6 +17,7 @@ import numpy as np
 from daqsvc.dsp.quality.clipped import clipped_at
 from daqsvc.dsp.quality.missing import REVOLUTION_SHARE
 from daqsvc.dsp.quality.stuck import dropped_to, stands_still
+from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,6 +101,9 @@ class RevolutionJudge:
         if (missing := self.missing(samples)) is not None:
             return missing
         known = samples[np.isfinite(samples).all(axis=1)]
+        for signal, probe in zip(known.T, self._probes, strict=True):
+            if wrong := beyond_any_unit(signal):
+                return RevolutionQuality("not_ok", f"{probe.name} {wrong}; {RESCALE}")
         self._pool.append(known)
         signals = [known] if len(self._pool) == 1 else [known, np.concatenate(self._pool)]
         deviations = known.std(axis=0)

@@ -1,7 +1,8 @@
 """Units of recordings, and whether samples can be in the one that they are said to be in, by their size.
 
 This is asked of recordings only. Live a sensor's unit stands in the machine file, where `daqsvc check` shows
-what becomes of it, and a machine that stands still is as quiet as one in a wrong unit.
+what becomes of it, and a machine that stands still is as quiet as one in a wrong unit. What no sensor measures
+in any unit is refused live as well (`refuse_impossible`), before arithmetic with it overflows.
 """
 
 from __future__ import annotations
@@ -42,10 +43,65 @@ _MOST_M_S2 = 10_000.0
 """No accelerometer on a housing shows less than its own noise, or more r.m.s. than destroys it."""
 _LEAST_MACHINE_M_S2 = 1e-3
 """A tenth of a milli-g: what a good accelerometer shows by itself where nothing turns."""
+MOST_IN_ANY_UNIT = 1e12
+"""A larger value no sensor measures, in whatever unit: in micrometres it is a thousand kilometres."""
+_LEAST_SWING = 1e-12
+"""Nor does any resolve less of a signal than this, from its lowest value to its highest."""
 _LEAST_ORBIT_UM = 0.01
 _MOST_ORBIT_UM = 10_000.0
 _MOST_CLEARANCES = 20.0
 _LEAST_OF_CLEARANCE = 1e-3
+
+
+def beyond_any_unit(signal: NDArray[np.floating]) -> str:
+    """What of a signal no sensor can have measured, whatever its unit; empty if nothing.
+
+    Args:
+        signal: ``[n]``; what is not finite does not count.
+    """
+    far = (signal > MOST_IN_ANY_UNIT) | (signal < -MOST_IN_ANY_UNIT)
+    wrong = np.flatnonzero(far & np.isfinite(signal))
+    if not len(wrong):
+        return ""
+    first = int(wrong[0])
+    return (
+        f"holds {signal[first]:.4g} at sample {first} ({len(wrong)} of {len(signal)} samples are beyond "
+        f"{MOST_IN_ANY_UNIT:g}), which no sensor measures in any unit"
+    )
+
+
+RESCALE = "correct its scale or unit, or replace the file or the device that is broken"
+
+
+def refuse_beyond_any_unit(signal: NDArray[np.floating], sensor: str = "channel") -> None:
+    """Refuse a signal that holds what no sensor measures, in whatever unit.
+
+    Args:
+        signal: ``[n]``; what is not finite does not count.
+        sensor: what it is called.
+
+    Raises:
+        UnfitError: it does.
+    """
+    if wrong := beyond_any_unit(signal):
+        raise UnfitError(sensor, wrong, RESCALE)
+
+
+def refuse_still(signal: Floats) -> None:
+    """Refuse a signal that moves, but by less than any sensor resolves, in whatever unit.
+
+    Args:
+        signal: ``[n]``, with a finite value; what is not finite does not count.
+
+    Raises:
+        UnfitError: it is such a signal.
+    """
+    there = signal[np.isfinite(signal)]
+    swing = float(np.ptp(there))
+    if 0.0 < swing < _LEAST_SWING:
+        raise UnfitError(
+            "channel", f"moves by {swing:.4g} in all, which no sensor resolves in any unit", RESCALE
+        )
 
 
 def refuse_size(samples: Floats, clearance_um: float | None, unit: str) -> None:
