@@ -91,6 +91,12 @@ class RevolutionJudge:
             "revolution are missing; check the bus and the device",
         )
 
+    def _impossible(self, samples: Floats) -> RevolutionQuality | None:
+        for signal, probe in zip(samples.T, self._probes, strict=True):
+            if wrong := beyond_any_unit(signal):
+                return RevolutionQuality("not_ok", f"{probe.name} {wrong}; {RESCALE}")
+        return None
+
     def judge(self, samples: Floats, least_motion_um: float) -> RevolutionQuality:
         """What a revolution is worth.
 
@@ -98,12 +104,9 @@ class RevolutionJudge:
             samples: float64 ``[n, 2]``, micrometres, as the probes say it; NaN where missing.
             least_motion_um: standard deviation that each probe must show at least.
         """
-        if (missing := self.missing(samples)) is not None:
-            return missing
+        if (bad := self.missing(samples) or self._impossible(samples)) is not None:
+            return bad
         known = samples[np.isfinite(samples).all(axis=1)]
-        for signal, probe in zip(known.T, self._probes, strict=True):
-            if wrong := beyond_any_unit(signal):
-                return RevolutionQuality("not_ok", f"{probe.name} {wrong}; {RESCALE}")
         self._pool.append(known)
         signals = [known] if len(self._pool) == 1 else [known, np.concatenate(self._pool)]
         deviations = known.std(axis=0)
