@@ -60,7 +60,7 @@ def load(
     del contents
     samples = _together(columns, length, timing.rows)
     if named:  # what nobody asked for may be anything, e.g. a time in nanoseconds
-        _refuse_impossible(file, about["names"], samples)
+        _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
     return about, (samples,)
 
