@@ -164,7 +164,7 @@ async def test_waveforms_of_a_device_that_is_asked_now_and_then_are_judged_block
         for taken in range(7):
             await eventually(lambda taken=taken: len(written_s) > taken, "a block is asked for")
             samples = vibration_g(1.15 * LIMIT_MM_S, taken * count, count, 3200.0)
-            store.put(taken * count, encode(layout.record, samples))
+            store.put(taken * count, encode(layout, samples))
         await eventually(lambda: len(heard.said) == 7, "all blocks are judged")
         counters = service.drivers[0].streams["casing"][0]
         assert (counters.samples_received, counters.samples_lost) == (7 * count, 0)

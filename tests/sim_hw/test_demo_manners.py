@@ -245,7 +245,9 @@ def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
         assert running.stderr is not None
         assert json.loads(running.stdout.readline())["type"]
         running.stdout.close()
-        assert running.stderr.read() == ""
+        # A host that starves it is told of, which is no matter of the pipe.
+        said = [line for line in running.stderr.read().splitlines() if "the process stood still" not in line]
+        assert said == []
         assert running.wait() == 0
     assert left_behind(tmp_path) == []
 
