@@ -171,13 +171,15 @@ def test_one_that_cannot_be_loaded_is_said_and_one_at_a_table_of_ours_is_left_ou
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt\nVersion: 1.0\n")
     points = "gone = no_such_module:Plugin\nalarms = event_file:EventFilePlugin\n"
     (info / "entry_points.txt").write_text(f"[daqsvc.outputs]\n{points}")
-    monkeypatch.syspath_prepend(str(info.parent))
-    registry.forget()
-    [problem] = problems_of(f"{MOTOR.read_text()}\n[gone]\npath = 'x'", MOTOR)
-    assert problem.message.startswith("the output cannot be loaded from no_such_module:Plugin: ")
-    assert problem.remedy == "install the package that brings it again, or remove [gone]"
-    assert parse_machine_file(MOTOR.read_text(), MOTOR).alarms
-    assert "output alarms is left out: [alarms] is a table of daqsvc itself" in caplog.text
+    # Undone before the example's own places on the path are: they would come back otherwise.
+    with monkeypatch.context() as patch:
+        patch.syspath_prepend(str(info.parent))
+        registry.forget()
+        [problem] = problems_of(f"{MOTOR.read_text()}\n[gone]\npath = 'x'", MOTOR)
+        assert problem.message.startswith("the output cannot be loaded from no_such_module:Plugin: ")
+        assert problem.remedy == "install the package that brings it again, or remove [gone]"
+        assert parse_machine_file(MOTOR.read_text(), MOTOR).alarms
+        assert "output alarms is left out: [alarms] is a table of daqsvc itself" in caplog.text
 
 
 def test_the_documentation_shows_the_example_as_it_is() -> None:
