@@ -231,7 +231,7 @@ class AlarmService:
         """
         logger.warning(
             "the service was ended while the disk took no writes: the broker may show what the journal does "
-            "not know, so it is told of every alarm how it stands"
+            "not know, so the state of every alarm is sent again"
         )
         again = [event for event in told if self._newest[event.identity.machine, event.alarm] is event]
         return [
@@ -258,8 +258,8 @@ class AlarmService:
         if series.startswith(self.outbox.series):
             return
         logger.warning(
-            "the broker was told by an earlier run what the disk never got, so it is told of every alarm how "
-            "it stands"
+            "an earlier run has sent the broker what the disk never got, so the state of every alarm is sent "
+            "again"
         )
         for event in [*self._newest.values()]:
             self._submit(event)

@@ -1,10 +1,10 @@
 """Memory of a bank for its kernels: eight observers side by side, so that the processor steps them together.
 
-All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a desk
-(`HEADER`), groups of lanes (`LANES`), constants of the observers, and evidence of pairs of modes (`PAIR`). A
-group holds constants, estimates and evidence of `WIDTH` modes, one lane each; mode m is lane m % WIDTH of
-group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop over lanes into
-vector instructions. Lanes that no mode needs explain nothing: their likelihood is 0.
+All that a bank knows lies in one piece, `BankMemory`, which is handed over and copied as a whole: a header
+(`HEADER`), groups of observers (`GROUP`), constants of the observers, and evidence of pairs of modes
+(`PAIR`). A group holds constants, estimates and evidence of `WIDTH` modes, one member each; mode m is member
+m % WIDTH of group m // WIDTH. The lengths are part of the type: that is what lets the compiler turn a loop
+over members into vector instructions. Members that no mode needs explain nothing: their likelihood is 0.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Pairs = NDArray[np.void]
 
 WIDTH = 8
-"""Lanes in a group: two or one vector registers of float64."""
+"""Members in a group: two or one vector registers of float64."""
 _LEAD_LIMIT = 1.5
 """The lead of the decision counts up to this many thresholds, so that a doubt shows before it wins."""
 
@@ -55,12 +55,12 @@ _FLOATS = (
     "log_odds", "log_prior",
 )  # fmt: skip
 
-LANES = np.dtype(
+GROUP = np.dtype(
     [
         *((name, np.float64, (WIDTH,)) for name in _FLOATS),
         # samples since the onset of the CUSUM
         ("age", np.int64, (WIDTH,)),
-        # not of the lane's own mode: the modes with rub, one after the other
+        # not of the member's own mode: the modes with rub, one after the other
         ("rub", np.int64, (WIDTH,)),
     ]
 )
@@ -68,7 +68,7 @@ LANES = np.dtype(
 
 HEADER = np.dtype(
     [
-        # what else there is: modes, groups of lanes, rub observers
+        # what else there is: modes, groups of members, rub observers
         ("modes", np.int64), ("groups", np.int64), ("rubs", np.int64),
         # rules
         ("usable_squared", np.float64), ("lead_limit", np.float64), ("first_threshold", np.float64),
@@ -88,8 +88,8 @@ PAIR = np.dtype([("threshold", np.float64), ("log_ratio", np.float64)])
 """Of one mode against another: nats that change the decision to the other, infinite where they look alike;
 and the one's evidence over the other, as long as there is no decision."""
 
-_DESK_BYTES = HEADER.itemsize
-_LANES_BYTES = LANES.itemsize
+_HEADER_BYTES = HEADER.itemsize
+_GROUP_BYTES = GROUP.itemsize
 _OBSERVER_BYTES = OBSERVER.itemsize
 _PAIR_BYTES = PAIR.itemsize
 
@@ -102,15 +102,15 @@ def sections(memory: Bytes) -> tuple[Headers, Batch, Observers, Pairs]:
         memory: uint8 ``[n]``.
 
     Returns:
-        Views: ``[1]`` of `HEADER`, ``[G]`` of `LANES`, ``[M]`` of `discretise.OBSERVER` and, row by row,
+        Views: ``[1]`` of `HEADER`, ``[G]`` of `GROUP`, ``[M]`` of `discretise.OBSERVER` and, row by row,
         ``[M M]`` of `PAIR`.
     """
-    headers = memory[:_DESK_BYTES].view(HEADER)
-    batch = _DESK_BYTES + headers[0]["groups"] * _LANES_BYTES
+    headers = memory[:_HEADER_BYTES].view(HEADER)
+    batch = _HEADER_BYTES + headers[0]["groups"] * _GROUP_BYTES
     observers = batch + headers[0]["modes"] * _OBSERVER_BYTES
     return (
         headers,
-        memory[_DESK_BYTES:batch].view(LANES),
+        memory[_HEADER_BYTES:batch].view(GROUP),
         memory[batch:observers].view(OBSERVER),
         memory[observers:].view(PAIR),
     )
@@ -142,9 +142,9 @@ class BankMemory:
         count = len(observers)
         groups = math.ceil(count / WIDTH)
         rubs = np.flatnonzero(observers["substeps"])
-        size = _DESK_BYTES + groups * _LANES_BYTES + count * _OBSERVER_BYTES + count**2 * _PAIR_BYTES
+        size = _HEADER_BYTES + groups * _GROUP_BYTES + count * _OBSERVER_BYTES + count**2 * _PAIR_BYTES
         memory = np.zeros(size, dtype=np.uint8)
-        header = memory[:_DESK_BYTES].view(HEADER)
+        header = memory[:_HEADER_BYTES].view(HEADER)
         header["modes"], header["groups"], header["rubs"] = count, groups, len(rubs)
         subject = cls(memory)
         subject.put("rub", rubs)
@@ -167,15 +167,15 @@ class BankMemory:
 
     @property
     def batch(self) -> Batch:
-        """Observers and evidence, ``[G]`` of `LANES`."""
-        return np.ndarray(int(self.header["groups"]), LANES, self.memory, _DESK_BYTES)
+        """Observers and evidence, ``[G]`` of `GROUP`."""
+        return np.ndarray(int(self.header["groups"]), GROUP, self.memory, _HEADER_BYTES)
 
     def each(self, name: str) -> Floats:
         """A figure of each mode, float64 ``[M]`` (int64 for ``age``), copied."""
         return np.array(self.batch[name].reshape(-1)[: int(self.header["modes"])])
 
     def put(self, name: str, values: NDArray[Any], rest: float = 0.0) -> None:
-        """Set a figure of each mode, float64 ``[M]``; lanes without a mode get ``rest``."""
+        """Set a figure of each mode, float64 ``[M]``; members without a mode get ``rest``."""
         batch = self.batch
         padded = np.full(len(batch) * WIDTH, rest)
         padded[: len(values)] = values
@@ -193,7 +193,7 @@ class BankMemory:
     def set_observers(self, observers: Observers) -> None:
         """Take over the constants of observers; estimates and evidence stay.
 
-        The lane of a rub observer stands still in the vector loops and adds no evidence there; its own step
+        The member of a rub observer stands still in the vector loops and adds no evidence there; its own step
         does both.
 
         Args:

@@ -1,6 +1,6 @@
 """A bank's one compiled call for a block: all observers and both rules, sample by sample.
 
-Loops over the lanes of a group become vector instructions; what is rare or branches (contact, a
+Loops over the members of a group become vector instructions; what is rare or branches (contact, a
 declaration, a lost observer) goes mode by mode. The CUSUM of log-likelihood ratios (Page 1954) stands by one
 mode; every other gathers evidence against that one since an onset of its own. As long as nothing is declared,
 all modes are compared with all.
@@ -44,10 +44,10 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
     """One sample's evidence of a group's modes against the declared one.
 
     Args:
-        group: of `batch.LANES`; its scores are the sample's.
+        group: of `observer_batch.GROUP`; its scores are the sample's.
         own: log-likelihood of the sample under the declared mode.
         lead_limit: the lead of the declared mode counts up to here.
-        width: lanes that there are modes in.
+        width: members that there are modes in.
 
     Returns:
         How many modes have the evidence that it takes to change the decision.
@@ -77,14 +77,14 @@ def first_verdict(batch: Batch, pairs: Pairs, header: Desk) -> int:
     count = header.modes
     winner = UNDETERMINED
     for i in range(count):
-        group, lane = batch[i // WIDTH], i % WIDTH
-        group.age[lane] += 1
+        group, member = batch[i // WIDTH], i % WIDTH
+        group.age[member] += 1
         narrowest = math.inf
         for j in range(count):
             if i != j:
                 pair = pairs[i * count + j]
                 pair.log_ratio = max(
-                    0.0, pair.log_ratio + group.score[lane] - batch[j // WIDTH].score[j % WIDTH]
+                    0.0, pair.log_ratio + group.score[member] - batch[j // WIDTH].score[j % WIDTH]
                 )
                 if pair.threshold < math.inf:
                     narrowest = min(narrowest, pair.log_ratio)
@@ -148,11 +148,11 @@ def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Desk) -> None:
     """
     won = batch[mode // WIDTH].cusum[mode % WIDTH]
     for j in range(header.modes):
-        group, lane = batch[j // WIDTH], j % WIDTH
+        group, member = batch[j // WIDTH], j % WIDTH
         pair = pairs[mode * header.modes + j]
-        lead = pair.log_ratio if header.decision == UNDETERMINED else won - group.cusum[lane]
-        group.lead[lane] = min(header.lead_limit, lead)
-        group.threshold[lane] = pair.threshold
+        lead = pair.log_ratio if header.decision == UNDETERMINED else won - group.cusum[member]
+        group.lead[member] = min(header.lead_limit, lead)
+        group.threshold[member] = pair.threshold
     for g in range(len(batch)):
         batch[g].cusum[:] = 0.0
         batch[g].age[:] = 0
@@ -160,34 +160,34 @@ def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Desk) -> None:
 
 
 _REGISTER = 4
-"""Lanes are looped over in whole vector registers of this many."""
+"""Members are looped over in whole vector registers of this many."""
 _DRIFT = -1e3
 """Logarithm of odds from which the paper's are counted from their leader anew, lest digits get lost."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _free(group: Group, lane: int) -> State:
-    return group.free_x[lane], group.free_u[lane], group.free_y[lane], group.free_v[lane]
+def _free(group: Group, member: int) -> State:
+    return group.free_x[member], group.free_u[member], group.free_y[member], group.free_v[member]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_free(group: Group, lane: int, state: State) -> None:
-    group.free_x[lane], group.free_u[lane], group.free_y[lane], group.free_v[lane] = state
+def _set_free(group: Group, member: int, state: State) -> None:
+    group.free_x[member], group.free_u[member], group.free_y[member], group.free_v[member] = state
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _paper(group: Group, lane: int) -> State:
-    return group.paper_x[lane], group.paper_u[lane], group.paper_y[lane], group.paper_v[lane]
+def _paper(group: Group, member: int) -> State:
+    return group.paper_x[member], group.paper_u[member], group.paper_y[member], group.paper_v[member]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _set_paper(group: Group, lane: int, state: State) -> None:
-    group.paper_x[lane], group.paper_u[lane], group.paper_y[lane], group.paper_v[lane] = state
+def _set_paper(group: Group, member: int, state: State) -> None:
+    group.paper_x[member], group.paper_u[member], group.paper_y[member], group.paper_v[member] = state
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _width(group: int, count: int) -> int:
-    """Lanes of a group that are worth stepping."""
+    """Members of a group that are worth stepping."""
     return min(WIDTH, (count - group * WIDTH + _REGISTER - 1) // _REGISTER * _REGISTER)
 
 
@@ -270,29 +270,29 @@ def _step_paper(group: Group, width: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _observe_rub(
-    observer: Observer, healthy: Observer, group: Group, lane: int, cos: float, sin: float
+    observer: Observer, healthy: Observer, group: Group, member: int, cos: float, sin: float
 ) -> None:
     """A rub observer with both rules: the free-running one is stepped, the paper's corrected."""
-    z_x, z_y = group.z_x[lane], group.z_y[lane]
-    state = guarded(observer, healthy, cos, sin, _free(group, lane))
-    state, group.score[lane] = correct(observer, z_x, z_y, state)
-    _set_free(group, lane, predict_rub(observer, cos, sin, state))
-    state = guarded(observer, healthy, cos, sin, _paper(group, lane))
-    state, group.paper_score[lane] = correct(observer, z_x, z_y, state)
-    _set_paper(group, lane, state)
+    z_x, z_y = group.z_x[member], group.z_y[member]
+    state = guarded(observer, healthy, cos, sin, _free(group, member))
+    state, group.score[member] = correct(observer, z_x, z_y, state)
+    _set_free(group, member, predict_rub(observer, cos, sin, state))
+    state = guarded(observer, healthy, cos, sin, _paper(group, member))
+    state, group.paper_score[member] = correct(observer, z_x, z_y, state)
+    _set_paper(group, member, state)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
     """Predict all estimates through a sample that is missing."""
     for m in range(len(observers)):
-        observer, group, lane = observers[m], batch[m // WIDTH], m % WIDTH
-        free, paper = _free(group, lane), _paper(group, lane)
+        observer, group, member = observers[m], batch[m // WIDTH], m % WIDTH
+        free, paper = _free(group, member), _paper(group, member)
         if observer.substeps > 0:
             free = guarded(observer, observers[0], cos, sin, free)
             paper = guarded(observer, observers[0], cos, sin, paper)
-        _set_free(group, lane, predict(observer, cos, sin, free))
-        _set_paper(group, lane, predict(observer, cos, sin, paper))
+        _set_free(group, member, predict(observer, cos, sin, free))
+        _set_paper(group, member, predict(observer, cos, sin, paper))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -341,10 +341,10 @@ def _believe(batch: Batch, count: int, header: Desk) -> int:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hand_over(observers: Observers, batch: Batch, cos: float, sin: float, declared: int) -> None:
     """Every observer under the paper's rule takes over the declared one's estimate, and is stepped."""
-    observer, group, lane = observers[declared], batch[declared // WIDTH], declared % WIDTH
-    dx, du, dy, dv = _paper(group, lane)
+    observer, group, member = observers[declared], batch[declared // WIDTH], declared % WIDTH
+    dx, du, dy, dv = _paper(group, member)
     if observer.substeps == 0:
-        (dx, du, dy, dv), _ = correct(observer, group.z_x[lane], group.z_y[lane], (dx, du, dy, dv))
+        (dx, du, dy, dv), _ = correct(observer, group.z_x[member], group.z_y[member], (dx, du, dy, dv))
     ox, ou, oy, ov = orbit(observer, cos, sin)
     for m in range(len(observers)):
         tx, tu, ty, tv = orbit(observers[m], cos, sin)
@@ -417,8 +417,8 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
 
         declared = UNDETERMINED
         if counts:
-            group, lane = batch[header.paper_leader // WIDTH], header.paper_leader % WIDTH
-            top = group.log_odds[lane] + group.paper_score[lane]
+            group, member = batch[header.paper_leader // WIDTH], header.paper_leader % WIDTH
+            top = group.log_odds[member] + group.paper_score[member]
             near, above = 0, 0
             for g in range(len(batch)):
                 more = _believe_group(batch[g], top, header.odds_bar, _width(g, count))
@@ -438,8 +438,8 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
                 _step_paper(batch[g], _width(g, count))
             for r in range(header.rubs):
                 m = batch[r // WIDTH].rub[r % WIDTH]
-                group, lane = batch[m // WIDTH], m % WIDTH
-                _set_paper(group, lane, predict_rub(observers[m], c, s, _paper(group, lane)))
+                group, member = batch[m // WIDTH], m % WIDTH
+                _set_paper(group, member, predict_rub(observers[m], c, s, _paper(group, member)))
 
         if header.by_paper and declared not in (UNDETERMINED, paper_previous):
             header.changed_from, header.changed_onset = paper_previous, paper_onset
