@@ -433,19 +433,21 @@ class AlarmManager:
 
         Whoever says good while others have not spoken since a restart changes nothing that a person could
         tell, so the last event of the quality alarm still has its doubt; the alarms that it had suppressed
-        know better.
+        know better, unless they rest on other sensors by now.
         """
-        place = {event.alarm: number for number, event in enumerate(told) if event.identity == self._identity}
+        ours = [event for event in told if event.identity == self._identity]
+        place = {event.alarm: number for number, event in enumerate(ours)}
         for name, doubt in self._doubts.not_ok():
-            since = place.get(name, len(told))
+            since = place.get(name, len(ours))
             blamed = set(doubt.sensors) if len(doubt.sensors) == 1 else set()
-            if any(
-                place.get(ruled.alarm.name, -1) > since and not ruled.alarm.is_held(Hold.SUPPRESSED)
-                for ruled in self._ruled
-                if ruled.rule.spare == 0
-                and (doubt.detector in ruled.rule.detectors or not blamed.isdisjoint(ruled.sensors))
-            ):
-                self._doubts.excuse(doubt.detector)
+            for event in ours[since + 1 :]:
+                ruled = self._ruled.named(event.alarm)
+                if ruled is None or ruled.rule.spare or ruled.alarm.is_held(Hold.SUPPRESSED):
+                    continue
+                rested_on = ruled.rule.sensors or event.cause.sensors or ruled.sensors
+                if doubt.detector in ruled.rule.detectors or not blamed.isdisjoint(rested_on):
+                    self._doubts.excuse(doubt.detector)
+                    break
 
     def _resume_ruled(self, ruled: Ruled, event: AlarmEvent) -> None:
         level = event.to_level if event.own_state.is_active else Level.NORMAL

@@ -88,6 +88,13 @@ class WalkingDoubts(SensorHealth):
             if doubts and detector not in self.table:
                 self.assumed[detector] = name, Doubt(detector, worst.quality, False, worst.reason, sensors)
 
+    def not_ok(self):
+        return [(name, doubt) for name, doubt in self.table.values() if doubt.not_ok]
+
+    def excuse(self, detector):
+        name, doubt = self.table[detector]
+        self.table[detector] = name, doubt._replace(not_ok=False)
+
     def give_up(self, t_ns):
         if not self.assumed or t_ns < self.until_ns:
             return []
