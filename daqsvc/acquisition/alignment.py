@@ -61,7 +61,8 @@ class AlignedBlock:
             0 for the reference itself, infinite if that is not known.
         lost_before: rows between the previous block and this one, when nothing came from any source for so
             long that it is not worth the rows.
-        quality: `Quality.TIME_UNSETTLED` while the samples of a source cannot be placed.
+        quality: `Quality.TIME_UNSETTLED` while the samples of a source cannot be placed;
+            `Quality.PLACE_ESTIMATED` where that holds for the reference's.
     """
 
     stream: str
@@ -143,6 +144,8 @@ class Aligner:
         self._longest = self._most + max(round(f.memory_s * rate_hz) for f in self._followers)
         self._next: int | None = None
         self._since_ns: int | None = None
+        self._break: int | None = None
+        """Where the reference goes on at a place that is a guess: a block begins there."""
 
     @property
     def counters(self) -> Mapping[str, SourceCounters]:
@@ -160,14 +163,22 @@ class Aligner:
         if follower is None:
             return
         follower.append(block)
+        if follower is self._reference and block.quality & Quality.PLACE_ESTIMATED:
+            self._break = block.first_index
         due_ns = self._due_ns()
         if self._next is None and self._can_begin():
             self._next = self._reference.line.index
         while self._next is not None and (rows := self._ready(self._next, due_ns)) >= self._least:
             skipped = rows - self._most if rows > self._longest else 0
             self._next += skipped
-            self._emit(self._next, min(rows, self._most), skipped)
-            self._next += min(rows, self._most)
+            rows = min(rows, self._most)
+            broken = self._break is not None and self._break <= self._next
+            if broken:
+                self._break = None
+            elif self._break is not None:
+                rows = min(rows, self._break - self._next)
+            self._emit(self._next, rows, skipped, broken=broken)
+            self._next += rows
 
     def _can_begin(self) -> bool:
         """Whether all streams can be placed, or that has been waited for long enough."""
@@ -202,7 +213,7 @@ class Aligner:
         overdue = math.floor(line.samples_to(due_ns)) + line.index - first
         return max(covered, overdue)
 
-    def _emit(self, first: int, rows: int, skipped: int) -> None:
+    def _emit(self, first: int, rows: int, skipped: int, *, broken: bool) -> None:
         line = self._reference.line
         for follower in self._followers if skipped else ():
             follower.skip(skipped)
@@ -211,6 +222,7 @@ class Aligner:
         self._reference.trim(first + rows)
         t_ns = line.time_of(first)
         settled = all(follower.trusted for follower in self._others)
+        quality = Quality.GOOD if settled else Quality.TIME_UNSETTLED
         self._deliver(
             AlignedBlock(
                 self.name,
@@ -221,7 +233,7 @@ class Aligner:
                 line.error_at(t_ns),
                 tuple(follower.error_ns for follower in self._followers),
                 skipped,
-                Quality.GOOD if settled else Quality.TIME_UNSETTLED,
+                quality | Quality.PLACE_ESTIMATED if broken else quality,
             )
         )
         for follower in self._others:

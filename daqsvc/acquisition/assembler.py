@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.acquisition.arrivals import SURE_FRAMES
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
@@ -221,6 +222,7 @@ class StreamAssembler:
         self._hand_over()
         if self._next is not None:
             self._time.begin_afresh(self._next)
+            self._after_restart = True
 
     def flush(self) -> None:
         """Hand over what is held back: the link is gone, or the service stops."""
@@ -378,15 +380,18 @@ class StreamAssembler:
 
     def _emit(self, first: int, samples: Samples, lost: int) -> None:
         assert self._next is not None  # noqa: S101 - `_release` has set it
-        quality = Quality.GOOD
+        quality, unsure = Quality.GOOD, False
         if not self._time.settled:
             quality |= Quality.TIME_UNSETTLED
         if lost:
             quality |= Quality.AFTER_LOSS
             if self._after_restart or self._counts_arrivals:
                 quality |= Quality.LOSS_ESTIMATED
+            unsure = self._counts_arrivals and lost > SURE_FRAMES * self._per_frame
             note_gap(self.counters, self.stream, lost, first)
             self._gaps.append((self._next, first))
+        if self._after_restart or unsure:
+            quality |= Quality.PLACE_ESTIMATED
         self._after_restart = False
         # Whatever is still held back waits for another frame than before.
         self._waiting_since_ns = self._arrival_ns

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.acquisition.samples import Window
+from daqsvc.acquisition.samples import Quality, Window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +27,7 @@ ANCHORS = 4096
 SNAPSHOTS = 1024
 """Snapshots that a ring remembers the places of."""
 GAPS = 256
-"""Gaps that a ring remembers, to tell what a reader has missed from what nobody ever had."""
+"""Gaps that a ring remembers, to tell what a reader has missed from what nobody ever had; breaks likewise."""
 
 
 class RingError(Exception):
@@ -84,6 +84,7 @@ class SampleRing:
         self._anchor_time = [(0, 0.0)] * ANCHORS
         self._anchors = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=GAPS)
+        self._breaks: deque[int] = deque(maxlen=GAPS)
         self._snapshots: deque[tuple[int, int]] = deque(maxlen=SNAPSHOTS)
         self._order = itertools.count()
         self._waiting: list[tuple[int, int, asyncio.Future[None]]] = []
@@ -118,6 +119,8 @@ class SampleRing:
             )
         if self._end is None:
             self._end = self._oldest = block.first_index - block.gap
+        elif block.quality & Quality.PLACE_ESTIMATED:
+            self._breaks.append(block.first_index)
         if block.first_index != self._end + block.gap:
             raise ValueError(
                 f"block of {self.stream!r} at index {block.first_index} does not follow {self._end} "
@@ -181,6 +184,10 @@ class SampleRing:
     def lost_between(self, first: int, end: int) -> int:
         """How many of the samples from index ``first`` up to ``end`` are missing, by the last `GAPS` gaps."""
         return sum(max(0, min(end, gap_end) - max(first, gap_first)) for gap_first, gap_end in self._gaps)
+
+    def breaks_between(self, first: int, end: int) -> list[int]:
+        """See `Window.breaks`; of the last `GAPS` ones, those from index ``first`` up to ``end``."""
+        return [index for index in self._breaks if first <= index < end]
 
     def time_of(self, index: int) -> int:
         """Host monotonic time in ns at which sample ``index`` was (or will be) taken.
@@ -316,8 +323,11 @@ class RingReader:
             return self._window(first, samples, skipped, snapshot=True)
 
     def _window(self, first: int, samples: Samples, skipped: int, *, snapshot: bool = False) -> Window:
-        last = first + len(samples) - 1
-        return Window(first, samples, self.ring.time_of(last), self.ring.period_at(last), skipped, snapshot)
+        ring, end = self.ring, first + len(samples)
+        breaks = sorted({max(index, first) for index in ring.breaks_between(first - skipped, end)})
+        return Window(
+            first, samples, ring.time_of(end - 1), ring.period_at(end - 1), skipped, snapshot, tuple(breaks)
+        )
 
     async def _first_block(self) -> None:
         # Any index will do: the first block starts wherever the device's counter stands.

@@ -7,8 +7,9 @@ now and then sends snapshots: each is complete by itself, and between them nothi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
+from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -32,6 +33,9 @@ class Quality(IntFlag):
     """Samples just before this block are missing (`SampleBlock.lost_before`)."""
     LOSS_ESTIMATED = 4
     """The number of missing samples comes from the host clock: the device has no counter, or restarted it."""
+    PLACE_ESTIMATED = 8
+    """How far this block lies behind the one before is a guess, which may be off by many samples: the device
+    has begun to count anew, or sends no count and was away for long. What goes by phase begins anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +105,8 @@ class Window:
             for (they were overwritten), or that were withheld from it; 0 in normal operation.
         snapshot: whether the samples are one block that was taken by itself. Between it and the window before
             nobody sampled: nothing is missing there, nothing goes on from there, and its length is its own.
+        breaks: absolute indices, rising, of samples whose distance to the one before is a guess
+            (`Quality.PLACE_ESTIMATED`). One among samples that were skipped is at the first sample.
     """
 
     first_index: int
@@ -109,3 +115,22 @@ class Window:
     period_ns: float
     skipped: int = 0
     snapshot: bool = False
+    breaks: tuple[int, ...] = ()
+
+    def parts(self) -> list[Window]:
+        """The window cut at its breaks: only the first sample of a part can be one."""
+        if not self.breaks:
+            return [self]
+        end = self.first_index + len(self.samples)
+        cuts = sorted({self.first_index, *self.breaks, end})
+        return [
+            replace(
+                self,
+                first_index=begin,
+                samples=self.samples[begin - self.first_index : until - self.first_index],
+                t_end_ns=self.t_end_ns - round((end - until) * self.period_ns),
+                skipped=self.skipped if begin == self.first_index else 0,
+                breaks=(begin,) if begin in self.breaks else (),
+            )
+            for begin, until in pairwise(cuts)
+        ]

@@ -272,7 +272,7 @@ class Pipeline:
     async def _next_window(self, detector: Detector) -> Window | None:
         """The next samples for a detector; None if no more will come."""
         reader, counters = self._readers[detector.name], self.counters[detector.name]
-        withheld = 0
+        withheld, broken = 0, False
         while True:
             try:
                 skipped_before = reader.samples_skipped
@@ -286,6 +286,7 @@ class Pipeline:
             self._seen_changes[detector.name] = changes
             counters.samples_withheld += len(window.samples)
             withheld += window.skipped + len(window.samples)
+            broken = broken or bool(window.breaks)
         if missed := reader.samples_skipped - skipped_before:
             counters.samples_skipped += missed
             logger.warning(
@@ -295,7 +296,10 @@ class Pipeline:
                 detector.stream,
                 window.first_index - window.skipped,
             )
-        return replace(window, skipped=window.skipped + withheld) if withheld else window
+        if not withheld:
+            return window
+        breaks = sorted({*window.breaks, *([window.first_index] if broken else [])})
+        return replace(window, skipped=window.skipped + withheld, breaks=tuple(breaks))
 
     async def _until_made(
         self, detector: Detector, job: Job[Sequence[Diagnosis]], kernels: KernelThreads

@@ -150,6 +150,8 @@ class CountedRows:
         self._next = first + len(samples)
         quality = Quality.GOOD if self._time.settled else Quality.TIME_UNSETTLED
         samples = note_received(self.counters, self._name, samples)
+        if restarted:
+            quality |= Quality.PLACE_ESTIMATED
         if lost:
             quality |= Quality.AFTER_LOSS
             if restarted:

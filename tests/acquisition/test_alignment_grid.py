@@ -208,6 +208,26 @@ def test_a_dead_stream_is_not_waited_for_and_is_taken_in_when_it_is_back(dead) -
         np.testing.assert_allclose(samples[there], true[there], atol=2e-3)
 
 
+@pytest.mark.parametrize("restarted", ["a", "b"])
+def test_where_the_reference_goes_on_at_a_guess_a_row_is_a_break(restarted) -> None:
+    """Of another stream only the instants count, and those its time base tells."""
+    cuts = list(range(0, 2001, 10))
+    streams = {
+        name: [
+            replace(block, quality=Quality.PLACE_ESTIMATED)
+            if name == restarted and block.first_index == 1230
+            else block
+            for block in blocks_of(name, 1000.0, sine(50.0), cuts, lost=[(1000, 1230)])
+        ]
+        for name in "ab"
+    }
+    sources = [AlignedSource(name, ("x",), 1000.0) for name in "ab"]
+    _, out = run(sources, merged(*streams.values()))
+    assert len(joined(out)) > 1500
+    breaks = [block.first_index for block in out if block.as_block().quality & Quality.PLACE_ESTIMATED]
+    assert breaks == ([1230] if restarted == "a" else [])
+
+
 def test_an_hour_without_anything_is_not_written_row_by_row() -> None:
     hour = 3_600_000
     cuts = [*range(0, 1001, 10), *range(hour, hour + 1001, 10)]

@@ -91,6 +91,23 @@ def test_what_the_assembler_makes_of_them_is_whole_and_says_that_loss_is_estimat
     assert last.t_first_ns == pytest.approx(10**9 + (last.first_index - first) * PERIOD_NS, abs=1000)
 
 
+@pytest.mark.parametrize("missing", [1, 50, 51])
+def test_a_gap_too_long_to_be_told_by_the_clock_to_the_frame_is_a_break(missing: int) -> None:
+    blocks: list[SampleBlock] = []
+    stream = StreamAssembler(
+        "s", 100.0, counter_bits=None, samples_per_frame=1, counts_per_frame=1, deliver=blocks.append
+    )
+    sent = np.concatenate([np.arange(60), np.arange(60) + 60 + missing])
+    for t_ns in sent * PERIOD_NS:
+        stream.accept(
+            np.zeros(1, np.int64), np.zeros((1, 1, 1), np.float32), np.ones(1, bool), np.array([t_ns])
+        )
+    stream.flush()
+    (after,) = [block for block in blocks if block.lost_before]
+    assert after.lost_before == missing
+    assert bool(after.quality & Quality.PLACE_ESTIMATED) == (missing > 50)
+
+
 def test_the_standard_acceleration_message_of_j1939_is_read_without_a_counter() -> None:
     machine = load_machine_file(SENSOR)
     layout = frame_layout(machine, "foot")

@@ -134,6 +134,7 @@ def test_a_restart_starts_a_new_run_with_its_loss_marked_as_estimated() -> None:
     unit.flush()
     assert unit.time_base.restarts == 1
     after = next(b for b in blocks if b.quality & Quality.LOSS_ESTIMATED)
+    assert [b for b in blocks if b.quality & Quality.PLACE_ESTIMATED] == [after]
     assert after.lost_before == 91 * PER_FRAME  # the silence, and the frame that was not yet believed
     assert unit.counters.frames_rejected == 1
 

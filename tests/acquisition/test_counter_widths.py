@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.counter import LEAST_BITS, MOST_BITS, CounterUnwrapper
-from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.samples import Quality, SampleBlock
 from drivers.frames import Field, FrameLayout
 
 pytestmark = pytest.mark.property
@@ -94,6 +94,8 @@ def test_a_sender_that_begins_anew_goes_on_with_the_next_index(bits, first, agai
     assert (unit.counters.frames_rejected, unit.time_base.restarts) == (0, 0)
     index = np.concatenate([np.arange(b.first_index, b.end_index) for b in blocks])
     assert index[-1] - index[0] == (11 if held else 9)
+    anew = [b.first_index - blocks[0].first_index for b in blocks if b.quality & Quality.PLACE_ESTIMATED]
+    assert anew == [6 if held else 5]
 
 
 def test_a_sender_without_a_counter_that_begins_anew_loses_nothing() -> None:

@@ -11,7 +11,7 @@ from support.waiting import eventually
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock, SystemClock
 from daqsvc.acquisition.ring import SampleRing
-from daqsvc.acquisition.samples import SampleBlock
+from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import StreamStanding, StreamState
 from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.diagnosis.pipeline import Pipeline
@@ -45,11 +45,12 @@ class Listener:
         return [Diagnosis("m", self.name, t_ns, "s", 0, 0, "N", quality="missing", reason=f"{silence_s:g} s")]
 
 
-async def write(ring: SampleRing, listener: Listener | None = None) -> None:
+async def write(ring: SampleRing, listener: Listener | None = None, quality: Quality = Quality.GOOD) -> None:
     """One block into the ring; wait until it has been processed, or for some turns of the loop."""
     before = len(listener.windows) if listener else 0
     first = ring.end_index
-    ring.write(SampleBlock("s", first, np.ones((BLOCK, 1), np.float32), 1000 * first, 1000.0))
+    samples = np.ones((BLOCK, 1), np.float32)
+    ring.write(SampleBlock("s", first, samples, 1000 * first, 1000.0, quality=quality))
     async with asyncio.timeout(20):
         for _ in range(20):
             await asyncio.sleep(0)
@@ -76,6 +77,22 @@ async def test_nothing_is_judged_by_a_stream_in_doubt() -> None:
     assert [(w.first_index, w.skipped) for w in listener.windows] == [(0, 0), (40, 30)]
     assert pipeline.counters["levels"].samples_withheld == 30
     assert [d.first_index for d in said if d.quality == "good"] == [0, 40]
+
+
+async def test_a_break_among_samples_that_are_withheld_comes_with_those_after_them() -> None:
+    ring, listener = SampleRing("s", ("a",), 1000), Listener()
+    pipeline = Pipeline({"s": ring}, [listener], [].append, SystemClock())
+    running = asyncio.create_task(pipeline.run())
+    await write(ring, listener)
+    pipeline.stand("s", StreamState(DOUBT, proven=True))
+    await write(ring, quality=Quality.PLACE_ESTIMATED)
+    pipeline.stand("s", StreamState())
+    await write(ring)
+    await write(ring, listener)
+    ring.close()
+    await running
+    first, *_, last = listener.windows
+    assert (first.breaks, last.skipped > 0, last.breaks) == ((), True, (last.first_index,))
 
 
 async def test_what_is_said_before_the_rate_is_known_waits_for_it() -> None:

@@ -61,8 +61,9 @@ class RotorBankDetector:
     mode, the decision is ``departure`` with the candidates as group, at once and until the cause is known;
     the declared mode has not changed by that.
 
-    A gap of up to a revolution is predicted through; after a longer one the observers start anew. While
-    the quality is not good there is no evidence, and the decision is held.
+    A gap of up to a revolution is predicted through; after a longer one, and after one whose length is a
+    guess, the observers start anew. While the quality is not good there is no evidence, and the decision is
+    held.
 
     Args:
         machine: name of the machine.
@@ -215,18 +216,22 @@ class RotorBankDetector:
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
         """See `Detector.process`."""
+        return [diagnosis for part in window.parts() for diagnosis in self._process(part)]
+
+    def _process(self, window: Window) -> list[Diagnosis]:
+        """Take in a window without a break behind its first sample."""
         samples = np.asarray(window.samples, dtype=np.float64)[:, self._columns]
         samples = np.where(np.isfinite(samples), samples, np.nan) * self._units
         first_index = window.first_index
         gap = 0 if self._next_index is None else first_index - self._next_index
-        if 0 < gap <= self._nominal_period:
+        if window.breaks:
+            # At which angle the shaft is by now, only the next pulses tell; its speed is what it was.
+            self._begin_anew(keep_speed=True)
+        elif 0 < gap <= self._nominal_period:
             samples = np.concatenate((np.full((gap, 3), np.nan), samples))
             first_index -= gap
         elif gap:
-            self._tracker.reset()
-            self._bank.reseed()
-            self._watch.reset()
-            self._last_revolution = np.empty((0, 3))
+            self._begin_anew()
         self._next_index = end_index = first_index + len(samples)
         said: list[Diagnosis] = []
         for begin in range(0, len(samples), self.block):
@@ -235,6 +240,12 @@ class RotorBankDetector:
             t_ns = window.t_end_ns - round((end_index - 1 - last_index) * window.period_ns)
             said += self._step(part, last_index + 1 - len(part), t_ns, window.period_ns)
         return said
+
+    def _begin_anew(self, *, keep_speed: bool = False) -> None:
+        self._tracker.reset(keep_speed=keep_speed)
+        self._bank.reseed()
+        self._watch.reset()
+        self._last_revolution = np.empty((0, 3))
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""

@@ -179,14 +179,19 @@ class RotorSynchronousDetector:
         """See `Detector.process`."""
         if not len(window.samples):
             return []
+        return [diagnosis for part in window.parts() for diagnosis in self._process(part)]
+
+    def _process(self, window: Window) -> list[Diagnosis]:
+        """Take in a window without a break behind its first sample."""
         self._t_end_ns, self._period_ns = window.t_end_ns, window.period_ns
         self._count_missing(window)
-        if abs(window.first_index - self._turns.end_index) > self._turns.period:
+        broken = bool(window.breaks)
+        if broken or abs(window.first_index - self._turns.end_index) > self._turns.period:
             self._judge.reset()
             self._checks.reset()
         said = [
             self._revolution(revolution)
-            for revolution in self._turns.process(window.samples, window.first_index)
+            for revolution in self._turns.process(window.samples, window.first_index, broken=broken)
         ]
         said.append(self._blind())
         return [diagnosis for diagnosis in said if diagnosis is not None]

@@ -134,25 +134,28 @@ class RevolutionStream:
         """Samples that no revolution has come out of yet."""
         return len(self._held)
 
-    def process(self, samples: NDArray[np.float32], first_index: int) -> list[Revolution]:
+    def process(
+        self, samples: NDArray[np.float32], first_index: int, *, broken: bool = False
+    ) -> list[Revolution]:
         """Take in samples; the revolutions that they complete.
 
-        A gap of up to a revolution is bridged as missing samples. After a longer one, and where the index
-        goes back, the revolutions begin anew; at a stated speed the angle goes on.
+        A gap of up to a revolution is bridged as missing samples. After a longer one, where the index goes
+        back, and after a break the revolutions begin anew; at a stated speed the angle goes on.
 
         Args:
             samples: float32 ``[n, channels]`` of the stream; what is not finite is missing.
             first_index: absolute index of the first one.
+            broken: whether it is a guess how far that is from the samples before.
         """
         values = np.asarray(samples, dtype=np.float64)[:, self._columns]
         values = np.where(np.isfinite(values), values, np.nan)
         if not self._started:
             self._started, self.origin = True, first_index
             self._begin_cutting(first_index)
-        elif 0 < (gap := first_index - self.end_index) <= self.period:
+        elif not broken and 0 < (gap := first_index - self.end_index) <= self.period:
             values = np.concatenate((np.full((gap, values.shape[1]), np.nan), values))
             first_index -= gap
-        elif gap:
+        elif broken or gap:
             self._begin_cutting(first_index)
         self.end_index = first_index + len(values)
         return list(self._cut(values))

@@ -213,9 +213,10 @@ class EdgeLine:
         self._crossings: deque[KeyphasorEdge] = deque(maxlen=_ALIAS_EDGES + 1)
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the edges; the counts go on."""
-        self.period = self._nominal_period
+    def reset(self, *, keep_speed: bool = False) -> None:
+        """Forget the edges; the counts go on, and the period if it is kept."""
+        if not keep_speed:
+            self.period = self._nominal_period
         self._forget()
 
     @property
@@ -458,11 +459,11 @@ class KeyphasorTracker:
         since = self._line.marks[-1].index if self._line.marks else self._start
         return (self._position - since) / self._line.period
 
-    def reset(self) -> None:
-        """Forget the edges, for instance after a long gap; the counts go on."""
+    def reset(self, *, keep_speed: bool = False) -> None:
+        """Forget the edges, for instance after a long gap; the counts go on, and the speed if it is kept."""
         self._start = self._position
         self._finder.reset()
-        self._line.reset()
+        self._line.reset(keep_speed=keep_speed)
 
     def process(self, samples: Floats) -> ShaftTrack:
         """Follow the shaft over the next samples.
