@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.offline.runner import Runner
     from daqsvc.recording.recording import Recording
     from daqsvc.rotor.calibration.file import CalibrationRecord
@@ -264,7 +264,7 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
 def _keep_bearings(found: BearingBaseline, arguments: argparse.Namespace) -> int:
     """Write the file first, then say what was found."""
     from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
-    from daqsvc.bearing.identify_file import BaselineFileError, save_bearing_baseline  # noqa: PLC0415
+    from daqsvc.bearing.baseline import BaselineFileError, save_bearing_baseline  # noqa: PLC0415
     from daqsvc.commands.calibrate_report import bearings_as_json, bearings_as_text  # noqa: PLC0415
 
     found = replace(found, written=iso_utc(SystemClock().wall_ns()))

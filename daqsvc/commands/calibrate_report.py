@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.rotor.calibration.file import CalibrationRecord
-    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.run_up import RunUpFit
     from daqsvc.rotor.synchronous.baseline import Calibration
 
 _OF_CRITICAL = (0.5, 0.7, 0.95, 1.0)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from daqsvc.rotor.detectability.prediction import Ambiguity, Detectability, PairEvidence
-    from daqsvc.rotor.detectability.visible_change import SmallestChange
+    from daqsvc.rotor.detectability.prediction import Ambiguity, Detectability, PairEvidence, SmallestChange
     from daqsvc.settings import MachineFile
 
 _QUANTITIES = {

@@ -244,7 +244,7 @@ class ModelBank:
         return BankReport(declarations, self.rules, self._alike, memory.tobytes())
 
     def _declaration(self, sample: int) -> Declaration:
-        """The change of the decision that is on the desk."""
+        """The change of the decision that is in the header."""
         header = self._memory.header
         return Declaration(sample, self.decision, int(header["changed_from"]), int(header["changed_onset"]))
 

@@ -106,8 +106,8 @@ class DecisionRules:
         Raises:
             ValueError: a figure is not above 0, or the rate is so high that no evidence would be needed.
         """
-        given = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev, "mtbf_hours": mtbf_hours}
-        for name, value in given.items():
+        rates = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev, "mtbf_hours": mtbf_hours}
+        for name, value in rates.items():
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"decision rule: {name} is {value}; it must be a finite number above 0")
         chances_per_rev = samples_per_rev * (modes - 1)

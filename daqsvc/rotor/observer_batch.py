@@ -161,7 +161,7 @@ class BankMemory:
 
     @property
     def header(self) -> np.void:
-        """The desk, one of `HEADER`."""
+        """What is known besides the modes, one of `HEADER`."""
         header: np.void = np.ndarray(1, HEADER, self.memory)[0]
         return header
 
@@ -215,7 +215,7 @@ class BankMemory:
         self.put("log_norm", np.where(linear, observers["log_norm"], 0.0), math.inf)
 
     def set_rules(self, rules: DecisionRules, *, noise: float, samples_per_rev: int, decision: int) -> None:
-        """Put the rules on the desk, and the decision to begin with.
+        """Put the rules into the header, and the decision to begin with.
 
         Args:
             rules: thresholds and the rule that declares.

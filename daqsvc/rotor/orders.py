@@ -416,18 +416,18 @@ def _probabilities(
 ) -> dict[OrderVerdict, float]:
     """At the threshold, changed and unchanged are even; a change is shared out by the causes' evidence."""
     changed = 1.0 / (1.0 + math.exp(-min(max(excess, -500.0), 500.0)))
-    found: dict[OrderVerdict, float] = dict.fromkeys(
+    probability: dict[OrderVerdict, float] = dict.fromkeys(
         ("normal", "unbalance", "damping_loss", "unmodelled", "small_change"), 0.0
     )
-    found["normal"] = 1.0 - changed
+    probability["normal"] = 1.0 - changed
     if group in {("normal",), ("small_change",)}:
-        found["small_change"] = changed
-        return found
+        probability["small_change"] = changed
+        return probability
     causes: tuple[Cause, ...] = ("unbalance", "damping_loss", "unmodelled")
     if group == ("unmodelled",):
         causes = ("unmodelled",)
     most = max(evidence[cause] for cause in causes)
     weights = {cause: math.exp(max(evidence[cause] - most, -700.0)) for cause in causes}
     for cause in causes:
-        found[cause] = changed * weights[cause] / sum(weights.values())
-    return found
+        probability[cause] = changed * weights[cause] / sum(weights.values())
+    return probability

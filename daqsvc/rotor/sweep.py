@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     Batch = NDArray[np.void]
     Observer = Any  # one element of Observers: numba makes a record of it
     Group = Any
-    Desk = Any
+    Header = Any
     State = tuple[float, float, float, float]
 
 
@@ -66,12 +66,12 @@ def gather(group: Group, own: float, lead_limit: float, width: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_verdict(batch: Batch, pairs: Pairs, header: Desk) -> int:
+def first_verdict(batch: Batch, pairs: Pairs, header: Header) -> int:
     """One sample's evidence of every mode against every other; a mode that leads all unlike it, or -1.
 
     Args:
         batch: memory of the bank; ages go on.
-        pairs: ``[M M]`` of `batch.PAIR`; the duels go on.
+        pairs: ``[M M]`` of `batch.PAIR`; their log-likelihood ratios go on.
         header: of `batch.HEADER`.
     """
     count = header.modes
@@ -97,7 +97,7 @@ def first_verdict(batch: Batch, pairs: Pairs, header: Desk) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def next_verdict(batch: Batch, pairs: Pairs, header: Desk) -> tuple[int, int]:
+def next_verdict(batch: Batch, pairs: Pairs, header: Header) -> tuple[int, int]:
     """The mode with a threshold of evidence against the declared one, and the one that takes over, or -1.
 
     A transient passes by the mildest faults, so for a moment several are past their thresholds. Who
@@ -137,7 +137,7 @@ def next_verdict(batch: Batch, pairs: Pairs, header: Desk) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Desk) -> None:
+def stand_by(mode: int, batch: Batch, pairs: Pairs, header: Header) -> None:
     """Make a mode the decision: its lead is what it won by, and the evidence starts anew.
 
     Args:
@@ -192,7 +192,7 @@ def _width(group: int, count: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _forget(observers: Observers, batch: Batch, pairs: Pairs, header: Desk) -> None:
+def _forget(observers: Observers, batch: Batch, pairs: Pairs, header: Header) -> None:
     """Forget estimates and evidence; the decision is held.
 
     Linear observers start on their own orbits, rub observers on the healthy one. The revolution that
@@ -296,7 +296,7 @@ def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(batch: Batch, pairs: Pairs, header: Desk) -> int:
+def _decide(batch: Batch, pairs: Pairs, header: Header) -> int:
     """What the CUSUM makes of evidence that is enough; the mode that it changes its decision to, or -1."""
     if header.decision == UNDETERMINED:
         header.departed = 0
@@ -321,7 +321,7 @@ def _believe_group(group: Group, top: float, bar: float, width: int) -> tuple[in
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _believe(batch: Batch, count: int, header: Desk) -> int:
+def _believe(batch: Batch, count: int, header: Header) -> int:
     """The mode that passes the paper's threshold, or -1."""
     leader = header.paper_leader
     top = batch[leader // WIDTH].log_odds[leader % WIDTH]
@@ -408,7 +408,7 @@ def advance(  # noqa: C901, PLR0912, PLR0915 - one recursion: correct, weigh, de
                 enough += gather(batch[g], own, header.lead_limit, _width(g, count))
         winner, onset = UNDETERMINED, 0
         if enough:
-            winner = _weigh(batch, pairs, header)
+            winner = _decide(batch, pairs, header)
         else:
             header.departed = 0
         if winner != UNDETERMINED:

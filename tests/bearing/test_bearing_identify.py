@@ -8,11 +8,24 @@ import numpy as np
 import pytest
 from support.bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, Housing, healthy, knocks
 
+from daqsvc.bearing.baseline import (
+    BaselineFileError,
+    learn_baseline,
+    load_bearing_baseline,
+    resampled,
+    save_bearing_baseline,
+)
 from daqsvc.bearing.geometry import bearing_orders
-from daqsvc.bearing.identify import LEAST_SAMPLES, NotIdentifiableError, identify, whiteness
-from daqsvc.bearing.identify_baseline import learn_baseline, resampled
-from daqsvc.bearing.identify_change import BANDS, ChangeRules, compare_residual, learn_healthy
-from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.identify import (
+    BANDS,
+    LEAST_SAMPLES,
+    ChangeRules,
+    NotIdentifiableError,
+    compare_residual,
+    identify,
+    learn_healthy,
+    whiteness,
+)
 
 A1 = np.array([[1.2, 0.1], [-0.2, 0.9]])
 A2 = np.array([[-0.7, 0.0], [0.1, -0.5]])

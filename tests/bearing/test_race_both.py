@@ -10,8 +10,7 @@ from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
 from daqsvc.bearing.race.decision import decide
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PartEvidence
+from daqsvc.bearing.race.verdict import PartEvidence, RaceRules
 
 WEAK = PartEvidence(0.0, 0.05, 1.0, 0.0, 5.0, 0.3, 3.0, 1e-4, 4.0)
 

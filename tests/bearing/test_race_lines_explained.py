@@ -6,8 +6,7 @@ from support.bearing_signals import CAGE, INNER, OUTER, RATE_HZ, SPEED_RPM, Hous
 
 from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.race import race_test
-from daqsvc.bearing.race.combs import part_lines
-from daqsvc.bearing.race.lines import EXPLAINED_SHARE
+from daqsvc.bearing.race.lines import EXPLAINED_SHARE, part_lines
 
 
 def test_no_line_of_another_part_is_where_the_foremost_part_has_one() -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from daqsvc.bearing.race.decision import decide
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PartEvidence
+from daqsvc.bearing.race.verdict import PartEvidence, RaceRules
 
 RULES = RaceRules()
 

@@ -9,19 +9,27 @@ import pytest
 import scipy.fft
 from support.race_signals import BEARING, RATE_HZ
 
-from daqsvc.bearing.race.baseline import BandLevels, RaceBaseline, band_levels
-from daqsvc.bearing.race.combs import best_comb, fundamental, highest_order
 from daqsvc.bearing.race.decision import decide
 from daqsvc.bearing.race.lines import (
     LineEvidence,
     ModulationDepth,
+    best_comb,
     false_alarm_probability,
+    fundamental,
+    highest_order,
     line_evidence,
     sharpest,
     significance,
 )
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PARTS, Part, PartEvidence
+from daqsvc.bearing.race.verdict import (
+    PARTS,
+    BandLevels,
+    Part,
+    PartEvidence,
+    RaceBaseline,
+    RaceRules,
+    band_levels,
+)
 from daqsvc.dsp.envelope import line_power, running_median, squared_envelope, whiten
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.speed.harmonics import ShaftRate, shaft_rate, slow_series

@@ -11,7 +11,7 @@ from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
 from daqsvc.bearing.race.decision import MOST_MARGIN, doubted
-from daqsvc.bearing.race.rules import RaceRules
+from daqsvc.bearing.race.verdict import RaceRules
 from daqsvc.dsp.envelope import levelled
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import checked

@@ -8,7 +8,7 @@ import scipy.fft
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
-from daqsvc.bearing.race.scoring import refuse_rivals
+from daqsvc.bearing.race.decision import refuse_rivals
 from daqsvc.bearing.race.verdict import PartEvidence
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.speed.harmonics import ShaftRate, shaft_rate, slow_series

@@ -16,7 +16,7 @@ from targets import Targets
 
 from daqsvc.bearing.geometry import bearing_orders
 from daqsvc.bearing.race import RaceWatch, race_test
-from daqsvc.bearing.race.watch import WINDOW_S
+from daqsvc.bearing.race.judge import WINDOW_S
 
 RATE_HZ = 25_600.0
 SPEED_RPM = 1797.0

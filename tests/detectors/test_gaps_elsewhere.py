@@ -17,8 +17,7 @@ from support.shaft_channels import channels_of, feed
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.alarms.manager import AlarmManager, Identity
 from daqsvc.bearing.geometry import bearing_orders
-from daqsvc.bearing.identify import NotIdentifiableError
-from daqsvc.bearing.identify_change import learn_healthy
+from daqsvc.bearing.identify import NotIdentifiableError, learn_healthy
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.housed import HousedBearing

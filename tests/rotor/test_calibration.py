@@ -19,7 +19,7 @@ from daqsvc.rotor.laval import unbalance_response
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.run_up import RunUpFit
 
 SEEDS = range(20)
 OMEGA_S, ZETA = 535.2191942310874, 0.18

@@ -22,7 +22,7 @@ from daqsvc.rotor.calibration.file import (
     save_calibration,
     save_record,
 )
-from daqsvc.rotor.calibration.run_up_fit import RunUpFit
+from daqsvc.rotor.calibration.run_up import RunUpFit
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
 

@@ -14,8 +14,7 @@ from support.machine_files import LAVAL, MOTOR, changed
 
 from daqsvc.cli import load
 from daqsvc.commands.detectability import DetectabilityCommand
-from daqsvc.rotor.detectability.prediction import detectability
-from daqsvc.rotor.detectability.visible_change import FAULTS
+from daqsvc.rotor.detectability.prediction import FAULTS, detectability
 from daqsvc.rotor.discretise import BankMode
 from daqsvc.rotor.model import NormalisedRotor
 

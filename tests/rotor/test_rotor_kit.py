@@ -17,7 +17,7 @@ import pytest
 from daqsvc.rotor.calibration.bode import fit_bode
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.synchronous.baseline import Calibration
-from daqsvc.rotor.synchronous.identify import Identification, NamingRules, identify
+from daqsvc.rotor.synchronous.signatures import Identification, NamingRules, identify
 
 if TYPE_CHECKING:
     from pathlib import Path

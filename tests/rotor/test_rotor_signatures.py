@@ -10,9 +10,8 @@ import pytest
 from support.rotor_orbits import HEALTHY, ROTOR, SPEED_RAD_S
 
 from daqsvc.rotor.laval import compliance, unbalance_response
-from daqsvc.rotor.synchronous.healthy import Healthy
 from daqsvc.rotor.synchronous.signatures import damping_misfit, likelihoods
-from daqsvc.rotor.synchronous.vectors import HARMONICS
+from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
 
 ORDER = np.array(HARMONICS)
 VARIANCE = np.full(5, (0.004 * abs(HEALTHY[1])) ** 2)

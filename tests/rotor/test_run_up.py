@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from support.run_ups import CENTRE, ECCENTRICITY, RATE_HZ, record
 
-from daqsvc.rotor.calibration.run_up import fit_run_up
-from daqsvc.rotor.calibration.run_up_fit import NotLavalError
+from daqsvc.rotor.calibration.run_up import NotLavalError, fit_run_up
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 

@@ -14,14 +14,13 @@ from support.orbit_files import RATE_HZ, SPEED_RPM, Orbit
 from support.race_signals import BEARING, strikes
 
 import sim_hw.scenario
-from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.baseline import BaselineFileError, load_bearing_baseline, save_bearing_baseline
 from daqsvc.detectors.bearing.calibrating import HealthyRun
 from daqsvc.detectors.bearing.verdict import BearingSetup
 from daqsvc.detectors.rotor_synchronous.recorded import analyse
 from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
 from daqsvc.recording.recording import Recording
-from daqsvc.rotor.calibration.file import load_record, save_calibration
-from daqsvc.rotor.calibration.reading import CalibrationFileError
+from daqsvc.rotor.calibration.file import CalibrationFileError, load_record, save_calibration
 from daqsvc.rotor.laval import LavalRotor
 from sim_hw.scenario import ScenarioError, load_any_scenario
 

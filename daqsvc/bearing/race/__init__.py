@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from daqsvc.bearing.race.baseline import RaceBaseline
-from daqsvc.bearing.race.judge import race_baseline, race_test
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PartEvidence, RaceLine, RaceVerdict
-from daqsvc.bearing.race.watch import RaceWatch
+from daqsvc.bearing.race.judge import RaceWatch, race_baseline, race_test
+from daqsvc.bearing.race.verdict import PartEvidence, RaceBaseline, RaceLine, RaceRules, RaceVerdict
 
 __all__ = [
     "PartEvidence",

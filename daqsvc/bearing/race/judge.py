@@ -1,8 +1,9 @@
-"""The race test of one record: from samples to a verdict.
+"""The race test: from samples to a verdict, of one record or window after window.
 
-A pure function: significance (`null`) and size (`depth`) of the kinematic lines of each part, in the envelope
-of the whitened signal. Significance alone is not enough: bearings in good order modulate too, faintly and
-very regularly.
+`race_test` is a pure function: significance (`decision`) and size (`lines`) of the kinematic lines of each
+part, in the envelope of the whitened signal. Significance alone is not enough: bearings in good order
+modulate too, faintly and very regularly. `RaceWatch` gathers the evidence of a running machine over the
+last ten seconds.
 """
 
 from __future__ import annotations
@@ -13,21 +14,38 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.fft
 
-from daqsvc.bearing.race.baseline import TOP_SHARE, BandLevels, RaceBaseline, band_levels
-from daqsvc.bearing.race.combs import TEETH, highest_order, part_lines
-from daqsvc.bearing.race.decision import MOST_DOUBT, MOST_MARGIN, RACES, decide, doubted
-from daqsvc.bearing.race.lines import NOTCHED_HARMONICS, false_alarm_probability
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.scoring import EnvelopeView, Scales, refuse_rivals, view_of
+from daqsvc.bearing.race.decision import (
+    MOST_DOUBT,
+    MOST_MARGIN,
+    RACES,
+    EnvelopeView,
+    Scales,
+    decide,
+    doubted,
+    refuse_rivals,
+    view_of,
+)
+from daqsvc.bearing.race.lines import (
+    NOTCHED_HARMONICS,
+    TEETH,
+    false_alarm_probability,
+    highest_order,
+    part_lines,
+)
 from daqsvc.bearing.race.track import shaft_track
 from daqsvc.bearing.race.verdict import (
     PARTS,
     PLACES,
+    TOP_SHARE,
+    BandLevels,
     EnvelopeSpectrum,
     Part,
     PartEvidence,
+    RaceBaseline,
     RaceLine,
+    RaceRules,
     RaceVerdict,
+    band_levels,
 )
 from daqsvc.dsp.envelope import levelled, line_power, squared_envelope, whiten
 from daqsvc.dsp.quality.accelerometers import checked
@@ -238,3 +256,62 @@ def _found(
                 line = (order * shaft_hz, order, tooth.harmonic, tooth.sideband, nats, depth)
                 lines.append(RaceLine(part, *line))
     return tuple(sorted(lines, key=lambda line: -line.evidence))
+
+
+WINDOW_S = 2.5
+SPAN_S = 10.0
+
+
+class RaceWatch:
+    """Race test of consecutive windows: the last `SPAN_S` seconds are judged together; memory stays flat.
+
+    Args:
+        rate_hz: sample rate of the windows.
+        speed_rpm: stated speed of the shaft.
+        bearing: its fault orders.
+        rules: settings of the test.
+        baseline: of the same machine in good order.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        speed_rpm: float,
+        bearing: BearingOrders,
+        rules: RaceRules | None = None,
+        baseline: RaceBaseline | None = None,
+    ) -> None:
+        self.rate_hz = rate_hz
+        self.speed_rpm = speed_rpm
+        self.window = round(WINDOW_S * rate_hz)
+        self._bearing = bearing
+        self._rules = rules or RaceRules()
+        self._baseline = baseline
+        self._held: NDArray[np.float64] = np.empty(0)
+        self._span = round(SPAN_S * rate_hz)
+
+    def evaluate(self, window_samples: NDArray[np.floating], speed_rpm: float | None = None) -> RaceVerdict:
+        """Take in the next window and judge the last ten seconds.
+
+        Args:
+            window_samples: ``[n]``, about `window` samples that follow those before; call `forget` where they
+                do not.
+            speed_rpm: the shaft's speed now, if it is measured; a change of more than the tolerance of the
+                test begins anew.
+
+        Raises:
+            UnfitError: no verdict can rest on these samples. They are forgotten.
+        """
+        if speed_rpm is not None:
+            if abs(speed_rpm / self.speed_rpm - 1.0) > self._rules.speed_tolerance:
+                self.forget()
+            self.speed_rpm = speed_rpm
+        joined = np.concatenate((self._held, np.asarray(window_samples, dtype=np.float64)))[-self._span :]
+        self._held = np.empty(0)
+        features = race_features(joined, self.rate_hz, self.speed_rpm, self._bearing, self._rules)
+        self._held = joined
+        return verdict_of(features, self._rules, self._baseline)
+
+    def forget(self) -> None:
+        """Begin anew: samples are missing, or the machine has changed."""
+        self._held = np.empty(0)

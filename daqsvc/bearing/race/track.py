@@ -103,10 +103,10 @@ def shaft_track(signal: Series, envelope: Series, revolutions: float) -> SpeedTr
     if followed is not None:
         candidates.append((followed, FOLLOWED_LEAD_NATS))
     leads = [rows.votes(candidate) - even for candidate, _ in candidates]
-    told = [(lead, ahead) for lead, (ahead, least) in zip(leads, candidates, strict=True) if lead >= least]
-    if not told:
+    leading = [(lead, ahead) for lead, (ahead, least) in zip(leads, candidates, strict=True) if lead >= least]
+    if not leading:
         return None
-    _, ahead = max(told, key=lambda each: each[0])
+    _, ahead = max(leading, key=lambda each: each[0])
     ahead = ahead - np.interp(u, u[[0, -1]], ahead[[0, -1]])
     turned = np.append(u + 0.5 + ahead / revolutions, 1.0)
     speed = np.diff(turned) * rows.points

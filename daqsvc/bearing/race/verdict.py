@@ -1,15 +1,22 @@
-"""What the race test says, with its evidence."""
+"""The terms of the race test: its rules, its memory of a machine in good order, its verdict and evidence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from daqsvc.dsp.quality import UnfitError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
     from numpy.typing import NDArray
+
+    Complex = NDArray[np.complex128]
+
 
 Part = Literal["inner", "outer", "ball"]
 RaceWord = Literal["normal", "changed", "inner", "outer", "ball", "inner_or_outer"]
@@ -130,3 +137,154 @@ class RaceVerdict:
     both: bool = False
     repairs: tuple[str, ...] = ()
     spectrum: EnvelopeSpectrum | None = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class RaceRules:
+    """Settings of the race test; the defaults are what the documentation's table was measured with.
+
+    Attributes:
+        low_hz: where the analysed band begins: above the shaft's harmonics, below most resonances.
+        high_hz: where it ends, if the sample rate allows.
+        whitening_hz: width of the local median amplitude of the whitening.
+        speed_tolerance: how far the shaft may be from the stated speed, as a share.
+        slip: how far the fault orders may be from the stated ones, as a share.
+        z_limit: significance from which a part may be named.
+        z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
+        strong_z: significance from which a part that cannot be named keeps a weaker one from being named.
+        regular_z: significance that no noise has, from which lines too small for damage are told.
+        regular_doubt: least belief in damage with such lines.
+        severity_limit: of a race; ``z`` times ``depth``.
+        ball_severity_limit: of a ball.
+        unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
+        unseen_ball_caution: the same for a ball: at a wrong speed it is a ball that races are most taken for.
+        elsewhere_ball_caution: the same where harmonics speak for another speed instead.
+        depth_limit: least size of a race's lines.
+        ball_depth_limit: least size of a ball's lines.
+        steadiness_limit: least steadiness of a race's lines.
+        steady_z: significance in 75 revolutions that many strikes reach and some knocks do not; beyond it the
+            limit of steadiness falls in proportion.
+        ball_weight: what a ball's severity counts against a race's.
+        group_factor: parts whose weights are within this factor cannot be told apart.
+        both_factor: factor by which both races must pass their limits, each by lines that the other does not
+            explain, for both to be called damaged.
+        unresolved_bins: lines closer to a harmonic of the shaft, in bins, are not resolved from it.
+        ball_testable_bins: the same for a ball, below which it is not tested at all.
+        smear_share: distance of a line from a harmonic of the shaft, as a share of its order, up to which
+            that harmonic may be smeared as far.
+        smear_mirrored: power beyond that harmonic over the line's, from which on it is such a smear.
+        changed_db: change of the whole level that makes a record "changed" against a baseline.
+        changed_band_db: the same of one octave band.
+        changed_ease: share of the limit of severity that suffices where the level has changed and the part's
+            lines have grown.
+        changed_growth: growth of size over the baseline that counts as grown.
+        z_growth: growth of significance over the baseline that counts as grown.
+        line_growth: growth of size that a line needs which was significant in the baseline already.
+    """
+
+    low_hz: float = 400.0
+    high_hz: float = 20_000.0
+    whitening_hz: float = 30.0
+    speed_tolerance: float = 0.012
+    slip: float = 0.015
+    z_limit: float = 5.0
+    z_unresolved: float = 1.5
+    strong_z: float = 8.0
+    regular_z: float = 9.0
+    regular_doubt: float = 0.1
+    severity_limit: float = 3.0
+    ball_severity_limit: float = 2.2
+    unseen_caution: float = 2.0
+    unseen_ball_caution: float = 3.5
+    elsewhere_ball_caution: float = 4.5
+    depth_limit: float = 0.12
+    ball_depth_limit: float = 0.20
+    steadiness_limit: float = 0.30
+    steady_z: float = 20.0
+    ball_weight: float = 0.6
+    group_factor: float = 1.15
+    both_factor: float = 1.2
+    unresolved_bins: float = 4.0
+    ball_testable_bins: float = 2.5
+    smear_share: float = 0.02
+    smear_mirrored: float = 0.25
+    changed_db: float = 2.0
+    changed_band_db: float = 3.0
+    changed_ease: float = 0.5
+    changed_growth: float = 1.8
+    z_growth: float = 4.0
+    line_growth: float = 1.3
+
+
+UNIT_DB = 15.0
+SAME_DB = 1.5
+LEAST_POWER = 1e-300
+FIRST_EDGE_HZ = 400.0
+TOP_SHARE = 0.48
+"""Of the sample rate: anti-aliasing filters have their edge about here."""
+
+
+@dataclass(frozen=True, slots=True)
+class BandLevels:
+    """Mean square of a channel in octave bands above 400 Hz.
+
+    Attributes:
+        edges_hz: band limits, ``[bands + 1]``.
+        power: mean square in each, in the channel's unit squared, ``[bands]``.
+    """
+
+    edges_hz: tuple[float, ...]
+    power: tuple[float, ...]
+
+    def change_db(self, before: BandLevels) -> tuple[float, float]:
+        """Change since ``before`` of the whole and of the band that changed most, in dB.
+
+        Only bands that both have are compared, so the two may differ in sample rate.
+
+        Raises:
+            UnfitError: all bands changed alike and much, as by another unit.
+        """
+        common = min(len(self.power), len(before.power))
+        now = np.maximum(self.power[:common], LEAST_POWER)
+        then = np.maximum(before.power[:common], LEAST_POWER)
+        bands = 10.0 * np.log10(now / then)
+        whole = float(10.0 * np.log10(now.sum() / then.sum()))
+        if common > 1 and abs(whole) > UNIT_DB and np.ptp(bands) < SAME_DB:
+            raise UnfitError(
+                "unit",
+                f"differs from the baseline's: all bands changed by {whole:+.1f} dB alike",
+                "give both recordings in the same unit",
+            )
+        return whole, float(bands[np.argmax(np.abs(bands))])
+
+
+@dataclass(frozen=True, slots=True)
+class RaceBaseline:
+    """Evidence and level of the same bearing in good order, at about the same speed; see `race_baseline`.
+
+    Attributes:
+        evidence: what spoke for each part although it was in good order.
+        levels: mean square in octave bands.
+        speed_rpm: of the shaft.
+    """
+
+    evidence: Mapping[Part, PartEvidence]
+    levels: BandLevels
+    speed_rpm: float
+
+
+def band_levels(spectrum: Complex, samples: int, rate_hz: float) -> BandLevels:
+    """Mean square in the octave bands above 400 Hz that end below 0.48 of the sample rate.
+
+    Args:
+        spectrum: one-sided spectrum of the signal, unwindowed.
+        samples: length of the signal.
+        rate_hz: its sample rate.
+    """
+    edges = [FIRST_EDGE_HZ]
+    while 2.0 * edges[-1] <= TOP_SHARE * rate_hz:
+        edges.append(2.0 * edges[-1])
+    places = [round(edge * samples / rate_hz) for edge in edges]
+    squares = spectrum.real**2 + spectrum.imag**2
+    power = [2.0 * float(squares[low:high].sum()) / samples**2 for low, high in pairwise(places)]
+    return BandLevels(tuple(edges), tuple(power))

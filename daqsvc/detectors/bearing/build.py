@@ -6,9 +6,9 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING
 
+from daqsvc.bearing.baseline import BaselineFileError, load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.geometry import BearingOrders, bearing_orders
-from daqsvc.bearing.identify_change import ChangeRules
-from daqsvc.bearing.identify_file import BaselineFileError, load_bearing_baseline, save_bearing_baseline
+from daqsvc.bearing.identify import ChangeRules
 from daqsvc.bearing.isolation import least_rate_hz
 from daqsvc.bearing.model import BearingParameters
 from daqsvc.bearing.two_sensors import PairModel, TwoSensorMonitor
@@ -23,7 +23,7 @@ from daqsvc.settings.models import Keyphasor
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.detectors.bearing.settings import Bearing, WatchedBearing
     from daqsvc.settings.models import MachineFile
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.identify_baseline import learn_baseline, resampled
+from daqsvc.bearing.baseline import learn_baseline, resampled
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.build import SAME_RATE, orders_of, pair_models
 from daqsvc.detectors.bearing.recorded_checks import against_healthy_run
@@ -17,8 +17,8 @@ from daqsvc.dsp.quality.clipped import refuse_clipped
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.bearing.geometry import BearingOrders
-    from daqsvc.bearing.identify_baseline import BearingBaseline
     from daqsvc.bearing.two_sensors import PairModel
     from daqsvc.detectors.bearing.settings import Bearing
     from daqsvc.detectors.bearing.verdict import BearingSetup

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daqsvc.bearing.identify_change import ChangeRules, compare_residual
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.watch import WINDOW_S, RaceWatch
+from daqsvc.bearing.identify import ChangeRules, compare_residual
+from daqsvc.bearing.race.judge import WINDOW_S, RaceWatch
+from daqsvc.bearing.race.verdict import RaceRules
 from daqsvc.detectors.bearing.direction import Direction, RaceDirection
 from daqsvc.detectors.bearing.evaluation import (
     LARGE,
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
-    from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.bearing.baseline import BearingBaseline
+    from daqsvc.bearing.identify import ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.housed import HousedBearing
     from daqsvc.diagnosis.detector import Window

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.identify_change import ChangeRules
+    from daqsvc.bearing.identify import ChangeRules
     from daqsvc.bearing.race.verdict import Part
     from daqsvc.bearing.two_sensors import HealthyPair, PairModel
 

@@ -12,7 +12,7 @@ from daqsvc.bearing.race.verdict import PARTS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.bearing.identify import ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict
     from daqsvc.detectors.bearing.direction import Direction
     from daqsvc.detectors.bearing.finding import BearingFinding

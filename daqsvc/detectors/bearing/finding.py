@@ -20,7 +20,7 @@ from daqsvc.bearing.race.verdict import PARTS, RaceVerdict, RaceWord
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from daqsvc.bearing.identify_change import ResidualChange
+    from daqsvc.bearing.identify import ResidualChange
     from daqsvc.detectors.bearing.direction import Direction
 
 BearingWord = RaceWord

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daqsvc.bearing.baseline import learn_baseline
 from daqsvc.bearing.identify import NotIdentifiableError
-from daqsvc.bearing.identify_baseline import learn_baseline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.detectors.bearing.finding import BearingFinding
     from daqsvc.detectors.bearing.housed import HousedBearing
 

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.bearing.identify import NotIdentifiableError
-from daqsvc.bearing.identify_change import ChangeRules, compare_residual
-from daqsvc.bearing.identify_file import load_bearing_baseline
+from daqsvc.bearing.baseline import load_bearing_baseline
+from daqsvc.bearing.identify import ChangeRules, NotIdentifiableError, compare_residual
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.build import bearing_detector, orders_of
 from daqsvc.detectors.bearing.calibrating import HealthyRun
@@ -44,8 +43,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
-    from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
+    from daqsvc.bearing.baseline import BearingBaseline
+    from daqsvc.bearing.identify import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
     from daqsvc.detectors.bearing.detector import BearingDetector
     from daqsvc.detectors.bearing.evaluation import Evaluation

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from daqsvc.bearing.identify_change import ChangeRules
-from daqsvc.bearing.race.rules import RaceRules
-from daqsvc.bearing.race.verdict import PARTS
+from daqsvc.bearing.identify import ChangeRules
+from daqsvc.bearing.race.verdict import PARTS, RaceRules
 from daqsvc.detectors.bearing.finding import WORDS, severity_of
 from daqsvc.diagnosis.recorded import Verdict, finite
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.bearing.geometry import BearingOrders
-    from daqsvc.bearing.identify_change import HealthyResidual, ResidualChange
+    from daqsvc.bearing.identify import HealthyResidual, ResidualChange
     from daqsvc.bearing.race.verdict import RaceLine, RaceVerdict
     from daqsvc.detectors.bearing.finding import BearingFinding
     from daqsvc.dsp.quality.unit import AccelerationUnit

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.calibration.run_up_fit import RunUpFit
+    from daqsvc.rotor.calibration.run_up import RunUpFit
 
     Floats = NDArray[np.float64]
 

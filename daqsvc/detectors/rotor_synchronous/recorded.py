@@ -51,8 +51,7 @@ if TYPE_CHECKING:
     from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
     from daqsvc.dsp.quality.unit import LengthUnit
     from daqsvc.recording.recording import Recording
-    from daqsvc.rotor.synchronous.identify import Identification
-    from daqsvc.rotor.synchronous.signatures import RotorFault
+    from daqsvc.rotor.synchronous.signatures import Identification, RotorFault
     from daqsvc.rotor.synchronous.watch import WatchReport
     from daqsvc.settings.models import Keyphasor, MachineFile, ProximityProbe
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from daqsvc.dsp.quality import Quality
     from daqsvc.dsp.quality.probes import RevolutionQuality
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.signatures import Identification
     from daqsvc.rotor.synchronous.watch import WatchReport, WatchRules
 
     Complexes = NDArray[np.complex128]

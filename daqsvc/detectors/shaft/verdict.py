@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.rotor.synchronous.identify import Identification
+    from daqsvc.rotor.synchronous.signatures import Identification
     from daqsvc.rotor.synchronous.vectors import SynchronousVectors
     from daqsvc.rotor.synchronous.watch import WatchReport
 

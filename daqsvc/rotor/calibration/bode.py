@@ -8,7 +8,7 @@ shaft's runout and the response of modes far above:
 
 That is the response at steady speeds. A run-up that passes a lightly damped critical speed rings after it; if
 the vectors are those of a sweep with a known acceleration, each mode's response is computed along the sweep
-instead (`daqsvc.rotor.calibration.chirp`), ringing and late peak included.
+instead (`daqsvc.rotor.calibration.run_up`), ringing and late peak included.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import least_squares
 
-from daqsvc.rotor.calibration.chirp import forcing_of, whirl_by_unbalance
+from daqsvc.rotor.calibration.run_up import forcing_of, whirl_by_unbalance
 from daqsvc.rotor.laval import unbalance_response
 from daqsvc.rotor.synchronous.baseline import NotCalibratableError
 
@@ -170,21 +170,21 @@ def _fit(speed_rpm: Floats, vectors: Complexes, response: Response, count: int) 
     starts.sort(key=lambda logs: float(np.sum(residual(logs) ** 2)))
     margin = math.log(1.2)
     bounds = ([lowest - margin, math.log(1e-3)] * count, [highest + margin, math.log(0.9)] * count)
-    found = min(
+    best = min(
         (
             least_squares(residual, logs, bounds=bounds, x_scale=[0.01, 0.2] * count, max_nfev=60)
             for logs in starts[:3]
         ),
         key=lambda result: float(result.cost),
     )
-    table = columns(found.x)
+    table = columns(best.x)
     linear = np.linalg.lstsq(table, vectors, rcond=None)[0]
     fitted = np.asarray(table @ linear)
-    order = np.argsort(found.x[::2])
+    order = np.argsort(best.x[::2])
     ratio = fitted / vectors
     return BodeFit(
-        critical_speeds_rpm=tuple((np.exp(found.x[::2]) * 30.0 / math.pi)[order].tolist()),
-        damping_ratios=tuple(np.exp(found.x[1::2])[order].tolist()),
+        critical_speeds_rpm=tuple((np.exp(best.x[::2]) * 30.0 / math.pi)[order].tolist()),
+        damping_ratios=tuple(np.exp(best.x[1::2])[order].tolist()),
         gains=tuple(linear[:-1][order].tolist()),
         runout=complex(linear[-1]),
         fitted=fitted,

@@ -8,28 +8,36 @@ speed that changes; phi is theta, omega_s and zeta are those of the shaft):
 
 Eccentricity e, centre c and the transient at the start are linear and are solved for at every omega_s and
 zeta (variable projection: Golub and Pereyra 1973); only these two are searched.
+
+The right-hand side is -e d^2/dt^2 exp(i theta), so the response is that of the transfer function -s^2 / (s^2
++ 2 zeta omega_s s + omega_s^2) to e exp(i theta), and the angle need not be differentiated.
+
+What follows from the fit for other speeds is in `RunUpFit`.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter
 
 from daqsvc.dsp.speed.revolutions import Revolutions
-from daqsvc.rotor.calibration.chirp import Chirp
-from daqsvc.rotor.calibration.run_up_fit import RunUpFit
-from daqsvc.rotor.laval import unbalance_response
+from daqsvc.rotor.laval import LavalRotor, unbalance_response
 from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS, NotCalibratableError
 from daqsvc.rotor.synchronous.vectors import HARMONICS, SynchronousVectors, synchronous_vectors
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
+
 
 LEAST_SPEED_RATIO = 1.1
 """Highest over lowest speed from which on a recording is a run-up or a coast-down."""
@@ -156,11 +164,11 @@ def _search(model: Chirp, starts: list[tuple[float, float]]) -> tuple[float, flo
             [math.log(omega / 2.0), math.log(_LEAST_DAMPING)],
             [math.log(omega * 2.0), math.log(_MOST_DAMPING)],
         )
-        found = least_squares(
+        fit = least_squares(
             residual, [math.log(omega), math.log(zeta)], bounds=bounds, x_scale=[0.01, 0.1], xtol=1e-7
         )
-        if found.cost < best_cost:
-            best_cost, best = found.cost, (math.exp(found.x[0]), math.exp(found.x[1]))
+        if fit.cost < best_cost:
+            best_cost, best = fit.cost, (math.exp(fit.x[0]), math.exp(fit.x[1]))
     return best
 
 
@@ -242,13 +250,234 @@ def _refuse_unseen(omega: float, covariance: Floats, speed_range_rpm: tuple[floa
     """Refuse figures that the speeds do not show."""
     low, high = speed_range_rpm
     critical_rpm = omega * 30.0 / math.pi
-    for what, doubt, most in (
+    for what, uncertain, most in (
         ("natural frequency", math.sqrt(covariance[0, 0]), _MOST_FREQUENCY_DOUBT),
         ("damping ratio", math.sqrt(covariance[1, 1]), _MOST_DAMPING_DOUBT),
     ):
-        if not doubt <= most:
+        if not uncertain <= most:
             raise NotCalibratableError(
                 f"the run-up from {low:.0f} to {high:.0f} rpm does not show the {what} (uncertain by "
-                f"{100.0 * doubt:.0f} %, at most {100.0 * most:.0f} %; the best guess of the critical speed "
-                f"is {critical_rpm:.0f} rpm); record a run-up that passes the critical speed"
+                f"{100.0 * uncertain:.0f} %, at most {100.0 * most:.0f} %; the best guess of the critical "
+                f"speed is {critical_rpm:.0f} rpm); record a run-up that passes the critical speed"
             )
+
+
+LAVAL_LIMIT = 0.05
+"""Fit error, and backward over forward 1X, up to which a machine counts as a Laval rotor."""
+
+_ROTOR_TOLERANCE = 0.02
+"""What a fitted rotor may still be off at best: independent rotor codes agree to that."""
+_GENERIC_TOLERANCE = 0.2
+"""The same where the machine is no Laval rotor, and the figures only name the nearest one."""
+
+
+class NotLavalError(ValueError):
+    """The machine is no Laval rotor, so nothing follows from one speed for another."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunUpFit:
+    """A Laval rotor fitted to a run-up or a coast-down. Uncertainties are standard deviations.
+
+    Attributes:
+        natural_frequency_hz: undamped natural frequency omega_s / 2 pi.
+        damping_ratio: zeta.
+        eccentricity_um: complex mass eccentricity e; its argument is the heavy spot's angle from the mark.
+        centre_um: where the shaft runs at standstill of the whirl, c; sag and the probes' zero are in it.
+        covariance: float64 ``[4, 4]`` of ln f, ln zeta, and real and imaginary part of ln e.
+        centre_uncertainty_um: of each coordinate of ``centre_um``.
+        ellipticity: backward over forward whirl, rms over the record, beyond what noise can make of it.
+        noise_um: standard deviation of the noise of one probe's sample.
+        fit_error: rms of what repeats with the shaft and no Laval rotor does, beyond what noise can make of
+            it, over that of the whirl.
+        speed_range_rpm: lowest and highest speed seen.
+        revolutions: in the record.
+    """
+
+    natural_frequency_hz: float
+    damping_ratio: float
+    eccentricity_um: complex
+    centre_um: complex
+    covariance: Floats
+    centre_uncertainty_um: float
+    ellipticity: float
+    noise_um: float
+    fit_error: float
+    speed_range_rpm: tuple[float, float]
+    revolutions: int
+
+    @property
+    def natural_frequency_uncertainty_hz(self) -> float:
+        """Standard deviation of the natural frequency."""
+        return self.natural_frequency_hz * math.sqrt(self.covariance[0, 0])
+
+    @property
+    def damping_uncertainty(self) -> float:
+        """Standard deviation of the damping ratio."""
+        return self.damping_ratio * math.sqrt(self.covariance[1, 1])
+
+    @property
+    def eccentricity_uncertainty_um(self) -> float:
+        """Standard deviation of the eccentricity's modulus."""
+        return abs(self.eccentricity_um) * math.sqrt(self.covariance[2, 2])
+
+    @property
+    def heavy_spot_uncertainty_deg(self) -> float:
+        """Standard deviation of the eccentricity's argument."""
+        return math.degrees(math.sqrt(self.covariance[3, 3]))
+
+    @property
+    def laval(self) -> bool:
+        """Whether one Laval rotor explains the whole record."""
+        return self.fit_error <= LAVAL_LIMIT and self.ellipticity <= LAVAL_LIMIT
+
+    def describe(self) -> str:
+        """The verdict in words."""
+        low, high = self.speed_range_rpm
+        seen = f"from {low:.0f} to {high:.0f} rpm"
+        if self.laval:
+            return (
+                f"one Laval rotor explains the orbit {seen} within {100.0 * self.fit_error:.1f} %: 1X at any "
+                "speed in between follows from it, and loss of damping can be told from unbalance"
+            )
+        limit = f"at most {100.0 * LAVAL_LIMIT:.0f} % each"
+        return (
+            f"no Laval rotor explains the orbit {seen} (unexplained {100.0 * self.fit_error:.0f} %, backward "
+            f"over forward whirl {100.0 * self.ellipticity:.0f} %, {limit}): calibrate at every speed that "
+            "is watched; nothing follows from one speed for another"
+        )
+
+    def rotor(self, *, clearance_um: float | None = None, static_sag_um: float | None = None) -> LavalRotor:
+        """What is known about the rotor from now on; with wide tolerances if it is no Laval rotor."""
+        least = _ROTOR_TOLERANCE if self.laval else _GENERIC_TOLERANCE
+        frequency, damping = (2.0 * math.sqrt(self.covariance[i, i]) for i in (0, 1))
+        return LavalRotor(
+            natural_frequency_hz=self.natural_frequency_hz,
+            damping_ratio=self.damping_ratio,
+            natural_frequency_tolerance=min(0.9, max(least, frequency)),
+            damping_tolerance=min(0.9, max(least, damping)),
+            clearance_um=clearance_um,
+            static_sag_um=static_sag_um,
+        )
+
+    def predict(self, speed_rpm: float) -> tuple[complex, float]:
+        """1X vector at a steady speed.
+
+        Args:
+            speed_rpm: shaft speed, in the direction of the run-up.
+
+        Returns:
+            The forward 1X vector in um, and the standard deviation of it, in um.
+
+        Raises:
+            NotLavalError: the machine is no Laval rotor.
+            ValueError: a speed outside of those seen.
+        """
+        if not self.laval:
+            raise NotLavalError(
+                f"1X at {speed_rpm:.0f} rpm cannot be predicted: the machine is no Laval rotor (the run-up "
+                f"fits within {100.0 * self.fit_error:.0f} %, backward over forward whirl is "
+                f"{100.0 * self.ellipticity:.0f} %, at most {100.0 * LAVAL_LIMIT:.0f} % each); record it at "
+                "that speed"
+            )
+        low, high = self.speed_range_rpm
+        if not low <= speed_rpm <= high:
+            raise ValueError(
+                f"1X at {speed_rpm:.0f} rpm cannot be predicted: the run-up went from {low:.0f} to "
+                f"{high:.0f} rpm; give a speed in between"
+            )
+        ratio = speed_rpm / 60.0 / self.natural_frequency_hz
+        vector = complex(self.eccentricity_um * unbalance_response(ratio, self.damping_ratio))
+        step = 1e-5
+        moved = np.array(
+            [
+                unbalance_response(ratio / (1.0 + step), self.damping_ratio),
+                unbalance_response(ratio, self.damping_ratio * (1.0 + step)),
+            ]
+        )
+        here = unbalance_response(ratio, self.damping_ratio)
+        slope = np.concatenate(((moved / here - 1.0) / step, [1.0, 1j]))
+        variance = float((slope.conj() @ self.covariance @ slope).real)
+        return vector, abs(vector) * math.sqrt(max(variance, 0.0))
+
+
+def forcing_of(angle_rad: Floats) -> Complexes:
+    """What drives a rotor sampled at this angle, complex128 ``[n]``, so that ramps between samples are exact.
+
+    Ramps between the samples of a turning vector pass sinc^2 of its turns in a step; the rest are images at
+    the sampling rate, which a rotor does not follow.
+
+    Args:
+        angle_rad: float64 ``[n]``, unwrapped.
+    """
+    return np.asarray(np.exp(1j * angle_rad) / np.sinc(np.gradient(angle_rad) / math.tau) ** 2)
+
+
+def whirl_by_unbalance(
+    forcing: Complexes, angle_rad: Floats, step_s: float, omega: float, zeta: float
+) -> Complexes:
+    """Motion of a rotor at rest to unit eccentricity that turns with the angle, complex128 ``[n]``.
+
+    Args:
+        forcing: `forcing_of` the angle.
+        angle_rad: float64 ``[n]``, unwrapped.
+        step_s: time between samples.
+        omega: natural frequency in rad/s.
+        zeta: damping ratio.
+    """
+    damping = 2.0 * zeta * omega
+    numerator, denominator, _ = cont2discrete(
+        (np.array([damping, omega**2]), np.array([1.0, damping, omega**2])), step_s, method="foh"
+    )
+    return np.asarray(lfilter(numerator.ravel(), denominator, forcing) - np.exp(1j * angle_rad))
+
+
+class Chirp:
+    """The record, and a Laval rotor's response to its shaft angle.
+
+    Args:
+        z: complex128 ``[n]``, the orbit in um.
+        angle_rad: float64 ``[n]``.
+        rate_hz: samples per second.
+        averaged: samples that are averaged, in the record and in the model alike.
+    """
+
+    def __init__(self, z: Complexes, angle_rad: Floats, rate_hz: float, averaged: int) -> None:
+        self._step_s = 1.0 / rate_hz
+        self._averaged = averaged
+        self._length = len(z) // averaged * averaged
+        self._time_s = np.arange(len(z)) * self._step_s
+        self._angle_rad = angle_rad
+        self._forcing = forcing_of(angle_rad)
+        self._recorded = z
+        seen = self._mean(z)
+        self._there = np.isfinite(seen)
+        self._seen = seen[self._there]
+
+    def _mean(self, values: Complexes) -> Complexes:
+        return np.asarray(values[: self._length].reshape(-1, self._averaged).mean(axis=1))
+
+    def columns(self, omega: float, zeta: float) -> Complexes:
+        """Complex128 ``[m, 4]``: response to unit eccentricity, unit centre, and the two free motions."""
+        forced, *free = (self._mean(column)[self._there] for column in self._motions(omega, zeta))
+        return np.column_stack((forced, np.ones(len(forced)), *free))
+
+    def _motions(self, omega: float, zeta: float) -> Iterator[Complexes]:
+        """Response to unit eccentricity and the two free motions, complex128 ``[n]`` each."""
+        yield whirl_by_unbalance(self._forcing, self._angle_rad, self._step_s, omega, zeta)
+        pole = omega * complex(-zeta, math.sqrt(1.0 - zeta**2))
+        yield np.exp(pole * self._time_s)
+        yield np.exp(pole.conjugate() * self._time_s)
+
+    def solve(self, omega: float, zeta: float) -> tuple[Complexes, Complexes, Complexes]:
+        """Best linear parameters complex128 ``[4]``, residual ``[m]`` and columns ``[m, 4]``."""
+        columns = self.columns(omega, zeta)
+        linear: Complexes = np.asarray(np.linalg.lstsq(columns, self._seen, rcond=1e-10)[0], np.complex128)
+        return linear, self._seen - columns @ linear, columns
+
+    def split(self, omega: float, zeta: float, linear: Complexes) -> tuple[Complexes, Complexes]:
+        """The record as the whirl by unbalance and what the model leaves of it, complex128 ``[n]`` each."""
+        forced, *free = self._motions(omega, zeta)
+        whirl = linear[0] * forced
+        left = self._recorded - whirl - linear[1] - linear[2] * free[0] - linear[3] * free[1]
+        return whirl, left

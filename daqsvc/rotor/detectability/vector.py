@@ -18,10 +18,9 @@ import numpy as np
 from daqsvc.rotor.laval import compliance, unbalance_response
 from daqsvc.rotor.synchronous.baseline import Calibration
 from daqsvc.rotor.synchronous.departure import WINDOWS
-from daqsvc.rotor.synchronous.healthy import DC, FORWARD
-from daqsvc.rotor.synchronous.identify import NamingRules
-from daqsvc.rotor.synchronous.signatures import damping_misfit
+from daqsvc.rotor.synchronous.signatures import NamingRules, damping_misfit
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN
+from daqsvc.rotor.synchronous.vectors import DC, FORWARD
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -181,7 +180,7 @@ def vector_detectability(
     misfit = _misfit(calibration, calibration.speed_rpm)
     nearest = sorted(_SPEEDS, key=lambda part: abs(part - 1.0))
     opens = (part for part in nearest if _misfit(calibration, part * calibration.speed_rpm) >= margin)
-    found = None if misfit >= margin else next(opens, None)
+    opens_at = None if misfit >= margin else next(opens, None)
 
     def evidence(change: Complexes, variance: Floats) -> float:
         return float(np.sum(np.abs(change) ** 2 / variance))
@@ -214,7 +213,7 @@ def vector_detectability(
         faults=tuple(visible(kind) for kind in _KINDS),
         misfit_nats=misfit,
         margin_nats=margin,
-        opens_at_rpm=None if found is None else float(found) * calibration.speed_rpm,
+        opens_at_rpm=None if opens_at is None else float(opens_at) * calibration.speed_rpm,
     )
 
 

@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
-from daqsvc.rotor.synchronous.departure import Spread
-from daqsvc.rotor.synchronous.healthy import Healthy
-from daqsvc.rotor.synchronous.steadiness import (
-    UNREST_NATS,
+from daqsvc.rotor.synchronous.departure import (
+    NONSTATIONARITY_NATS,
     VECTOR_NATS,
-    most_restless_stretch,
+    Spread,
+    least_stationary_stretch,
     nonstationarity,
     oddest_stretch,
     turn_per_revolution,
 )
-from daqsvc.rotor.synchronous.vectors import HARMONICS
+from daqsvc.rotor.synchronous.vectors import HARMONICS, Healthy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,7 +42,7 @@ _EDGE_SAMPLES = 0.29
 """A keyphasor's edge may lie anywhere between two samples: a sharp one is not interpolated."""
 _TURNING_LEAVES = 0.1
 """Part of 1X that may still move where turning is what it is."""
-_LEAST_UNREST = 0.15
+_LEAST_NONSTATIONARITY = 0.15
 """Relative change of what does not repeat that is worth a refusal."""
 _LAVAL_ELLIPTICITY = 0.05
 _REVERSED = 2.0
@@ -153,9 +152,9 @@ class Calibration:
 
     def describe(self) -> str:
         """The verdict in words: what the model of this machine can and cannot separate."""
-        said = []
+        sentences = []
         if self.laval:
-            said.append(
+            sentences.append(
                 f"behaves like a Laval rotor as far as was seen (backward over forward 1X "
                 f"{100.0 * self.ellipticity:.1f} %)"
             )
@@ -168,20 +167,20 @@ class Calibration:
                 if self.implausible
                 else f"backward over forward 1X is {100.0 * self.ellipticity:.0f} %"
             )
-            said.append(
+            sentences.append(
                 f"is no Laval rotor ({why}): generic mode, in which rub and unmodelled changes stay one group"
             )
         smallest_um = self.smallest_change_um
-        said.append(
+        sentences.append(
             f"after {self.revolutions} revolutions the smallest change that can be seen is "
             f"{smallest_um:.2g} um, {100.0 * smallest_um / max(self.amplitude_um, 1e-12):.1f} % of 1X"
         )
         if self.rotor.natural_frequency_tolerance > 0.05 or self.fit_error is None:
-            said.append(
+            sentences.append(
                 "without a run-up, unbalance and loss of damping are one group unless the steady orbit "
                 "excludes one of them"
             )
-        return "; ".join(said)
+        return "; ".join(sentences)
 
 
 def compensated(
@@ -233,12 +232,12 @@ def calibrate(
     white = noise / samples
     variance = _long_run_variance(moved, white, _memory(rotor, speed_rad_s))
     _refuse_no_orbit(vectors.vectors, white)
-    restless = nonstationarity(
+    nonstationary = nonstationarity(
         moved, np.maximum(vectors.noise, (_NOISE_FLOOR * amplitude) ** 2), vectors.samples, baseline
     )
     _refuse_unsteady(moved, white, rotor, speed_rad_s, deviation, samples, assumed=angle_assumed)
-    _refuse_restless(restless, samples, 0.0 if angle_assumed else amplitude * math.pi / samples)
-    relative = restless / restless.mean()
+    _refuse_nonstationary(nonstationary, samples, 0.0 if angle_assumed else amplitude * math.pi / samples)
+    relative = nonstationary / nonstationary.mean()
     freedom = 1.0 / max(samples - 5.0, 1.0)
     return Calibration(
         rotor=rotor,
@@ -246,7 +245,7 @@ def calibrate(
         revolutions=count,
         baseline=baseline,
         variance=variance,
-        noise=float(restless.mean()),
+        noise=float(nonstationary.mean()),
         noise_variance=max(freedom, float(relative.var(ddof=1))),
         samples_per_rev=samples,
     )
@@ -347,22 +346,25 @@ def _refuse_unsteady(
     )
 
 
-def _refuse_restless(values: Floats, samples: float, jitter_um: float) -> None:
+def _refuse_nonstationary(values: Floats, samples: float, jitter_um: float) -> None:
     """Whether what does not repeat with the shaft comes or goes.
 
     Args:
-        values: float64 ``[R]``, unrest of every revolution, um^2.
+        values: float64 ``[R]``, nonstationarity of every revolution, um^2.
         samples: samples in a revolution.
         jitter_um: what half a sample of doubt about the marks makes of the whirl.
     """
-    restless = most_restless_stretch(values, samples)
+    stretch = least_stationary_stretch(values, samples)
     usual = math.sqrt(float(np.median(values)) / 2.0)
-    if restless.nats <= UNREST_NATS or abs(restless.by / max(usual, 1e-300) - 1.0) < _LEAST_UNREST:
+    if (
+        stretch.nats <= NONSTATIONARITY_NATS
+        or abs(stretch.by / max(usual, 1e-300) - 1.0) < _LEAST_NONSTATIONARITY
+    ):
         return
-    if abs(restless.by**2 - usual**2) < jitter_um**2:
+    if abs(stretch.by**2 - usual**2) < jitter_um**2:
         return
     raise NotCalibratableError(
-        f"not steady: noise and whirl that do not repeat with the shaft are {restless.by:.3g} um in "
-        f"revolutions {restless.begin + 1} to {restless.end} of {len(values)}, else {usual:.3g} um; "
+        f"not steady: noise and whirl that do not repeat with the shaft are {stretch.by:.3g} um in "
+        f"revolutions {stretch.begin + 1} to {stretch.end} of {len(values)}, else {usual:.3g} um; "
         "calibrate where the machine runs steadily and is healthy"
     )

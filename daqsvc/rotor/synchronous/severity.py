@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.synchronous.pulses import likeliest_touch
+from daqsvc.rotor.synchronous.signatures import likeliest_touch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.rotor.synchronous.identify import Identification
-    from daqsvc.rotor.synchronous.signatures import RotorFault
+    from daqsvc.rotor.synchronous.signatures import Identification, RotorFault
 
 _DAMPING_LEFT = (0.01, 1.0, 400)
 

@@ -10,34 +10,43 @@ rotor's parameters are averaged over, so that a flexible hypothesis pays for its
 * rub: a pulse once a revolution, directed inwards where the orbit comes nearest to the wall, passed through
   the rotor; or an orbit that fills the clearance.
 * unmodelled: any components, each by itself. It pays `UNMODELLED_NATS` for explaining everything.
+
+The pulses of rub and crack, and the name or group of names that the likelihoods come to (`identify`), follow.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from daqsvc.rotor.laval import unbalance_response
-from daqsvc.rotor.synchronous.healthy import (
+from daqsvc.rotor.laval import compliance, unbalance_response
+from daqsvc.rotor.synchronous.vectors import (
     BACKWARD,
     DC,
     FORWARD,
+    HARMONICS,
     SPREADS,
     Healthy,
     density,
     log_density,
     log_mean,
 )
-from daqsvc.rotor.synchronous.pulses import crack, rub_pulse
-from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from numpy.typing import NDArray
+
+    from daqsvc.rotor.synchronous.baseline import Calibration
+    from daqsvc.rotor.synchronous.transient import Comparison
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
 
 RotorFault: TypeAlias = Literal[
     "normal",
@@ -241,3 +250,298 @@ def _unmodelled(change: Complexes, variance: Floats, healthy: Healthy) -> float:
     for k in range(len(change)):
         total += np.logaddexp(still[k], _free(change[k], variance[k], healthy.amplitude_um)) - math.log(2.0)
     return float(total)
+
+
+_PULSE_WIDTHS = np.array([0.3, 0.6, 1.0])
+_ANGLES = 2.0 * math.pi * np.arange(24) / 24.0
+"""Angles of the shaft at which it may touch, or at which a crack may lie."""
+_RUB_TOLERANCES = np.array([0.2, 0.4, 0.7])
+_CRACK_TOLERANCES = np.array([0.1, 0.2, 0.4])
+_CRACK_FACING = 0.85
+_RUB_FACING = 0.5
+_RUB_OUTWARDS = 0.2
+
+
+def rub_pulse(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """A pulse of force at one angle of the shaft, inwards, through the rotor's compliance."""
+    order = np.array(HARMONICS)
+    turning = np.exp(1j * np.outer(_ANGLES, order))
+    whirl = turning[:, 1:] @ healthy.baseline[1:]
+    place = whirl + healthy.baseline[DC]
+
+    def possible(force: Complexes) -> Flags:
+        # The wall is where the whirl leads to, and not behind the centre: a crack pulls the other way.
+        return (_facing(-force, whirl) > _RUB_FACING) & (_facing(-force, place) > _RUB_OUTWARDS)
+
+    return _shaped(change, variance, healthy, _pulses(healthy), _RUB_TOLERANCES, possible)
+
+
+def likeliest_touch(change: Complexes, healthy: Healthy) -> tuple[float, float]:
+    """Force of a rub over the shaft's stiffness, in um, and the shaft angle where it touches, in rad.
+
+    Of all pulses the one that explains the change best, whichever way it points.
+    """
+    shape = _pulses(healthy)
+    scale = (shape.conj() * change).sum(axis=-1) / (np.abs(shape) ** 2).sum(axis=-1)
+    explained = np.abs(scale) ** 2 * (np.abs(shape) ** 2).sum(axis=-1)
+    best = np.unravel_index(int(explained.argmax()), explained.shape)
+    return float(abs(scale[best])), float(_ANGLES[best[2]])
+
+
+def crack(change: Complexes, variance: Floats, healthy: Healthy) -> float:
+    """A shaft that a crack makes softer once a revolution, when its weight opens it.
+
+    Two shapes, equally likely: the lost restoring force lies along the crack and turns with it (Mayes and
+    Davies 1984; the hinge of Gasch 1976), or it is a pulse along the sag, as a finite-element model of a
+    crack between bearings gives it. A rub pushes the other way.
+    """
+    order = np.array(HARMONICS)
+    theta = 2.0 * math.pi * np.arange(32) / 32.0
+    direction = np.exp(1j * (theta + _ANGLES[:, np.newaxis]))
+    deflection = np.exp(1j * np.outer(theta, order[1:])) @ healthy.baseline[1:] - 1j * healthy.rotor.sag_um
+    down = -direction.imag  # cosine of the angle between crack and gravity
+    breathing = np.stack([(1.0 + down) / 2.0, (1.0 + np.sign(down)) / 2.0])
+    force = breathing * (deflection * direction.conj()).real * direction
+    spectrum = force @ np.exp(-1j * np.outer(theta, order)) / len(theta)
+    turning = _shaped(
+        change,
+        variance,
+        healthy,
+        spectrum[:, np.newaxis] * _passed(healthy),
+        _CRACK_TOLERANCES,
+        lambda loss: loss.real > math.cos(math.pi / 4.0) * np.abs(loss),
+    )
+    along_sag = _shaped(
+        change,
+        variance,
+        healthy,
+        _pulses(healthy),
+        _CRACK_TOLERANCES,
+        lambda loss: -loss.imag > _CRACK_FACING * np.abs(loss),
+    )
+    return float(np.logaddexp(turning, along_sag)) - math.log(2.0)
+
+
+def _pulses(healthy: Healthy) -> Complexes:
+    """Response to a pulse of force in a fixed direction, once a revolution, complex128 ``[W, B, A, 5]``."""
+    order = np.array(HARMONICS)
+    width = np.exp(-((order * _PULSE_WIDTHS[:, np.newaxis]) ** 2) / 2.0)
+    turning = np.exp(1j * np.outer(_ANGLES, order))
+    return np.asarray(width[:, np.newaxis, np.newaxis] * _passed(healthy) * turning.conj())
+
+
+def _passed(healthy: Healthy) -> Complexes:
+    """Compliance to forces at the orders of `HARMONICS`, complex128 ``[B, 1, 5]`` over a coarse box."""
+    omega, zeta = (axis.reshape(5, 5)[::2, ::2].ravel() for axis in healthy.rotor.box)
+    order = np.array(HARMONICS)
+    passed = compliance(order * healthy.speed_rad_s / omega[:, np.newaxis], zeta[:, np.newaxis])
+    return np.asarray(passed[:, np.newaxis])
+
+
+def _shaped(
+    change: Complexes,
+    variance: Floats,
+    healthy: Healthy,
+    shape: Complexes,
+    tolerances: Floats,
+    possible: Callable[[Complexes], Flags],
+) -> float:
+    """Log marginal likelihood of a change of known shape and unknown complex size.
+
+    Args:
+        change: complex128 ``[5]``.
+        variance: float64 ``[5]``.
+        healthy: the machine before.
+        shape: complex128 ``[..., 5]``, shapes, equally likely.
+        tolerances: relative deviations from the shape, equally likely.
+        possible: which of the sizes that fit best can be, complex128 ``[...]`` to bool.
+    """
+    size = np.abs(shape)
+    norm = (size**2).sum(axis=-1)
+    scores = np.full((len(tolerances), len(SPREADS), *norm.shape), -np.inf)
+    for i, tolerance in enumerate(tolerances):
+        spread = variance + (tolerance * np.abs(change)) ** 2
+        for _ in range(2):
+            scale = (shape.conj() * change / spread).sum(axis=-1) / (size**2 / spread).sum(axis=-1)
+            spread = variance + (tolerance * np.abs(scale)[..., np.newaxis] * size) ** 2
+        precision = (size**2 / spread).sum(axis=-1)
+        scale = (shape.conj() * change / spread).sum(axis=-1) / precision
+        residual = change - scale[..., np.newaxis] * shape
+        misfit = (np.abs(residual) ** 2 / spread).sum(axis=-1) + np.log(spread).sum(axis=-1)
+        allowed = possible(scale)
+        for j, part in enumerate(SPREADS):
+            # Integral over the size, normal with this spread: Sherman and Morrison.
+            prior = (part * healthy.amplitude_um) ** 2 / norm
+            occam = np.log1p(prior * precision) + np.abs(scale) ** 2 * precision / (1.0 + prior * precision)
+            scores[i, j] = np.where(allowed, -misfit - occam, -np.inf)
+    return log_mean(scores.ravel())
+
+
+def _facing(force: Complexes, place: Complexes) -> Floats:
+    """Cosine of the angle between two directions."""
+    return np.asarray((force * place.conj()).real / np.maximum(np.abs(force) * np.abs(place), 1e-300))
+
+
+_GENERIC_RUB_MARGIN_NATS = 12.0
+_ENERGY_NATS = 12.0
+_MOST_ENERGY_NATS = 100.0
+_RIVALS = frozenset(("rub", "unmodelled"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamingRules:
+    """Margins of a name.
+
+    Attributes:
+        margin_nats: lead over every other hypothesis that a name takes: odds of 150 to 1.
+        rub_margin_nats: lead of rub over "unmodelled": a crack at half speed looks much like a rub.
+        least_severity: part of the healthy whirl below which a change is small and gets no name.
+    """
+
+    margin_nats: float = 5.0
+    rub_margin_nats: float = 5.0
+    least_severity: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Energy:
+    """What the non-harmonic energy says of a segment.
+
+    Attributes:
+        excess: variance of the complex residual of a sample above the healthy one, um^2.
+        nats: evidence that it is more than chance.
+    """
+
+    excess: float = 0.0
+    nats: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """What a change of the synchronous vector is.
+
+    Attributes:
+        verdict: the name, or the most likely member of the group.
+        group: all that cannot be told apart, the most likely first; the verdict alone if it stands alone.
+        named: whether two looks in a row agreed on the group.
+        evidence: nats of every hypothesis over "normal".
+        probabilities: posterior of every verdict, hypotheses equally likely before.
+        change: complex128 ``[5]``, d in um.
+        severity: size of the change, its non-harmonic energy included, over the healthy whirl's amplitude.
+        excess: variance of a complex sample that does not repeat with the shaft, above the healthy one, um^2.
+        candidates: verdict and group of this look alone.
+    """
+
+    verdict: RotorFault
+    group: tuple[RotorFault, ...]
+    named: bool
+    evidence: Mapping[RotorFault, float]
+    probabilities: Mapping[RotorFault, float]
+    change: Complexes
+    severity: float
+    candidates: tuple[RotorFault, ...] = field(default=())
+    excess: float = 0.0
+
+
+def identify(
+    change: Complexes,
+    variance: Floats,
+    healthy: Calibration,
+    *,
+    previous: Identification | None,
+    rules: NamingRules,
+    may_name: bool = True,
+    comparison: Comparison | None = None,
+    energy: Energy | None = None,
+) -> Identification:
+    """Weigh the hypotheses.
+
+    Args:
+        change: complex128 ``[5]``, mean synchronous vector of the present segment less the baseline, um.
+        variance: float64 ``[5]``, its variance, um^2.
+        healthy: the baseline.
+        previous: the look before; a name takes two that agree.
+        rules: margins.
+        may_name: whether the rotor has settled enough for a name.
+        comparison: what the transient says of unbalance and loss of damping, if it was abrupt.
+        energy: of the present segment; motion that does not repeat with the shaft (whirl, repeated
+            impacts) is what no linear fault makes.
+    """
+    scores = likelihoods(change, variance, healthy.healthy, healthy.baseline + change)
+    model_holds = comparison is not None and comparison.holds(complex(change[1]))
+    if comparison is not None and model_holds:
+        scores["damping_loss"] += min(0.0, comparison.damping_nats)
+        scores["unbalance"] += min(0.0, -comparison.damping_nats)
+    amplitude = healthy.healthy.amplitude_um
+    square = float(np.sum(np.abs(change) ** 2))
+    if (
+        energy is not None
+        and energy.nats > _ENERGY_NATS
+        and energy.excess > (rules.least_severity * amplitude) ** 2
+    ):
+        square += energy.excess
+        unexplained = min(energy.nats, _MOST_ENERGY_NATS)
+        # A rub shakes the rotor besides; but what leaves no mark of a rub on the vector is noise or whirl.
+        explained = {"unmodelled"} if scores["rub"] < rules.margin_nats else {"unmodelled", "rub"}
+        for name in scores.keys() - explained:
+            scores[name] -= unexplained
+    size = math.sqrt(square)
+    # The typical component: that of the mean position may be drift of the probes, or not there at all.
+    deviation = math.sqrt(float(np.median(variance)))
+    best = max(scores, key=lambda name: scores[name])
+    probabilities = _posterior(scores)
+    candidates: tuple[RotorFault, ...]
+    if best != "normal" and size < rules.least_severity * amplitude + 2.0 * deviation:
+        candidates = ("small_change",)
+        probabilities = {"normal": probabilities["normal"], "small_change": 1.0 - probabilities["normal"]}
+    else:
+        candidates = _group(scores, best, healthy, rules)
+    agreed = previous is not None and (
+        set(previous.candidates) == set(candidates)
+        or (model_holds and set(candidates) < set(previous.candidates))
+    )
+    # That the machine may be healthy again is for the watch to decide; until then a name stands.
+    named = may_name and agreed and "normal" not in candidates
+    group = candidates
+    if previous is not None and previous.named and not named:
+        # One look does not take a name away.
+        group = previous.group
+        named = True
+    return Identification(
+        verdict=group[0],
+        group=group,
+        named=named,
+        evidence=scores,
+        probabilities=probabilities,
+        change=change,
+        severity=size / max(amplitude, 1e-12),
+        candidates=candidates,
+        excess=energy.excess if energy is not None and energy.nats > _ENERGY_NATS else 0.0,
+    )
+
+
+def _group(
+    scores: Mapping[RotorFault, float], best: RotorFault, healthy: Calibration, rules: NamingRules
+) -> tuple[RotorFault, ...]:
+    """All hypotheses within the margin of the best one, the best first."""
+    # Without a Laval rotor any change of both senses of 1X would be a loss of damping.
+    alone = best == "damping_loss" and scores[best] - scores["unbalance"] > rules.margin_nats
+
+    def margin(name: RotorFault) -> float:
+        if name == "unmodelled" and alone and not healthy.laval:
+            return math.inf
+        if {name, best} == _RIVALS:
+            return rules.rub_margin_nats if healthy.laval else _GENERIC_RUB_MARGIN_NATS
+        return rules.margin_nats
+
+    close = [name for name in scores if scores[best] - scores[name] < margin(name)]
+    if "normal" in close and best != "normal":
+        close.remove("normal")
+    return tuple(sorted(close, key=lambda name: -scores[name]))
+
+
+def _posterior(scores: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
+    top = max(scores.values())
+    weights = {name: math.exp(score - top) for name, score in scores.items()}
+    total = math.fsum(weights.values())
+    return {name: weight / total for name, weight in weights.items()}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from daqsvc.rotor.synchronous.baseline import Calibration
-    from daqsvc.rotor.synchronous.healthy import Healthy
+    from daqsvc.rotor.synchronous.vectors import Healthy
 
     Complexes = NDArray[np.complex128]
     Floats = NDArray[np.float64]

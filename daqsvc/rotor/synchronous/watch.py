@@ -22,9 +22,14 @@ from daqsvc.rotor.synchronous.baseline import (
     compensated,
     with_more,
 )
-from daqsvc.rotor.synchronous.departure import DepartureEvidence, DepartureTest, Spread, threshold_for
-from daqsvc.rotor.synchronous.identify import Energy, Identification, NamingRules, identify
-from daqsvc.rotor.synchronous.steadiness import nonstationarity
+from daqsvc.rotor.synchronous.departure import (
+    DepartureEvidence,
+    DepartureTest,
+    Spread,
+    nonstationarity,
+    threshold_for,
+)
+from daqsvc.rotor.synchronous.signatures import Energy, Identification, NamingRules, identify
 from daqsvc.rotor.synchronous.transient import KNOWN_WITHIN, REVOLUTIONS, Comparison, LastOrbits
 from daqsvc.rotor.synchronous.vectors import SynchronousVectors
 
@@ -222,7 +227,7 @@ class RotorWatch:
             orbits: their samples in um; without them the way from one orbit to the next cannot tell
                 unbalance from loss of damping.
         """
-        said = []
+        reports = []
         ends = [] if orbits is None else [*orbits.starts[1:].tolist(), len(orbits.xy)]
         for i in range(len(vectors)):
             one = vectors[i : i + 1]
@@ -232,19 +237,19 @@ class RotorWatch:
                 z = orbits.xy[part, 0] + 1j * orbits.xy[part, 1]
                 self._orbits.add(self.revolutions, orbits.angle_rad[part] / (2.0 * math.pi), z)
             if one.usable[0]:
-                said.append(self._take(one))
-        return said
+                reports.append(self._take(one))
+        return reports
 
     def _take(self, one: SynchronousVectors) -> WatchReport:
         if self.calibration is None:
             return self._calibrate(one)
         moved, speed = compensated(one, self.rotor, self.calibration.speed_rad_s, self.rate_hz)
-        restless = float(
+        nonstationary = float(
             nonstationarity(moved, one.noise, one.samples, self.calibration.baseline, self._previous)[0]
         )
         self._previous = np.vstack((self._previous[-1:], moved))
         row = JudgedRevolution(
-            self.revolutions, moved[0] - self.calibration.baseline, restless, float(speed[0])
+            self.revolutions, moved[0] - self.calibration.baseline, nonstationary, float(speed[0])
         )
         self._rows.append(row)
         assert self._test is not None  # noqa: S101 - made with the calibration

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daqsvc.bearing.identify_change import BANDS, ResidualChange
+from daqsvc.bearing.identify import BANDS, ResidualChange
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence, RaceVerdict
 from daqsvc.detectors.bearing.direction import Direction
 from daqsvc.detectors.bearing.finding import WORDS, find

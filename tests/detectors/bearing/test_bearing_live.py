@@ -12,8 +12,8 @@ from support.bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, healthy, k
 from support.machine_files import MACHINES
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.bearing.baseline import load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.geometry import BearingOrders, bearing_orders
-from daqsvc.bearing.identify_file import load_bearing_baseline, save_bearing_baseline
 from daqsvc.bearing.two_sensors import PairModel
 from daqsvc.detectors.bearing.detector import BearingDetector
 from daqsvc.detectors.bearing.direction import TwoSensors
@@ -29,7 +29,7 @@ from sim_hw.reproduce.bearing.design import S3
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from daqsvc.bearing.identify_baseline import BearingBaseline
+    from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.diagnosis.record import Diagnosis
     from sim_hw.demo.listener import Received
     from sim_hw.plants.bearing import Fault

@@ -11,9 +11,8 @@ import pytest
 from support.bearing_signals import healthy
 from support.machine_files import MACHINES, changed, only_problem, parsed, problems_of
 
+from daqsvc.bearing.baseline import learn_baseline, save_bearing_baseline
 from daqsvc.bearing.geometry import bearing_orders
-from daqsvc.bearing.identify_baseline import learn_baseline
-from daqsvc.bearing.identify_file import save_bearing_baseline
 from daqsvc.cli import main
 from daqsvc.detectors.bearing.build import pair_models
 from daqsvc.detectors.bearing.detector import BearingDetector
