@@ -12,8 +12,7 @@ from rich.console import Console
 
 from daqsvc import kernel_cache
 from sim_hw.demo.command import DemoCommand, script_of
-from sim_hw.demo.session import DemoSession
-from sim_hw.demo.summary import summarise
+from sim_hw.demo.session import DemoSession, summarise
 from sim_hw.demo.view import View
 
 WIDTH = 110

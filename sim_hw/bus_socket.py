@@ -27,10 +27,14 @@ from typing import TYPE_CHECKING, Literal
 import can
 
 from daqsvc.commands.arguments import ArgumentParser
-from sim_hw.bus_socket_hub import QUEUE_FRAMES, Hub, HubError, HubTakenError, check_path
-from sim_hw.bus_socket_wire import (
+from sim_hw.bus_socket_hub import (
     LONGEST,
+    QUEUE_FRAMES,
     ClientOption,
+    Hub,
+    HubError,
+    HubTakenError,
+    check_path,
     is_frame,
     overflow_message,
     pack_frame,

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from daqsvc.settings import MachineFile
     from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
-    from sim_hw.sim_command_order import SimNode
-    from sim_hw.sim_command_signals import Signals
+    from sim_hw.sim_nodes import SimNode
+    from sim_hw.sim_signals import Signals
 
 SCENARIO = "paper"
 OF_RECORDINGS = ("map", "fs", "max_memory")
@@ -96,8 +96,8 @@ class SimCommand:
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
-        from sim_hw.sim_command_order import NodeError  # noqa: PLC0415
-        from sim_hw.sim_command_signals import SignalError  # noqa: PLC0415
+        from sim_hw.sim_nodes import NodeError  # noqa: PLC0415
+        from sim_hw.sim_signals import SignalError  # noqa: PLC0415
 
         try:
             return asyncio.run(_simulate(arguments))
@@ -137,9 +137,8 @@ def _misuse(arguments: argparse.Namespace) -> str | None:
 async def _simulate(arguments: argparse.Namespace) -> int:
     from daqsvc.acquisition.clock import SystemClock  # noqa: PLC0415
     from sim_hw.nodes.pacing import RealTimePacer  # noqa: PLC0415
-    from sim_hw.sim_command_nodes import node_for  # noqa: PLC0415
-    from sim_hw.sim_command_order import NodeOrder  # noqa: PLC0415
-    from sim_hw.sim_command_signals import SignalError, stream_samples  # noqa: PLC0415
+    from sim_hw.sim_nodes import NodeOrder, node_for  # noqa: PLC0415
+    from sim_hw.sim_signals import SignalError, stream_samples  # noqa: PLC0415
 
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -218,7 +217,7 @@ def _script(
     """The machine, what its sensors see, what goes wrong, and the virtual bus if there is one."""
     from daqsvc.settings import load_machine_file  # noqa: PLC0415
     from sim_hw.scenario import Scenario, load_any_scenario  # noqa: PLC0415
-    from sim_hw.sim_command_signals import (  # noqa: PLC0415
+    from sim_hw.sim_signals import (  # noqa: PLC0415
         BearingSignals,
         RecordedSignals,
         RotorSignals,

@@ -2,7 +2,7 @@
 
 A unit slides on a surface that its own fault does not leave, and is pushed off by the other's. Its distance s
 from there obeys s' = -mu s + n . r - K sgn(s): a leaky sum with a soft threshold. The paper's units, in two
-states each, are in `sim_hw.reproduce.bearing.paper_units`.
+states each, are in `sim_hw.reproduce.bearing.experiment`.
 
 A fault of the inner race pushes the outer race's unit off its surface and leaves the inner race's unit in
 peace, and the other way round; a ball meets both races and pushes both off. With the model a little wrong the

@@ -15,16 +15,15 @@ from urllib.parse import urlsplit
 from daqsvc.commands.arguments import EXIT_FAILED
 from daqsvc.recording.channels import channel_map, sampling_rate_hz
 from sim_hw.arguments import add_random, add_recording, add_speed, given, misplaced, positive
-from sim_hw.demo.errors import DemoError
+from sim_hw.demo.machines import DemoError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
     from types import FrameType
 
     from daqsvc.recording.recording import Recording
-    from sim_hw.demo.listener import Received
-    from sim_hw.demo.session import DemoOutcome, Script
-    from sim_hw.scenario_bearing import BearingScenario
+    from sim_hw.demo.session import DemoOutcome, Received, Script
+    from sim_hw.scenario import BearingScenario
 
 SCENARIO = "paper"
 UNIT = "g"
@@ -184,8 +183,7 @@ def _say(message: str) -> None:
 
 
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
-    from sim_hw.demo.session import DemoSession  # noqa: PLC0415
-    from sim_hw.demo.summary import summarise  # noqa: PLC0415
+    from sim_hw.demo.session import DemoSession, summarise  # noqa: PLC0415
 
     def play(hear: Callable[[Received], None]) -> DemoOutcome:
         session = DemoSession(script, speed=arguments.speed, broker_url=arguments.broker, hear=hear)
@@ -280,8 +278,7 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
 
 def _from_recording(arguments: argparse.Namespace) -> Script:
     from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
-    from sim_hw.demo.baseline import playable, setpoints  # noqa: PLC0415
-    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
+    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording, playable, setpoints  # noqa: PLC0415  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
     set_memory(arguments.max_memory)

@@ -1,14 +1,19 @@
-"""One run of the demo: a simulated device, the whole service, a broker, and a consumer behind it."""
+"""One run of the demo: a simulated device, the whole service, a broker, and a consumer behind it.
+
+The consumer (`Listener`) knows nothing of the service but its broker. What a run comes to is in `summarise`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import urlsplit
 
 import aiomqtt
 import can
@@ -18,8 +23,8 @@ from daqsvc.service import Service
 from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.errors import DemoError
-from sim_hw.demo.listener import Listener
+from sim_hw.demo.machines import DemoError
+from sim_hw.node_faults import NodeFaults
 from sim_hw.nodes.can_node import CanNode
 from sim_hw.nodes.pacing import DrivenPacer, RealTimePacer
 
@@ -32,10 +37,94 @@ if TYPE_CHECKING:
     from daqsvc.acquisition.assembler import StreamCounters
     from daqsvc.settings import MachineFile
     from drivers.frames import FrameLayout
-    from sim_hw.demo.listener import Received
-    from sim_hw.node_faults import NodeFaults
     from sim_hw.nodes.pacing import Pacer
     from sim_hw.scenario import Onset
+
+
+CONNECT_S = 10.0
+FAREWELL_S = 5.0
+DEFAULT_PORT = 1883
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One message.
+
+    Attributes:
+        kind: ``"diagnosis"``, ``"alarm"``, ``"status"`` or ``"availability"``, from its schema.
+        topic: where it came.
+        payload: its JSON.
+    """
+
+    kind: str
+    topic: str
+    payload: dict[str, Any]
+
+
+class Listener:
+    """Subscribes to everything below a topic and hands messages on until the box goes offline.
+
+    Args:
+        url: the broker, ``mqtt://host:port``.
+        base: topic of the box.
+        hear: called with each message.
+    """
+
+    def __init__(self, url: str, base: str, hear: Callable[[Received], None]) -> None:
+        parts = urlsplit(url)
+        self._host, self._port = parts.hostname or "localhost", parts.port or DEFAULT_PORT
+        self._base = base
+        self._hear = hear
+        self._subscribed = asyncio.Event()
+        self._been_online = False
+        self._offline = asyncio.Event()
+        self.messages = 0
+
+    async def run(self) -> None:
+        """Listen until cancelled.
+
+        Raises:
+            aiomqtt.MqttError: the broker is not there.
+        """
+        quiet = logging.getLogger(f"{__name__}.aiomqtt")
+        quiet.setLevel(logging.CRITICAL)
+        client = aiomqtt.Client(self._host, self._port, timeout=CONNECT_S, logger=quiet)
+        async with client:
+            await client.subscribe(f"{self._base}/#", qos=1)
+            self._subscribed.set()
+            async for message in client.messages:
+                self._take(str(message.topic), bytes(message.payload or b""), retained=bool(message.retain))
+
+    def _take(self, topic: str, payload: bytes, *, retained: bool) -> None:
+        if retained or not payload:
+            return  # what an earlier run has left behind
+        try:
+            content = json.loads(payload)
+        except (ValueError, RecursionError):
+            return  # of somebody else, on a broker of the user's
+        if not isinstance(content, dict):
+            return
+        kind = str(content.get("schema", "")).removeprefix("daqsvc.").split("/")[0]
+        self.messages += 1
+        if kind == "availability":
+            online = content["state"] == "online"
+            self._been_online |= online
+            if self._been_online and not online:
+                self._offline.set()
+        self._hear(Received(kind, topic, content))
+
+    async def subscribed(self) -> None:
+        """Wait until nothing that is published from now on can be missed."""
+        await self._subscribed.wait()
+
+    async def farewell(self) -> bool:
+        """Wait until the box has said that it goes; False if that takes too long."""
+        try:
+            await asyncio.wait_for(self._offline.wait(), FAREWELL_S)
+        except TimeoutError:
+            return False
+        return True
+
 
 logger = logging.getLogger(__name__)
 
@@ -301,3 +390,98 @@ async def _task(work: Coroutine[Any, Any, T]) -> AsyncIterator[asyncio.Task[T]]:
         await asyncio.wait({task})
         if not task.cancelled():
             task.exception()
+
+
+ROTOR_BANK = "rotor-bank"
+
+
+def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str, Any]:
+    """The summary as one JSON object.
+
+    A declaration is a change of the decision of the script's detector. Its delay counts from the onset of the
+    mode, in revolutions. It is wrong if the machine was in another mode. Samples at the end that do not fill
+    a frame are left over: a device would send them with the next ones.
+    """
+    declared = [
+        (str(payload["decision"]), int(payload["window"]["end_index"]))
+        for payload in outcome.diagnoses
+        if payload["detector"] == script.detector
+    ]
+    figures = outcome.figures
+    stream = figures["streams"][script.stream]
+    frames_lost = stream["samples_lost"] // max(outcome.samples_sent // max(outcome.frames_in, 1), 1)
+    return {
+        "type": "summary",
+        "title": script.title,
+        "seed": script.seed,
+        "speed": speed,
+        "simulated_s": script.duration_s,
+        "real_s": outcome.real_s,
+        "declared": [mode for mode, _ in declared],
+        "onsets": _onsets(script, declared),
+        "wrong_declarations": sum(not _true_at(script.onsets, mode, at) for mode, at in declared)
+        if script.onsets
+        else 0,
+        "samples": {
+            "sent": outcome.samples_sent,
+            "left_over": len(script.samples) - outcome.samples_sent,
+            "received": stream["samples_received"],
+            "lost": stream["samples_lost"],
+            "skipped_by_detectors": sum(d["samples_skipped"] for d in figures["detectors"].values()),
+        },
+        "frames": {
+            "sent": outcome.frames_sent,
+            "received": stream["frames_received"],
+            "injected": outcome.injected,
+            "counted": {
+                "dropped": frames_lost - stream["frames_corrupt"],
+                "duplicated": stream["frames_duplicate"],
+                "reordered": stream["frames_reordered"],
+                "corrupted": stream["frames_corrupt"],
+            },
+            "not_sent": _not_sent(script),
+            "late": stream["frames_late"],
+            "rejected": stream["frames_rejected"],
+        },
+        "clock": {"drift_ppm": stream["drift_ppm"], "jitter_ms": stream["jitter_ms"]},
+        "loop_lag_ms": figures["loop_lag_ms"],
+        "alarm_events": outcome.alarms,
+        "messages": outcome.messages,
+        "complete": outcome.complete,
+    }
+
+
+def _not_sent(script: Script) -> list[str]:
+    """When the device sends nothing, in words: frames that it would have sent count as lost, too."""
+    if not isinstance(script.faults, NodeFaults):
+        return []  # none, or a link's only
+    seconds = {
+        what: sum(min(window.end_s, script.duration_s) - window.start_s for window in windows)
+        for what, windows in (("silence", script.faults.silence), ("brown-out", script.faults.brown_out))
+    }
+    return [f"{length:g} s of {what}" for what, length in seconds.items() if length > 0.0]
+
+
+def _onsets(script: Script, declared: Sequence[tuple[str, int]]) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    per_rev = script.samples_per_rev or 1.0
+    for i, onset in enumerate(script.onsets):
+        end = script.onsets[i + 1].sample if i + 1 < len(script.onsets) else len(script.samples)
+        at = next((at for mode, at in declared if mode == onset.mode and onset.sample <= at <= end), None)
+        rows.append(
+            {
+                "mode": onset.mode,
+                "onset_rev": onset.at_rev,
+                "declared_rev": None if at is None else at / per_rev,
+                "delay_rev": None if at is None else (at - onset.sample) / per_rev,
+            }
+        )
+    return rows
+
+
+def _true_at(onsets: Sequence[Onset], mode: str, sample: int) -> bool:
+    true = onsets[0].mode
+    for onset in onsets:
+        if onset.sample <= sample:
+            true = onset.mode
+    return mode == true

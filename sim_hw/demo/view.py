@@ -11,14 +11,13 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from sim_hw.demo.summary import ROTOR_BANK
+from sim_hw.demo.session import ROTOR_BANK
 
 if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
-    from sim_hw.demo.listener import Received
-    from sim_hw.demo.session import Script
+    from sim_hw.demo.session import Received, Script
 
 LAST_ALARMS = 8
 BAR = 28

@@ -14,7 +14,7 @@ import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from sim_hw.node_faults import NodeFaults
-from sim_hw.nodes.planned_node import LinkLostError, PlannedNode
+from sim_hw.nodes.pacing import LinkLostError, PlannedNode
 
 if TYPE_CHECKING:
     from collections.abc import Callable

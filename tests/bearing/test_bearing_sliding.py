@@ -7,7 +7,7 @@ import pytest
 
 from daqsvc.bearing.sliding_mode import RatioRule, SlidingGains, SlidingPair, UnitEnergies
 from sim_hw.reproduce.bearing.design import S3
-from sim_hw.reproduce.bearing.paper_units import INNER_SLOPE, OUTER_SLOPE, AbsoluteRule, PaperUnit
+from sim_hw.reproduce.bearing.experiment import INNER_SLOPE, OUTER_SLOPE, AbsoluteRule, PaperUnit
 
 INNER = PaperUnit(INNER_SLOPE, (2.0 / 5**0.5, 1.0 / 5**0.5))
 OUTER = PaperUnit(OUTER_SLOPE, (6.0 / 37**0.5, 1.0 / 37**0.5))

@@ -19,7 +19,7 @@ from targets import Targets
 from daqsvc.bearing.residual import TwoSensorResidual
 from daqsvc.bearing.sliding_mode import SlidingGains, SlidingPair
 from sim_hw.reproduce.bearing.design import S3
-from sim_hw.reproduce.bearing.paper_units import DAMPING, INNER_SLOPE, OUTER_SLOPE, STIFFNESS
+from sim_hw.reproduce.bearing.experiment import DAMPING, INNER_SLOPE, OUTER_SLOPE, STIFFNESS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -31,7 +31,7 @@ from drivers.base import BusPort, StreamSpec
 from drivers.frames import FrameLayout
 from drivers.serial.binary import DELIMITER
 from drivers.serial.driver import SerialDriver, framing_of
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
     from daqsvc.acquisition.samples import SampleBlock

@@ -101,7 +101,7 @@ def test_where_nothing_can_be_written_kernels_are_compiled_and_not_kept(tmp_path
     use = (
         "from daqsvc import kernel_cache; kernel_cache.prepare()\n"
         "import daqsvc.rotor.sweep, daqsvc.bearing.residual, drivers.serial.line_kernels\n"
-        "import daqsvc.bearing.sliding_mode, sim_hw.reproduce.bearing.paper_units\n"
+        "import daqsvc.bearing.sliding_mode, sim_hw.reproduce.bearing.experiment\n"
         "import numpy as np\n"
         "from drivers.serial.kernels import gather\n"
         "print(gather(np.arange(9, dtype=np.uint8), np.array([1, 4]), 2).tolist())\n"

@@ -17,7 +17,7 @@ from drivers.frames import FrameLayout
 from drivers.serial.binary import CobsFraming
 from drivers.serial.driver import SerialDriver, framing_of
 from drivers.serial.lines import LineFraming
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -33,7 +33,7 @@ from daqsvc.rotor.laval import LavalRotor
 from daqsvc.rotor.model import RotorParameters
 from daqsvc.rotor.synchronous.vectors import synchronous_vectors
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 pytestmark = pytest.mark.statistical
 GAPS = [(share, frame) for share in SHARES for frame in FRAMES]

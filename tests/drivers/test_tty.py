@@ -19,7 +19,7 @@ from drivers.serial.driver import SerialDriver
 from drivers.tty import Character, CharacterFormat, is_pseudo_terminal
 from sim_hw.nodes.modbus_node import ModbusRtuServer
 from sim_hw.nodes.modbus_unit import ModbusUnit
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 pytestmark = pytest.mark.integration
 TREND = registers_layout(1, "input", [register("x", 0, "int16")])

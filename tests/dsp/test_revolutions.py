@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.examples import examples
 
 from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 pytestmark = pytest.mark.property
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daqsvc.dsp.speed.revolutions import FixedSpeedCutter, KeyphasorCutter, OrbitCutter
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 
 def cutter(period=64.0, **options):

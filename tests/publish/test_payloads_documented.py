@@ -17,7 +17,7 @@ from daqsvc.publish.schemas import PAYLOADS
 from daqsvc.service import Service
 from daqsvc.settings import load_machine_file
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 RIG = load_machine_file(ROOT / "config" / "machines" / "laval-rig.toml")
 TEXT = (ROOT / "docs" / "mqtt.md").read_text(encoding="utf-8")

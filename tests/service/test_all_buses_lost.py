@@ -25,7 +25,7 @@ from drivers.modbus.registers import RegisterRecord
 from drivers.serial.settings import SerialBus
 from sim_hw.nodes.modbus_node import ModbusTcpServer
 from sim_hw.nodes.modbus_unit import ModbusUnit, RingStore
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,11 +15,9 @@ from support.brokers import Consumer, running_mosquitto
 from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, DiagnosisPayload, StatusPayload
 from daqsvc.recording.recording import Recording, load_recording
 from drivers.can.plugin import frame_layout
-from sim_hw.demo.baseline import setpoints
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
-from sim_hw.demo.session import DemoOutcome, DemoSession, Script
-from sim_hw.demo.summary import summarise
+from sim_hw.demo.machines import Setpoints, for_recording, laval_rig, setpoints
+from sim_hw.demo.session import DemoOutcome, DemoSession, Script, summarise
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import quantised
 from sim_hw.scenario import load_scenario
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
 MODES = ["N", "F1", "F1L2", "F1L3"]

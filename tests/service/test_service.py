@@ -22,7 +22,7 @@ from sim_hw.scenario import load_scenario
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
 RATE_HZ = 2000.0

@@ -20,7 +20,7 @@ from daqsvc.service import Service
 from sim_hw.demo import broker, session
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.command import DemoCommand, script_of
-from sim_hw.demo.errors import DemoError
+from sim_hw.demo.machines import DemoError
 from sim_hw.demo.session import DemoSession, Script
 from sim_hw.demo.view import View, _PipeConsole
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
 RATE_HZ = 2000.0

@@ -9,9 +9,7 @@ import numpy as np
 from rich.console import Console
 from support.machine_files import MACHINES
 
-from sim_hw.demo.listener import Received
-from sim_hw.demo.session import Script
-from sim_hw.demo.summary import _not_sent
+from sim_hw.demo.session import Received, Script, _not_sent
 from sim_hw.demo.view import View
 from sim_hw.scenario import load_scenario
 

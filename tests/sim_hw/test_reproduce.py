@@ -16,10 +16,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from daqsvc import cli
-from sim_hw.reproduce import registry, results
-from sim_hw.reproduce.registry import Study
+from sim_hw.reproduce import command, results
+from sim_hw.reproduce.command import Study
 from sim_hw.reproduce.results import Findings, ResultRow
-from sim_hw.reproduce.rotor.detection import delays_rev, wrong_changes
+from sim_hw.reproduce.rotor.experiment import delays_rev, wrong_changes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -213,13 +213,11 @@ def small_study(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     silent = ResultRow(name="b", figure="2", paper="", obtained="a point " * 30, agrees=None, remark="why")
     findings = Findings((found, silent), {"fig1": lambda figure: figure.subplots().plot([0.0, 1.0])})
-    monkeypatch.setattr(registry, "STUDIES", (Study("a study", lambda _seed, _snr_db: findings),))
+    monkeypatch.setattr(command, "STUDIES", (Study("a study", lambda _seed, _snr_db: findings),))
 
 
 @pytest.mark.usefixtures("small_study")
-def test_a_study_needs_only_a_place_in_the_registry(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_needs_only_a_place_in_the_list(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["reproduce", "--out", str(tmp_path)]) == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["fig1.png", "results.csv", "results.md"]
     assert "a \\| b" in (tmp_path / "results.md").read_text(encoding="utf-8")

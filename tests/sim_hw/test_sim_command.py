@@ -24,7 +24,7 @@ from daqsvc.settings import parse_machine_file
 from drivers.can.plugin import frame_layout
 from sim_hw.bus_socket import UnixBus
 from sim_hw.scenario import load_any_scenario
-from sim_hw.sim_command_signals import BearingSignals
+from sim_hw.sim_signals import BearingSignals
 
 if TYPE_CHECKING:
     from pathlib import Path

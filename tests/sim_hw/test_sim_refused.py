@@ -17,7 +17,7 @@ from daqsvc.recording.recording import Recording
 from daqsvc.settings import load_machine_file
 from sim_hw.scenario import Scenario, builtin_scenarios, load_any_scenario, load_scenario
 from sim_hw.sim_command import SimCommand, _misuse, _script
-from sim_hw.sim_command_signals import (
+from sim_hw.sim_signals import (
     BearingSignals,
     RecordedSignals,
     RotorSignals,

@@ -13,10 +13,11 @@ from sim_hw.plants.rotor import (
     PlantParameters,
     RotorEscapeError,
     contact_force,
+    keyphasor_voltage,
+    noise_sigma,
     simulate,
     state_derivative,
 )
-from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
 
 N = PlantParameters()
 F1 = replace(N, damping_ratio=0.10)

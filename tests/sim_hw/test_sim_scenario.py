@@ -7,9 +7,15 @@ from support.machine_files import MACHINES
 from daqsvc.settings import load_machine_file
 from daqsvc.settings.sensors import Accelerometer
 from sim_hw.link_faults import LinkFaults
-from sim_hw.scenario import ScenarioError, builtin_scenarios, load_any_scenario, load_scenario
-from sim_hw.scenario_bearing import BearingScenario, RaceDamage
-from sim_hw.sim_command_signals import BearingSignals
+from sim_hw.scenario import (
+    BearingScenario,
+    RaceDamage,
+    ScenarioError,
+    builtin_scenarios,
+    load_any_scenario,
+    load_scenario,
+)
+from sim_hw.sim_signals import BearingSignals
 
 SCENARIOS = MACHINES.parent / "scenarios"
 ACCELEROMETER = Accelerometer(name="a", stream="s", channel="c", type="accelerometer", unit="m/s2")

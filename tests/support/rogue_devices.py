@@ -19,7 +19,7 @@ from drivers.serial.driver import framing_of
 from drivers.serial.settings import SerialBus
 from sim_hw.nodes.modbus_node import ModbusRtuServer, ModbusTcpServer, PlannedReply
 from sim_hw.nodes.modbus_unit import ModbusUnit
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -21,7 +21,7 @@ from daqsvc.rotor import kernels
 from daqsvc.rotor.discretise import discretise
 from daqsvc.rotor.model import RotorParameters
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage, noise_sigma
+from sim_hw.plants.rotor import keyphasor_voltage, noise_sigma
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

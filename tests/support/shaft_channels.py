@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.diagnosis.detector import Window
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

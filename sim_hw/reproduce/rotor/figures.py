@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from daqsvc.rotor.decision import DecisionRules
-from sim_hw.reproduce.rotor.detection import delays_rev
-from sim_hw.reproduce.rotor.setup import MODES, SAMPLES_PER_REV, in_decibels, spoken
+from sim_hw.reproduce.rotor.experiment import MODES, SAMPLES_PER_REV, delays_rev, in_decibels, spoken
 from sim_hw.reproduce.rotor.statements import convergence
 
 if TYPE_CHECKING:

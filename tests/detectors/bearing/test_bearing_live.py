@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from daqsvc.bearing.baseline import BearingBaseline
     from daqsvc.diagnosis.record import Diagnosis
-    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Received
     from sim_hw.plants.bearing import Fault
 
 pytestmark = pytest.mark.integration

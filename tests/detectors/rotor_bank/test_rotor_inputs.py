@@ -18,7 +18,7 @@ from daqsvc.detectors.rotor_bank.detector import (
 )
 from daqsvc.rotor.decision import DecisionRules
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 RATE_HZ = 640.0
 

@@ -20,7 +20,7 @@ from sim_hw.scenario import Scenario
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sim_hw.demo.listener import Received
+    from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
 EXAMPLE = MACHINES / "rotor-synchronous.toml"

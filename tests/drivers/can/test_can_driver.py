@@ -17,7 +17,7 @@ from support.waiting import eventually
 from drivers.base import BusPort, DeviceAbsentError, StreamSpec
 from drivers.can.driver import CanDriver
 from drivers.frames import FrameLayout
-from sim_hw.bus_socket_wire import overflow_message
+from sim_hw.bus_socket_hub import overflow_message
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,7 +18,7 @@ from support.bus_tables import modbus_bus
 from daqsvc.acquisition.clock import SystemClock
 from drivers.modbus.client import ModbusClient
 from drivers.modbus.replies import LineLostError, ModbusCounters, NoReplyError
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
+from sim_hw.nodes.serial_node import PseudoTerminal
 
 pytestmark = pytest.mark.integration
 TIMEOUT_NS = 50_000_000

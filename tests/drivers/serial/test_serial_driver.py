@@ -26,8 +26,7 @@ from drivers.serial import reader as serial_reader
 from drivers.serial.driver import SerialDriver, framing_of
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.pacing import DrivenPacer
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
-from sim_hw.nodes.serial_node import SerialNode
+from sim_hw.nodes.serial_node import PseudoTerminal, SerialNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

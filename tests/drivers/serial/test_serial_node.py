@@ -14,8 +14,7 @@ from daqsvc.acquisition.clock import DrivenClock
 from drivers.serial import reader as serial_reader
 from drivers.serial.lines import LineFraming
 from sim_hw.nodes.pacing import DrivenPacer
-from sim_hw.nodes.pseudo_terminal import PseudoTerminal
-from sim_hw.nodes.serial_node import SerialNode
+from sim_hw.nodes.serial_node import PseudoTerminal, SerialNode
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,7 +25,7 @@ from daqsvc.publish.output import Watched
 from daqsvc.publish.topics import Topics
 from daqsvc.settings import parse_machine_file
 from sim_hw.plants import rotor as plant
-from sim_hw.plants.sensors import keyphasor_voltage
+from sim_hw.plants.rotor import keyphasor_voltage
 
 BROKER = '[mqtt]\nurl = "mqtts://broker.example"\n'
 NONE = commands()

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from daqsvc.recording.recording import Recording
     from daqsvc.settings import MachineFile
     from daqsvc.settings.sensors import BaseSensor
-    from sim_hw.scenario_bearing import BearingScenario, ScenarioRun
+    from sim_hw.scenario import BearingScenario, ScenarioRun
+
 
 logger = logging.getLogger(__name__)
 
