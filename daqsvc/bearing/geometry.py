@@ -72,25 +72,6 @@ class BearingOrders:
         """2 BSF: strikes of a spot on a ball per revolution of the shaft."""
         return 2.0 * self.ball
 
-    def slipped(self, slip: float) -> BearingOrders:
-        """The orders when the cage falls behind pure rolling.
-
-        Args:
-            slip: share of the cage's speed that is lost, e.g. 0.01.
-
-        Raises:
-            ValueError: ``slip`` is not in [0, 1).
-        """
-        if not 0.0 <= slip < 1.0:
-            raise ValueError(f"cage slip is {slip}; it must be a share from 0 to below 1")
-        kept = 1.0 - slip
-        return BearingOrders(
-            inner=self.inner + self.outer * slip,
-            outer=self.outer * kept,
-            ball=self.ball * kept,
-            cage=self.cage * kept,
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class BearingGeometry:

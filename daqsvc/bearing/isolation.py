@@ -15,7 +15,6 @@ two components are then nearly one, and cancel in d.
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -62,7 +61,6 @@ class Isolation:
         verdict: the faulty part; ``"ball"`` is also what inner and outer race together look like, and
             ``"inner_or_outer"`` says that the evidence does not decide.
         group: the parts that the evidence leaves possible, the verdict first.
-        inner_share: evidence for the inner race as a share of all; NaN if there is none.
         inner_nats: evidence of the frames that are likelier to be hits of the inner race.
         outer_nats: evidence of the others.
         hits: frames in which a hit stands out.
@@ -70,7 +68,6 @@ class Isolation:
 
     verdict: Race | Literal["inner_or_outer"]
     group: tuple[Race, ...]
-    inner_share: float
     inner_nats: float
     outer_nats: float
     hits: int
@@ -170,9 +167,7 @@ class IsolationRule:
         everything: tuple[Race, ...] = ("inner", "outer", "ball")
         # Half-overlapping frames are half a frame longer than they are many.
         if total < LEAST_NATS_PER_S * self._step_s * (len(spectra) + 1):
-            return Isolation(
-                "inner_or_outer", everything, inner / total if total else math.nan, inner, outer, hits
-            )
+            return Isolation("inner_or_outer", everything, inner, outer, hits)
         share = inner / total
         verdict: Race = "outer" if share < OUTER_BELOW else "inner" if share > INNER_ABOVE else "ball"
         neighbours: dict[Race, bool] = {
@@ -181,7 +176,7 @@ class IsolationRule:
             "ball": OUTER_BELOW - DOUBT < share < INNER_ABOVE + DOUBT,
         }
         others = tuple(race for race, near in neighbours.items() if near and race != verdict)
-        return Isolation(verdict, (verdict, *others), share, inner, outer, hits)
+        return Isolation(verdict, (verdict, *others), inner, outer, hits)
 
     def _evidence(self, spectra: Complexes) -> tuple[float, float, int]:
         """Nats for the inner and for the outer race, and the number of hits."""

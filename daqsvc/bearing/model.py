@@ -130,10 +130,6 @@ class BearingModel:
         motion = np.linalg.solve(p.mass * s**2 + p.damping * s + p.stiffness, forces.astype(np.complex128))
         return np.asarray(s**2 * motion[:, [0, 2]], dtype=np.complex128)
 
-    def unbalance_transfer(self, frequency_hz: Floats) -> Complexes:
-        """From the force on the rotor to the accelerations: complex128 ``[n, 2]`` in 1/kg."""
-        return transfer(self.A, self.B, self.C, self.E, frequency_hz)[:, :, 0]
-
     @cached_property
     def modes_hz(self) -> tuple[float, float, float]:
         """Natural frequencies, rising; the highest is that of the rolling elements between the races."""
@@ -141,24 +137,6 @@ class BearingModel:
         squared = np.linalg.eigvals(np.linalg.solve(p.mass, p.stiffness))
         slow, middle, ball = np.sort(np.sqrt(squared.real)) / (2.0 * np.pi)
         return float(slow), float(middle), float(ball)
-
-    def literal_directions(self, eigenvalue: float) -> Floats:
-        """Directions D_i - C F_i / |lambda| of the paper's residual under a constant fault.
-
-        The paper prints "CF_i - D_i", which is this with lambda = -1 and the sign of its error equation.
-
-        Args:
-            eigenvalue: lambda in 1/s, below 0.
-
-        Returns:
-            float64 ``[2, 2]``: output, fault.
-        """
-        return np.asarray(self.D - self.C @ self.F / abs(eigenvalue), dtype=np.float64)
-
-    def slope_ratio(self, eigenvalue: float) -> float:
-        """q: slope of the outer race's direction over the inner one's; 3 for the paper's (1, 6), (1, 2)."""
-        (in_1, out_1), (in_2, out_2) = self.literal_directions(eigenvalue)
-        return float(out_2 / out_1 / (in_2 / in_1))
 
 
 def transfer(A: Floats, B: Floats, C: Floats, D: Floats, frequency_hz: Floats) -> Complexes:

@@ -24,7 +24,6 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass
-from typing import Self
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,34 +149,6 @@ class RotorParameters:
             heavy_spot_rad=math.radians(self.heavy_spot_deg),
             contact_radius=self.contact_radius_um / self.clearance_um,
             load_x=self.static_load_x_um / self.clearance_um,
-        )
-
-    @classmethod
-    def from_normalised(
-        cls, rotor: NormalisedRotor, *, natural_frequency_hz: float, clearance_um: float
-    ) -> Self:
-        """The physical rotor behind normalised quantities.
-
-        A rotor with k != 1 is described by its own natural frequency, sqrt(k) omega_s, so that its
-        damping ratio becomes zeta / sqrt(k) and its K* becomes K* / k.
-
-        Args:
-            rotor: the normalised rotor.
-            natural_frequency_hz: omega_s / 2 pi that it was normalised with.
-            clearance_um: clearance that it was normalised with.
-        """
-        return cls(
-            natural_frequency_hz=natural_frequency_hz * math.sqrt(rotor.k),
-            damping_ratio=rotor.zeta / math.sqrt(rotor.k),
-            eccentricity_um=rotor.e * clearance_um,
-            clearance_um=clearance_um,
-            heavy_spot_deg=math.degrees(rotor.heavy_spot_rad),
-            static_sag_um=rotor.g / rotor.k * clearance_um,
-            contact_stiffness=rotor.contact_stiffness / rotor.k,
-            hertz_exponent=rotor.alpha,
-            friction=rotor.mu,
-            contact_radius_um=rotor.contact_radius * clearance_um,
-            static_load_x_um=rotor.load_x / rotor.k * clearance_um,
         )
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from daqsvc.bearing.sliding_mode import RatioRule, SlidingGains, SlidingPair, UnitEnergies
 from sim_hw.reproduce.bearing.design import S3
-from sim_hw.reproduce.bearing.experiment import INNER_SLOPE, OUTER_SLOPE, AbsoluteRule, PaperUnit
+from sim_hw.reproduce.bearing.experiment import INNER_SLOPE, OUTER_SLOPE, PaperUnit
 
 INNER = PaperUnit(INNER_SLOPE, (2.0 / 5**0.5, 1.0 / 5**0.5))
 OUTER = PaperUnit(OUTER_SLOPE, (6.0 / 37**0.5, 1.0 / 37**0.5))
@@ -117,11 +117,6 @@ def test_the_ratio_rule_does_not_depend_on_the_size_of_the_fault(size):
     assert rule.judge(energies(0.0, 0.0)) == "inner_or_outer"
 
 
-def test_the_absolute_rule_of_the_paper_takes_a_large_leaking_fault_for_a_ball():
-    rule = AbsoluteRule(inner_limit=2.0, outer_limit=2.0)
-    assert rule.judge(UnitEnergies(1.0, 1.0)) == "normal"
-    assert rule.judge(UnitEnergies(1.0, 5.0)) == "inner"
-    assert rule.judge(UnitEnergies(5.0, 1.0)) == "outer"
-    assert rule.judge(UnitEnergies(100.0, 10.0)) == "ball"
+def test_the_ratio_rule_refuses_an_energy_that_is_none():
     with pytest.raises(ValueError, match="healthy energy of the inner unit is nan"):
         RatioRule(S3, UnitEnergies(float("nan"), 1.0))

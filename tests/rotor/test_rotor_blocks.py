@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.examples import examples
+from support.rotor_runs import physical_rotor
 
 from daqsvc.rotor.bank import ModelBank
 from daqsvc.rotor.decision import DecisionRules
@@ -102,7 +103,7 @@ def test_whatever_comes_the_statements_stay_finite(xy, known):
 def test_normalising_is_undone(speed_rpm, **figures):
     rotor = RotorParameters(**figures)
     normalised = rotor.normalised(speed_rpm)
-    back = RotorParameters.from_normalised(
+    back = physical_rotor(
         normalised, natural_frequency_hz=rotor.natural_frequency_hz, clearance_um=rotor.clearance_um
     )
     for name, value in figures.items():

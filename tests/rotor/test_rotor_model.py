@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.rotor_runs import physical_rotor
 
 from daqsvc.rotor import discretise, kernels
 from daqsvc.rotor.discretise import BankMode
@@ -44,7 +45,7 @@ def test_orbit_at_resonance_is_e_over_two_zeta():
 
 def test_normalising_is_undone():
     rotor = PAPER.normalised(540.0)
-    back = RotorParameters.from_normalised(rotor, natural_frequency_hz=10.0, clearance_um=100.0)
+    back = physical_rotor(rotor, natural_frequency_hz=10.0, clearance_um=100.0)
     for name in (
         "natural_frequency_hz",
         "damping_ratio",
@@ -61,7 +62,7 @@ def test_normalising_is_undone():
 
 def test_softer_shaft_has_its_own_frequency_but_the_same_orbit():
     soft = NormalisedRotor(w=0.9, e=0.1, zeta=0.1, k=0.8, g=0.1, load_x=-0.03, contact_stiffness=30.0)
-    physical = RotorParameters.from_normalised(soft, natural_frequency_hz=10.0, clearance_um=100.0)
+    physical = physical_rotor(soft, natural_frequency_hz=10.0, clearance_um=100.0)
     assert physical.natural_frequency_hz == pytest.approx(10.0 * math.sqrt(0.8))
     again = physical.normalised(0.9 * 600.0)
     assert again.orbit() == pytest.approx(soft.orbit())

@@ -8,9 +8,10 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.rotor_runs import physical_rotor
 
 from daqsvc.detectors.rotor_bank.modes import RotorMode, bank_modes
-from daqsvc.rotor.model import NormalisedRotor, RotorParameters
+from daqsvc.rotor.model import NormalisedRotor
 
 pytestmark = pytest.mark.property
 POSITIVE = st.floats(1e-2, 1e2)
@@ -32,9 +33,7 @@ ROTORS = st.builds(
 
 @given(rotor=ROTORS, natural_frequency_hz=POSITIVE, clearance_um=POSITIVE)
 def test_physical_rotor_is_the_same_rotor(rotor, natural_frequency_hz, clearance_um):
-    physical = RotorParameters.from_normalised(
-        rotor, natural_frequency_hz=natural_frequency_hz, clearance_um=clearance_um
-    )
+    physical = physical_rotor(rotor, natural_frequency_hz=natural_frequency_hz, clearance_um=clearance_um)
     speed_rpm = 60.0 * natural_frequency_hz * rotor.w
     again = physical.normalised(speed_rpm)
     # Its own natural frequency has become the unit of time: lengths stay, times are sqrt(k) longer.
@@ -60,7 +59,7 @@ def test_physical_rotor_is_the_same_rotor(rotor, natural_frequency_hz, clearance
 def test_modes_move_what_their_fault_moves(
     rotor, clearance_um, damping_ratio, unbalance_ratio, stiffness_ratio, load
 ):
-    physical = RotorParameters.from_normalised(rotor, natural_frequency_hz=10.0, clearance_um=clearance_um)
+    physical = physical_rotor(rotor, natural_frequency_hz=10.0, clearance_um=clearance_um)
     modes = [
         RotorMode("N"),
         RotorMode("U", unbalance_ratio=unbalance_ratio),

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.rotor.model import NormalisedRotor
+
     Floats = NDArray[np.float64]
     Models = Any
 
@@ -210,3 +212,31 @@ def genie_delays(
             at = begins[old - 1]
             delays.append((begin + enough[0] + 1) / PER_REV - at if len(enough) else math.inf)
     return delays
+
+
+def physical_rotor(
+    rotor: NormalisedRotor, *, natural_frequency_hz: float, clearance_um: float
+) -> RotorParameters:
+    """The physical rotor behind normalised quantities.
+
+    A rotor with k != 1 is described by its own natural frequency, sqrt(k) omega_s, so that its
+    damping ratio becomes zeta / sqrt(k) and its K* becomes K* / k.
+
+    Args:
+        rotor: the normalised rotor.
+        natural_frequency_hz: omega_s / 2 pi that it was normalised with.
+        clearance_um: clearance that it was normalised with.
+    """
+    return RotorParameters(
+        natural_frequency_hz=natural_frequency_hz * math.sqrt(rotor.k),
+        damping_ratio=rotor.zeta / math.sqrt(rotor.k),
+        eccentricity_um=rotor.e * clearance_um,
+        clearance_um=clearance_um,
+        heavy_spot_deg=math.degrees(rotor.heavy_spot_rad),
+        static_sag_um=rotor.g / rotor.k * clearance_um,
+        contact_stiffness=rotor.contact_stiffness / rotor.k,
+        hertz_exponent=rotor.alpha,
+        friction=rotor.mu,
+        contact_radius_um=rotor.contact_radius * clearance_um,
+        static_load_x_um=rotor.load_x / rotor.k * clearance_um,
+    )

@@ -48,7 +48,6 @@ S3 = BearingParameters(
     c_h=1256.64,
 )
 """Heavy rolling elements: their mode is at 4.2 kHz, so that the two races can be told apart by direction."""
-S3_EIGENVALUE = -125.66
 
 _POINTS = 400
 _PLAIN_DEG = 10.0
@@ -108,14 +107,6 @@ def residual_transfer(model: BearingModel, gain: Floats, frequency_hz: Floats) -
     """
     closed_loop = model.A + gain @ model.C
     return transfer(closed_loop, model.F + gain @ model.D, model.C, model.D, frequency_hz)
-
-
-def literal_transfer(model: BearingModel, gain: Floats, frequency_hz: Floats) -> Complexes:
-    """The same by the paper's error equation e' = (A + LC) e - F u, which drops L D u.
-
-    No observer that sees only y behaves so; the paper's figures 8 to 10 need it.
-    """
-    return transfer(model.A + gain @ model.C, -model.F, model.C, model.D, frequency_hz)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.sliding_mode import Race, UnitEnergies
     from sim_hw.plants.bearing import Fault
 
     Floats = NDArray[np.float64]
@@ -133,34 +132,6 @@ class PaperUnit:
             path,
         )
         return path
-
-
-@dataclass(frozen=True, slots=True)
-class AbsoluteRule:
-    """The paper's logic: each unit against a limit of its own.
-
-    Attributes:
-        inner_limit: energy that the inner unit does not pass on a healthy machine.
-        outer_limit: the same for the outer unit.
-    """
-
-    inner_limit: float
-    outer_limit: float
-
-    def judge(self, energies: UnitEnergies) -> Race | Literal["normal"]:
-        """Name what the two bits say: a unit off its surface denies its own race.
-
-        Args:
-            energies: over a window.
-        """
-        denied = (energies.inner_unit > self.inner_limit, energies.outer_unit > self.outer_limit)
-        named: dict[tuple[bool, bool], Race | Literal["normal"]] = {
-            (False, False): "normal",
-            (False, True): "inner",
-            (True, False): "outer",
-            (True, True): "ball",
-        }
-        return named[denied]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -319,7 +319,7 @@ class RotorExperiment:
         shown: runs of the bank on the same measurement, by rule.
         statistics: runs on other draws of the noise, by rule and signal-to-noise ratio in dB.
         settled: the rub after its transient.
-        escape: how the rotor leaves its housing with the printed signs.
+        escape_rev: revolutions from contact until the rotor is out of its housing, with the printed signs.
         whirl_of_observer: turns per revolution of the rub observer's rotor without measurements.
     """
 
@@ -337,7 +337,7 @@ class RotorExperiment:
     shown: Mapping[Rule, DetectionRun]
     statistics: Mapping[tuple[Rule, float], tuple[DetectionRun, ...]]
     settled: motion.SettledRub
-    escape: motion.Escape
+    escape_rev: float
     whirl_of_observer: float
 
     @cached_property
@@ -396,7 +396,7 @@ def run(seed: int, snr_db: float) -> RotorExperiment:
         shown={rule: run_bank(new_bank(rule, noise), measured, tau) for rule in RULES},
         statistics=_statistics(true, tau, amplitude, statistics_draws),
         settled=motion.settled_rub(plant("F1L3"), onset_of_rub, SAMPLES_PER_REV),
-        escape=motion.escape_with_printed_signs(plant("F1L3"), onset_of_rub),
+        escape_rev=motion.escape_with_printed_signs(plant("F1L3"), onset_of_rub),
         whirl_of_observer=motion.whirl_of_model(
             replace(plant("F1L3"), contact_exponent=OBSERVER_ALPHA, friction=OBSERVER_MU),
             onset_of_rub,

@@ -157,25 +157,15 @@ def whirl_of_model(rotor: PlantParameters, start: Floats, samples_per_rev: int) 
     return whirl_per_rev(z[len(z) // 2 :], samples_per_rev)
 
 
-@dataclass(frozen=True, slots=True)
-class Escape:
-    """How a rotor with the printed signs leaves its housing.
-
-    Attributes:
-        contact_rev: revolutions from the start to the first contact.
-        escape_rev: revolutions from there to two clearances from the centre.
-    """
-
-    contact_rev: float
-    escape_rev: float
-
-
-def escape_with_printed_signs(rotor: PlantParameters, start: Floats) -> Escape:
+def escape_with_printed_signs(rotor: PlantParameters, start: Floats) -> float:
     """The state equation as printed, ``x' = Ax + Bu + gamma f(Cx)``: the housing pulls the disc outwards.
 
     Args:
         rotor: the rotor.
         start: state ``[x, x', y, y']`` to start from.
+
+    Returns:
+        Revolutions from the first contact to two clearances from the centre.
 
     Raises:
         ArithmeticError: the rotor did not leave its housing.
@@ -206,7 +196,7 @@ def escape_with_printed_signs(rotor: PlantParameters, start: Floats) -> Escape:
     if events is None or not len(events[1]):
         raise ArithmeticError(f"with the printed signs {rotor} stayed inside {_OUTSIDE} clearances")
     contact, escape = float(events[0][0]), float(events[1][0])
-    return Escape(contact / per_rev, (escape - contact) / per_rev)
+    return (escape - contact) / per_rev
 
 
 def rub_limit(rotor: PlantParameters) -> float:

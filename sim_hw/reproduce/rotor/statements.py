@@ -67,16 +67,15 @@ def rows(experiment: RotorExperiment) -> tuple[ResultRow, ...]:
 
 
 def _model(experiment: RotorExperiment) -> Iterable[ResultRow]:
-    escape = experiment.escape
     yield ResultRow(
         name="printed-sign",
         figure="II",
         paper="x' = Ax + Bu + gamma f(Cx): the contact force enters with a plus",
-        obtained=f"{escape.escape_rev:.2f} rev after the first contact the disc is two clearances out",
+        obtained=f"{experiment.escape_rev:.2f} rev after the first contact the disc is two clearances out",
         agrees=False,
         remark="f points outwards: the printed sign pulls the disc through the housing. Everything below has "
         "a minus there, and friction that opposes the sliding of the rim.",
-        values={"escape_rev": escape.escape_rev},
+        values={"escape_rev": experiment.escape_rev},
     )
 
 
