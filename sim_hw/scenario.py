@@ -497,16 +497,8 @@ class Scenario(ScenarioTable):
             noise_um=sigma_um,
         )
 
-    def link(self, seed: int | None = None) -> LinkFaults | None:
-        """The scenario's link, or None if nothing is wrong with it."""
-        return (
-            None
-            if self.link_faults is None
-            else self.link_faults.for_seed(self.seed if seed is None else seed)
-        )
-
     def node_faults(self, seed: int | None = None) -> NodeFaults | None:
-        """What goes wrong with nodes and link, `link` included; None if nothing does."""
+        """What goes wrong with nodes and link; None if nothing does."""
         return planned_faults(self.fault, self.link_faults, self.seed if seed is None else seed)
 
 

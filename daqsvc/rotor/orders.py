@@ -176,8 +176,7 @@ class OrderChange:
         growth_significant: whether 1X has grown, at the false-alarm probability.
         healthy: float64 ``[3, channels]``, amplitudes of the orders in the healthy run.
         present: the same now.
-        healthy_uncertainty: float64 ``[3, channels]``, standard deviation of each component of them.
-        present_uncertainty: the same now.
+        present_uncertainty: float64 ``[3, channels]``, standard deviation of each component of them.
         residual_ratio: float64 ``[channels]``, root mean square beside the orders, now over healthy.
         residual_changed: whether its rise is a change.
     """
@@ -194,7 +193,6 @@ class OrderChange:
     growth_significant: bool
     healthy: Floats
     present: Floats
-    healthy_uncertainty: Floats
     present_uncertainty: Floats
     residual_ratio: Floats
     residual_changed: bool
@@ -259,7 +257,6 @@ def compare_orders(
         growth_significant=grown,
         healthy=np.abs(was.mean),
         present=np.abs(now.mean),
-        healthy_uncertainty=np.sqrt(was.variance / 2.0),
         present_uncertainty=np.sqrt(now.variance / 2.0),
         residual_ratio=residual.ratio,
         residual_changed=residual.changed,

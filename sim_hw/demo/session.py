@@ -130,6 +130,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+ROTOR_BANK = "rotor-bank"
 LINK_UP_S = 20.0
 KERNELS_S = 300.0
 """What a slow box may take to compile the kernels, at the first run."""
@@ -162,7 +163,7 @@ class Script:
     samples_per_rev: float | None = None
     faults: NodeFaults | None = None
     seed: int = 0
-    detector: str = "rotor-bank"
+    detector: str = ROTOR_BANK
 
     @property
     def duration_s(self) -> float:
@@ -390,9 +391,6 @@ async def _task(work: Coroutine[Any, Any, T]) -> AsyncIterator[asyncio.Task[T]]:
         await asyncio.wait({task})
         if not task.cancelled():
             task.exception()
-
-
-ROTOR_BANK = "rotor-bank"
 
 
 def summarise(script: Script, outcome: DemoOutcome, *, speed: float) -> dict[str, Any]:

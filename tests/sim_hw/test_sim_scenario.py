@@ -7,6 +7,7 @@ from support.machine_files import MACHINES
 from daqsvc.settings import load_machine_file
 from daqsvc.settings.sensors import Accelerometer
 from sim_hw.link_faults import LinkFaults
+from sim_hw.node_faults import EVER
 from sim_hw.scenario import (
     BearingScenario,
     RaceDamage,
@@ -81,8 +82,12 @@ def test_link_faults_scenario_is_the_paper_over_a_bad_link():
     assert faulty.model_dump(exclude={"title", "link_faults"}) == paper.model_dump(
         exclude={"title", "link_faults"}
     )
-    assert paper.link() is None
-    assert faulty.link(seed=9) == LinkFaults(
+    assert paper.node_faults() is None
+    faults = faulty.node_faults(seed=9)
+    assert faults is not None
+    ((window, link),) = faults.link
+    assert window == EVER
+    assert link == LinkFaults(
         drop=0.01, duplicate=0.01, reorder=0.01, corrupt=0.01, seed=9, reorder_within_ns=5_000_000
     )
 

@@ -39,7 +39,9 @@ def clean_record(
 
     t = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     start = [CENTRE.real, CENTRE.imag, 0.0, 0.0]
-    solved = solve_ivp(motion, (0.0, t[-1]), start, t_eval=t, rtol=1e-8, atol=1e-6, max_step=2e-3)
+    solved = solve_ivp(
+        motion, (0.0, t[-1]), start, t_eval=t, method="DOP853", rtol=1e-8, atol=1e-6, max_step=2e-2
+    )
     return solved.y[:2].T, w0 * t + growth * t * t / 2.0
 
 

@@ -265,14 +265,12 @@ class Convergence:
         before: RMS error in F1 L2, in clearances.
         after: RMS error in F1 L3 once it has settled.
         level: the error that counts as converging.
-        over_rev: float64 ``[n]``, RMS error over the revolution up to each sample.
     """
 
     begins: float
     before: float
     after: float
     level: float
-    over_rev: Floats
 
 
 def convergence(experiment: RotorExperiment) -> Convergence:
@@ -288,7 +286,6 @@ def convergence(experiment: RotorExperiment) -> Convergence:
         before=before,
         after=_rms(error[experiment.samples_of("F1L3", settled_rev=_CONVERGED_REV)]),
         level=level,
-        over_rev=over_rev,
     )
 
 
