@@ -5,13 +5,15 @@
     make guard                           # everything; exit code 1 and a diff if anything is not as before
     make guard ARGS=--take               # keep what comes out now, and print what has changed: is it meant?
     make guard ARGS="--only usage keys"  # some parts only
-    make guard ARGS=--fast               # all but the recordings; `make test` runs these parts, too
+    make guard ARGS=--fast               # all but the recordings; the tests run these parts, too
 
 The parts, and their texts in `golden/`:
 
 ``examples``
-    What `check`, `detectability` and `example` print of all machine files in config/ and of `specimens/`,
-    which have every key that there is. (check, detectability, example)
+    What `check` and `example` print of all machine files in config/ and of `specimens/`, which have every
+    key that there is. (check, example)
+``detectability``
+    What `detectability` prints of the same files. (detectability)
 ``broken``
     What `check` says of some 880 wrong machine files, made as `broken.py` tells: line, key, value, remedy
     and exit code. (broken-tables, broken-together, broken-text)

@@ -26,16 +26,10 @@ _MEMORY = (
 
 
 def examples() -> dict[str, str]:
-    """What `check`, `detectability` and `example` print of the examples and specimens."""
+    """What `check` and `example` print of the examples and specimens."""
     with workplace() as folder:
-        files = machine_files(folder)
         return {
-            "check.txt": _joined(answer("check", name) for name in files),
-            "detectability.txt": _joined(
-                answer("detectability", name, *more)
-                for name in files
-                for more in ((), ("--json",), ("--noise-um", "2", "--eccentricity-um", "10"))
-            ),
+            "check.txt": _joined(answer("check", name) for name in machine_files(folder)),
             "example.txt": _joined(
                 [
                     answer("example"),
@@ -45,6 +39,18 @@ def examples() -> dict[str, str]:
                     answer("check", "dbc-triaxial.toml"),
                 ]
             ),
+        }
+
+
+def detectability() -> dict[str, str]:
+    """What `detectability` prints of the examples and specimens."""
+    with workplace() as folder:
+        return {
+            "detectability.txt": _joined(
+                answer("detectability", name, *more)
+                for name in machine_files(folder)
+                for more in ((), ("--json",), ("--noise-um", "2", "--eccentricity-um", "10"))
+            )
         }
 
 
@@ -146,6 +152,7 @@ def _joined(answers: Iterable[Answer]) -> str:
 FAST: Mapping[str, Callable[[], dict[str, str]]] = {
     "keys": keys,
     "broken": broken,
+    "detectability": detectability,
     "examples": examples,
     "usage": usage,
     "schemas": schemas,

@@ -13,6 +13,7 @@ import pytest
 from guard.broken import contradictions, covered
 from guard.golden import FOLDER, compare
 from guard.measure import circles, imports, modules, repeated_classes
+from guard.parts import FAST
 from guard.recordings import DATA, GROUPS
 from guard.verbs import ROOT, SPECIMENS, answer, workplace
 
@@ -22,6 +23,8 @@ from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.section import Section
 
 CONFIG = ROOT / "config" / "machines"
+SLOW = {"keys", "detectability"}
+"""Parts that take longer than all others together: services are started, and machines simulated."""
 
 
 def guard(*arguments: str | Path, code: int = 0) -> str:
@@ -37,9 +40,12 @@ def guard(*arguments: str | Path, code: int = 0) -> str:
     return done.stdout
 
 
-@pytest.mark.timeout(300)
-def test_what_users_see_is_as_before():
-    guard("--fast")
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    "part", [pytest.param(part, marks=[pytest.mark.long] * (part in SLOW)) for part in FAST]
+)
+def test_what_users_see_is_as_before(part):
+    guard("--only", part)
 
 
 @pytest.mark.long

@@ -7,6 +7,7 @@ what the broker has acknowledged.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import sqlite3
@@ -30,11 +31,11 @@ TOLD = {*ALARM_OF.values(), *QUALITY_ALARM_OF.values()}
 
 def journal_of(store: Path) -> dict[str, bytes]:
     """Every alarm payload in the journal file by its id, in the order of its numbers."""
-    with sqlite3.connect(f"file:{store / 'outbox.sqlite'}?mode=ro", uri=True) as connection:
+    path = f"file:{store / 'outbox.sqlite'}?mode=ro"
+    with contextlib.closing(sqlite3.connect(path, uri=True)) as connection:
         rows = connection.execute(
             "SELECT payload FROM messages WHERE topic LIKE '%/alarms/%' ORDER BY sequence"
         ).fetchall()
-    connection.close()
     return {json.loads(payload)["id"]: payload for (payload,) in rows}
 
 

@@ -86,6 +86,11 @@ def settled_to(path: Path) -> int:
     return max((int(line.split()[1]) for line in tail[1:] if line.startswith(b"settled ")), default=-1)
 
 
+def may_end(witness: Path) -> Path:
+    """The file that lets the teller end, beside its notes: nothing befalls it any more."""
+    return witness.with_name("may-end")
+
+
 class Teller:
     """Takes the script's diagnoses to the desk and writes down what becomes of them."""
 
@@ -200,7 +205,9 @@ async def run(arguments: argparse.Namespace) -> None:
     running = [asyncio.create_task(each.run()) for each in desk.outputs.values()]
     timekeeper = asyncio.create_task(desk.keep_time())
     await teller.tell(script.steps[untold:])
-    while desk.outbox.counters.waiting or desk.outbox.counters.depth:
+    while (
+        desk.outbox.counters.waiting or desk.outbox.counters.depth or not may_end(arguments.witness).exists()
+    ):
         await asyncio.sleep(0.02)
     teller.write("done")
     timekeeper.cancel()
