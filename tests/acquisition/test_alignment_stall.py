@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.aligned_streams import START_NS, Device, aligned, exponential, uniform
+from support.examples import first_of
 from test_alignment_grid import START_NS as GRID_START_NS
 from test_alignment_grid import WAIT_NS, blocks_of, joined, sine
 
@@ -77,7 +78,7 @@ def test_what_comes_for_longer_than_is_remembered_is_not_forgotten_for_the_other
 
 
 @pytest.mark.parametrize("delays", [uniform, exponential])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", first_of(0, 1))
 def test_a_stall_without_loss_costs_no_row_and_no_trust(delays, seed) -> None:
     """Five seconds in which nothing is read, after 25 s; then all of it comes with one time of arrival."""
     devices = [

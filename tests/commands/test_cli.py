@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.brokers import free_port
+from support.examples import first_of
 from support.paths import ROOT
 
 from daqsvc import service as service_module
@@ -97,7 +98,7 @@ def test_the_readme_names_every_verb() -> None:
     assert sorted(re.findall(r"`(\w+)", " ".join(rows))) == sorted(VERBS)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", first_of(signal.SIGTERM, signal.SIGINT))
 def test_run_stops_even_if_the_broker_is_dead(number: int, tmp_path: Path) -> None:
     text = (CONFIG / "laval-rig.toml").read_text()
     text = text.replace('interface = "socketcan"', 'interface = "virtual"')

@@ -72,7 +72,7 @@ def daqsvc(
 @needs_setpriv
 @pytest.mark.parametrize(
     "verb",
-    [pytest.param(v, marks=[] if v in {"check", "record"} else pytest.mark.long) for v in USING_KERNELS],
+    [pytest.param(v, marks=[] if v == "check" else pytest.mark.long) for v in USING_KERNELS],
 )
 def test_an_account_without_a_home_can_use_every_verb(verb: str, tmp_path: Path) -> None:
     tmp_path.chmod(0o755)

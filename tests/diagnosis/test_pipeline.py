@@ -128,9 +128,9 @@ async def test_a_detector_that_raises_is_heard_once_and_goes_on(caplog: pytest.L
     said: list[Diagnosis] = []
     pipeline = Pipeline({"s": ring}, [broken], said.append, CLOCK)
     running = asyncio.create_task(pipeline.run())
-    for _ in range(3):
+    for count in (1, 2, 3):
         write(ring, 10)
-        await asyncio.sleep(0.02)
+        await eventually(lambda count=count: len(said) == count, "the window is judged")
     ring.close()
     await running
     assert pipeline.counters["broken"].failures == 1

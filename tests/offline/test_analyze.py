@@ -163,6 +163,7 @@ def test_a_person_reads_what_and_since_when(tmp_path: Path, capsys: pytest.Captu
     assert len(lines) <= 8
 
 
+@pytest.mark.long
 def test_figures_are_drawn_for_each_recording(analyze: Callable[..., Any], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     other = tmp_path / "other"

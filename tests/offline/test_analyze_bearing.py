@@ -72,6 +72,7 @@ def test_without_a_healthy_run_a_healthy_machine_is_normal(verb: Run, files: dic
     assert found["probabilities"]["normal"] > 0.5
 
 
+@pytest.mark.long
 def test_many_recordings_come_in_order_from_any_number_of_processes(
     verb: Run, files: dict[str, Path]
 ) -> None:

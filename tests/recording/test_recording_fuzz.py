@@ -9,6 +9,7 @@ import can
 import numpy as np
 import pytest
 from support import damaged_recordings
+from support.examples import first_of
 from support.fuzz_bytes import mutated
 from support.orbit_files import OPTIONS, Orbit
 from support.paths import ROOT
@@ -93,7 +94,7 @@ def test_no_pickle_is_loaded(tmp_path):
         assert not trace.exists(), name
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", first_of(2, 1))
 def test_damaged_recordings_cost_a_line_each(tmp_path, capsys, jobs):
     stop_reading()
     sound = Orbit().save(tmp_path / "sound.npz")

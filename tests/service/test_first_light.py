@@ -178,7 +178,8 @@ async def test_a_race_fault_arrives_sample_for_sample_and_raises_the_alarm_of_re
     assert calm.alarms == 0
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 5))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(5))
 async def test_loss_counters_equal_what_was_injected(seed: int) -> None:
     rng = np.random.default_rng(seed)
     noise = Recording(("a",), rng.normal(size=(120_000, 1)), 12_000.0, __file__, 0)  # type: ignore[arg-type]

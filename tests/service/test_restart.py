@@ -110,6 +110,7 @@ async def test_a_latching_alarm_keeps_its_occurrence_over_restarts(tmp_path: Pat
     assert told[2]["previous"]["state"] == "latched_unacknowledged"
 
 
+@pytest.mark.long
 async def test_a_sensor_that_came_back_while_the_service_was_down_is_told(tmp_path: Path) -> None:
     file = machine(free_port())
     async with running(file, tmp_path) as service:

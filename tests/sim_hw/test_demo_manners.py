@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from rich.console import Console
+from support.examples import first_of
 
 from daqsvc.service import Service
 from sim_hw.demo import broker, session
@@ -264,7 +265,7 @@ def test_an_alarm_is_shown_once_where_no_terminal_is(form: list[str], tmp_path: 
     assert said.count("danger limit") == 1, said
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", first_of(signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
 def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
     path = save(tmp_path / "rig.npz", a=noise(600))
     with demo("--recording", str(path), "--json", "--speed", "2", env=elsewhere(tmp_path)) as running:
@@ -283,6 +284,7 @@ def without_delays(said: str) -> list[str]:
     return [line for line in said.splitlines() if "the process stood still for" not in line]
 
 
+@pytest.mark.long
 def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path: Path) -> None:
     path = save(tmp_path / "rig.npz", a=noise(600))
     playing = ["--recording", str(path), "--json", "--speed", "2"]

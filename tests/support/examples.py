@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from _pytest.mark.structures import ParameterSet
 
 ALL = os.environ.get("DAQSVC_EXAMPLES") == "all"
 _FEW = 15
@@ -15,3 +21,12 @@ def examples(count: int) -> int:
     They are drawn in the same order each time, so the short run is the beginning of the long one.
     """
     return count if ALL else max(min(count, _FEW), count // 3)
+
+
+def first_of(first: object, *others: Any) -> list[object | ParameterSet]:
+    """Cases for ``parametrize``: the first every day, all in ``make test-long``.
+
+    Tuples are several arguments.
+    """
+    arguments = [one if isinstance(one, tuple) else (one,) for one in others]
+    return [first, *(pytest.param(*several, marks=pytest.mark.long) for several in arguments)]

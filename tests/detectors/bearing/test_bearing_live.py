@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support.bearing_signals import INNER, OUTER, RATE_HZ, SPEED_RPM, healthy, knocks
+from support.examples import first_of
 from support.machine_files import MACHINES
 
 from daqsvc.acquisition.clock import NS_PER_S
@@ -87,6 +88,7 @@ def learnt() -> BearingBaseline:
     return watch.baseline
 
 
+@pytest.mark.long
 def test_a_fault_is_raised_by_two_looks_and_taken_back_by_eight(learnt) -> None:
     kept: list[BearingBaseline] = []
     watch = detector(keep=kept.append)
@@ -232,7 +234,7 @@ def pair():
     return {"healthy": run("healthy", 12.5), "inner": run("inner", 7.5), "outer": run("outer", 7.5)}
 
 
-@pytest.mark.parametrize(("fault", "sign"), [("inner", 1.0), ("outer", -1.0)])
+@pytest.mark.parametrize(("fault", "sign"), first_of(("inner", 1.0), ("outer", -1.0)))
 def test_two_accelerometers_tell_the_race_where_the_lines_do_not(pair, fault, sign) -> None:
     """The bearing is another one than the file says: its lines are not found, and the direction decides."""
     watch = with_pair()

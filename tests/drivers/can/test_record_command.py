@@ -13,6 +13,7 @@ import can
 import pytest
 from support.brokers import free_port
 from support.can_recordings import numbers
+from support.examples import first_of
 from support.paths import ROOT
 from support.waiting import PATIENCE_S, eventually_blocking
 
@@ -87,7 +88,7 @@ def send_until_it_is_recorded(bus: UnixBus, log: Path) -> int:
     return sent
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", first_of(*ENDINGS))
 def test_what_is_recorded_is_printed_when_it_is_stopped(
     bus: UnixBus, machine: Path, tmp_path: Path, ending: str
 ) -> None:
@@ -111,7 +112,7 @@ def test_what_is_recorded_is_printed_when_it_is_stopped(
     assert summary["streams"]["shaft"] == {"samples_received": 0, "samples_lost": 0}
 
 
-@pytest.mark.parametrize("ending", [".blf", ".asc", ".log"])
+@pytest.mark.parametrize("ending", first_of(".blf", ".asc", ".log"))
 def test_a_recorder_that_is_killed_leaves_what_it_has_written(
     bus: UnixBus, machine: Path, tmp_path: Path, ending: str
 ) -> None:

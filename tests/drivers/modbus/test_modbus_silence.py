@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clocks import LoopClock
-from support.examples import examples
+from support.examples import examples, first_of
 from support.modbus_layouts import count_at, fifo_layout, in_sample, register, registers_layout
 from support.modbus_lines import Rig, options_of, responding, simulate
 
@@ -96,7 +96,7 @@ def test_a_line_that_was_opened_is_quiet_as_if_somebody_had_just_asked():
 
 
 @pytest.mark.parametrize("fault", ["silent", "wrong function", "gateway"])
-@pytest.mark.parametrize("demote_after", [1, 3])
+@pytest.mark.parametrize("demote_after", first_of(3, 1))
 def test_a_unit_lives_while_it_answers_anything(fault, demote_after, caplog):
     """A queue that the unit does not know costs its other stream nothing, and the link stays up."""
     unit_side = units()

