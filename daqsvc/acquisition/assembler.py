@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.samples import Samples
     from daqsvc.acquisition.standing import Tell
+
+    Frames: TypeAlias = tuple[NDArray[np.int64], Samples, NDArray[np.int64]]
+    """Counters, samples and times of arrival, see `StreamAssembler.accept`."""
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +121,9 @@ class StreamAssembler:
         self._arrival_ns = 0
         self._gaps: deque[tuple[int, int]] = deque(maxlen=REMEMBERED_GAPS)
         self._after_restart = False
-        self._unplaced: list[tuple[NDArray[np.int64], Samples, NDArray[np.int64]]] = []
+        self._unplaced: list[Frames] = []
+        self._doubtful: Frames | None = None
+        """The last frame that came, if only the next one can tell whether it is the first after a restart."""
         self._asked_ns = 0
         self._advanced_ns = 0
         frame_rate_hz = rate_hz / samples_per_frame
@@ -207,10 +212,9 @@ class StreamAssembler:
 
         That is how a gap is closed, and why a counter is behind the clock.
         """
-        if self._unplaced:
-            _, _, arrival_ns = self._unplaced[0]
-            if now_ns - int(arrival_ns[-1]) > self._time.watch_ns + self._patience_ns:
-                self._place()
+        waiting = self._unplaced[0] if self._unplaced else self._doubtful
+        if waiting and now_ns - int(waiting[2][-1]) > self._time.watch_ns + self._patience_ns:
+            self._place()
         if self._held is not None and now_ns - self._waiting_since_ns > self._patience_ns:
             self._release(everything=True)
 
@@ -235,24 +239,15 @@ class StreamAssembler:
 
     def _place(self, *, until_sure: bool = False) -> None:
         """Place what has come, unless more has to come before that can be done for sure."""
-        if not self._unplaced:
+        ready = self._ready(until_sure=until_sure)
+        if ready is None:
             return
-        newest_ns = int(self._unplaced[-1][2][-1])
-        if until_sure and len(self._unplaced) > 1 and 0 <= newest_ns - self._asked_ns < ASK_AGAIN_NS:
-            return
-        counter, samples, arrival_ns = self._unplaced[0]
-        if len(self._unplaced) > 1:
-            counter, samples, arrival_ns = map(np.concatenate, zip(*self._unplaced, strict=True))
-        if until_sure and self._time.wants_more(counter, arrival_ns):
-            self._asked_ns = newest_ns
-            sure = self._time.sure(counter, arrival_ns)
-            if not sure:
-                return
-            self._unplaced = [(counter[sure:], samples[sure:], arrival_ns[sure:])]
-            counter, samples, arrival_ns = counter[:sure], samples[:sure], arrival_ns[:sure]
-        else:
-            self._unplaced = []
+        counter, samples, arrival_ns = ready
+        newest_ns = int(arrival_ns[-1])
         indices, fits, restarts, anew = self._time.place(counter, arrival_ns)
+        if until_sure and not fits[-1]:
+            self._doubtful = counter[-1:], samples[-1:], arrival_ns[-1:]
+            counter, samples, indices, fits = counter[:-1], samples[:-1], indices[:-1], fits[:-1]
         before = self.counters.frames_rejected
         self._reject(int((~fits).sum()))
         if restarts:
@@ -276,6 +271,29 @@ class StreamAssembler:
                 self._after_restart = True
             start = restart
         self._sense.placed(len(counter), self.counters.frames_rejected - before, newest_ns)
+
+    def _ready(self, *, until_sure: bool) -> Frames | None:
+        """What can be placed now, the frame that was doubtful first; None if that is nothing."""
+        come = self._unplaced
+        self._unplaced = []
+        if until_sure:
+            newest_ns = int(come[-1][2][-1])
+            if len(come) > 1 and 0 <= newest_ns - self._asked_ns < ASK_AGAIN_NS:
+                self._unplaced = come
+                return None
+            counter, samples, arrival_ns = _joined(come)
+            if self._time.wants_more(counter, arrival_ns):
+                self._asked_ns = newest_ns
+                sure = self._time.sure(counter, arrival_ns)
+                self._unplaced = [(counter[sure:], samples[sure:], arrival_ns[sure:])]
+                if not sure:
+                    return None
+                counter, samples, arrival_ns = counter[:sure], samples[:sure], arrival_ns[:sure]
+            come = [(counter, samples, arrival_ns)]
+        if self._doubtful is not None:
+            come = [self._doubtful, *come]
+            self._doubtful = None
+        return _joined(come) if come else None
 
     def _reject(self, frames: int) -> None:
         if frames and not self.counters.frames_rejected:
@@ -410,6 +428,14 @@ class StreamAssembler:
                 self._time.error_at(first),
             )
         )
+
+
+def _joined(parts: list[Frames]) -> Frames:
+    """Batches of frames, at least one, as one batch."""
+    if len(parts) == 1:
+        return parts[0]
+    counter, samples, arrival_ns = zip(*parts, strict=True)
+    return np.concatenate(counter), np.concatenate(samples), np.concatenate(arrival_ns)
 
 
 def note_received(counters: StreamCounters, stream: str, samples: Samples) -> Samples:

@@ -195,12 +195,19 @@ def follow(
                 place = last[COUNT] + ahead_by
                 late[0] = max(before + elapsed - ahead_by, 0.0)
             elif last[SUSPECTED] and np.uint64(0) < beyond <= np.uint64(4.0 * step_usual):
+                # The frame before was the first of the new count; it may have been of another batch.
+                first = max(at - 1, 0)
+                until_first = (arrival_ns[first] - last[SEEN_NS]) * rate
+                by_clock = last[COUNT] + np.int64(np.rint(until_first + before))
                 # Never before anything placed already: two samples cannot share an index.
-                by_clock = last[COUNT] + np.int64(np.rint(elapsed + before))
                 place = max(by_clock, last[HIGHEST] + np.int64(step_usual))
-                restarts[n_restarts] = at
+                restarts[n_restarts] = first
                 n_restarts += 1
                 late[0] = 0.0
+                if first < at:
+                    kept[first], count[first] = True, place
+                    place += np.int64(beyond)
+                    late[0] = max((elapsed - until_first) * (1.0 - drift) - beyond, 0.0)
             else:
                 last[SUSPECT], last[SUSPECTED] = raw[at], 1
                 kept[at] = False
@@ -240,7 +247,8 @@ class CounterUnwrapper:
 
     A frame is taken by its sequence alone while that agrees with the host clock. Where it does not,
     the number of missed wraps comes from the clock; a counter that no number of wraps can explain is
-    held back until the next frame continues from it, and only then believed to be a restart.
+    kept only if the next frame of the batch continues from it: then it is a restart. The last frame of a
+    batch may come once more, as the first one of the next.
 
     Frames that waited in a buffer, because the process was suspended, arrive late and all at once. If the
     buffer overflowed, the first frame after them is a long step ahead in no time: such a step may be as long
