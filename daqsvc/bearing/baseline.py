@@ -319,7 +319,9 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
         BaselineFileError: the file cannot be read or used; the message names file, key, value and remedy.
     """
     try:
-        table = _File.model_validate(read_toml(Path(path)))
+        document = read_toml(Path(path))
+        _refuse_rotor(document, path)
+        table = _File.model_validate(document)
         return BearingBaseline(
             rate_hz=table.rate_hz,
             speed_rpm=table.speed_rpm,
@@ -338,8 +340,18 @@ def load_bearing_baseline(path: Path | str) -> BearingBaseline:
         key = ".".join(map(str, first["loc"]))
         why = first["msg"].removeprefix("Value error, ").lower()
         raise BaselineFileError(f"{path}: {key} = {_short(first['input'])}: {why}; {_REMEDY}") from None
+    except BaselineFileError:
+        raise
     except (ValueError, RecursionError) as error:
         raise BaselineFileError(f"{path}: {error}; {_REMEDY}") from None
+
+
+def _refuse_rotor(document: Mapping[str, Any], path: Path | str) -> None:
+    if "rotor" in document and "kind" not in document:
+        raise BaselineFileError(
+            f"{path}: was written of a rotor, for pipeline.rotor_synchronous.calibration or --calibration "
+            "with --probes, and bearings are watched here; calibrate them"
+        )
 
 
 def save_bearing_baseline(baseline: BearingBaseline, path: Path | str) -> None:

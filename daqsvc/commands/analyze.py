@@ -124,6 +124,7 @@ def _by_options(arguments: argparse.Namespace) -> Runner:
             told,
             in_memory=True,
             patterns=True,
+            calibration=told.calibration,
             healthy=told.baseline,
             healthy_channels=told.baseline_map,
             healthy_rate_hz=told.baseline_fs,

@@ -166,7 +166,7 @@ class CalibrateCommand:
 
         runner = self._runner(bearing_machine, machine, arguments)
         (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
-        loaded = runner.load(recording, only=bearings.sensors)
+        (loaded,) = _with_notes_said([runner.load(recording, only=bearings.sensors)])
         try:
             return calibrate_bearings(runner.machine, bearings.given, loaded, together=machine is None)
         except (RefusedError, NotIdentifiableError):

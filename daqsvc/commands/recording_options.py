@@ -308,7 +308,8 @@ def _add_about_recordings(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         type=Path,
         metavar="FILE",
-        help="the healthy machine as daqsvc calibrate wrote it, in place of the first revolutions",
+        help="the healthy machine as daqsvc calibrate wrote it, in place of the first revolutions or of "
+        "--baseline",
     )
 
 
@@ -491,7 +492,15 @@ def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
         return "--speed-rpm orbit:N needs two probes; with --channels give the nominal speed alone"
     if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
         return f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
-    return ""
+    return next(_baseline_misuse(arguments), "")
+
+
+def _baseline_misuse(arguments: argparse.Namespace) -> Iterator[str]:
+    if arguments.baseline is not None and arguments.baseline.lower().endswith(".toml"):
+        yield (
+            f"--baseline {arguments.baseline}: takes a recording; a file that daqsvc calibrate wrote of "
+            "bearings is for --calibration, with --bearing or --orders or a machine file"
+        )
 
 
 def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iterator[str]:
@@ -500,11 +509,9 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
         yield "--bearing, --orders: the machine file says which bearings there are; leave them out"
     if arguments.bearing is not None and arguments.orders is not None:
         yield "--bearing and --orders both say what the bearing is; leave out one of them"
-    if arguments.calibration is not None:
-        yield (
-            "--calibration: goes with a machine file, whose bearings it was learnt for; with --bearing or "
-            "--orders give the healthy recording itself, --baseline FILE"
-        )
+    if arguments.calibration is not None and arguments.baseline is not None:
+        yield "--calibration and --baseline both say what the healthy machine is; leave out one of them"
+    yield from _baseline_misuse(arguments)
     if extra := _given(arguments, _PROBES_ONLY):
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
     if missing := _missing(arguments, ("--channels", "--speed-rpm")):

@@ -135,13 +135,11 @@ class Evaluated:
         statements: what it said, condensed.
         verdict: what that comes to; None if it gives none by itself.
         draw: writes figures, whose names begin with what it is called with; None if there is nothing to draw.
-        shown: whether a person is shown the statements; not, if the verdict tells the same.
     """
 
     statements: tuple[Statements, ...] = ()
     verdict: Verdict | None = None
     draw: Callable[[str], object] | None = None
-    shown: bool = True
 
 
 class RecordedDetector(Generic[SettingsT]):
@@ -181,6 +179,15 @@ class RecordedDetector(Generic[SettingsT]):
         known = {sensor.name for sensor in self.machine.sensors}
         named = known.intersection(_texts(self.given.model_dump()))
         return self.given if all(name in sensors for name in named) else None
+
+    def left_out(self, sensors: Container[str]) -> str:
+        """What of the machine a recording tells nothing of, in a sentence; empty if there is nothing.
+
+        Args:
+            sensors: names of the sensors that the recording has.
+        """
+        del sensors
+        return ""
 
     def not_judged(self, recording: str, why: str) -> Verdict | None:
         """The verdict about a recording that cannot be judged; None if this detector gives none.

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
         Progress,
         RecordedDetector,
         RecordingOptions,
-        Statements,
         Verdict,
     )
     from daqsvc.recording.recording import Recording
@@ -156,6 +155,8 @@ class Runner:
         except (RecordingError, RefusedError) as error:
             return self._outcome(_not_judged(self.detectors, recording, str(error)), {})
         present, machine = self._as_recorded(loaded)
+        left_out = (one.left_out(loaded.names) for one in self.detectors.values())
+        notes = [*loaded.notes, *filter(None, left_out)]
         found: dict[str, Evaluated] = {}
         wrong = ""
         for key, given in present.items():
@@ -170,34 +171,46 @@ class Runner:
                 draw(figures)
         if wrong:
             first = _not_judged({key: self.detectors[key] for key in present}, recording, wrong)
-            return self._outcome(first, found, loaded.notes)
+            return self._outcome(first, found, notes)
         heads = _heads({key: self.detectors[key] for key in present})
         verdicts = [verdict for key in heads.values() if (verdict := found[key].verdict) is not None]
         if not verdicts:
             verdicts = [RotorVerdict(recording=recording, quality=known_against(loaded))]
-        return self._outcome(verdicts[0], found, loaded.notes, verdicts[1:])
+        others = {key: one for key, one in found.items() if key not in heads.values()}
+        return self._outcome(verdicts[0], found, notes, verdicts[1:], others)
 
     def _outcome(
         self,
         first: Verdict,
         found: Mapping[str, Evaluated],
         notes: Iterable[str] = (),
-        others: Sequence[Verdict] = (),
+        verdicts: Sequence[Verdict] = (),
+        others: Mapping[str, Evaluated] | None = None,
     ) -> Outcome:
-        """The verdict about the first part of the machine, the others below it, then all statements."""
+        """What is printed.
+
+        Args:
+            first: the verdict about the first part of the machine.
+            found: what all detectors brought forward.
+            notes: what a person should know of the recording, in sentences.
+            verdicts: about the other parts.
+            others: the detectors that give none of these; None: all.
+        """
         json = first.as_json()
         if self.options.in_memory:
             return Outcome(json, first.describe(), first.refused is not None)
         quality = json["data_quality"]
         quality["problems"] = list(dict.fromkeys([*notes, *quality["problems"]]))
         texts = [first.describe()]
-        texts += [said.describe() for one in found.values() if one.shown for said in one.statements]
-        for verdict in others:
+        said = [said for one in (found if others is None else others).values() for said in one.statements]
+        texts += [one.describe() for one in said]
+        for verdict in verdicts:
             json[verdict.part] = verdict.as_json()
             texts.append(f"{verdict.part}s of {verdict.describe()}")
-        statements: list[Statements] = [said for one in found.values() for said in one.statements]
-        json["detectors"] = {said.detector: said.as_json() for said in statements}
-        if alarmed := worst(statements):
+        json["detectors"] = {
+            each.detector: each.as_json() for one in found.values() for each in one.statements
+        }
+        if alarmed := worst(said):
             texts.insert(1, f"worst of the other detectors: {alarmed}")
         texts[1:1] = [note for note in notes if note not in texts[0]]
         return Outcome(json, "\n  ".join(texts), first.refused is not None)

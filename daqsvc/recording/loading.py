@@ -16,10 +16,10 @@ from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
 from daqsvc.recording.contents import NUMERIC
 from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import read
-from daqsvc.recording.rate import time_column, timing_of
+from daqsvc.recording.rate import place_at, time_column, timing_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,8 +45,7 @@ def load(
     named = bool(channels)
     if not channels:
         channels, left_out = _longest(file, contents)
-    columns = {name: _channel(file, contents, variable) for name, variable in channels.items()}
-    length = _common_length(file, columns, channels)
+    columns, length = _channels(file, contents, channels)
     timing = timing_of(file, contents, length, rate_hz)
     about = {
         "names": list(columns),
@@ -63,6 +62,31 @@ def load(
         _refuse_impossible(file, list(channels), samples)
     about["nan_count"], about["infinity_count"] = _count_bad(samples)
     return about, (samples,)
+
+
+def load_streams(
+    path: str, streams: Sequence[tuple[Mapping[str, str], float]], memory_bytes: int
+) -> tuple[list[Sequence[str]], list[Floats]]:
+    """Read the channels of several streams; see `daqsvc.recording.recording.load_streams`.
+
+    Returns:
+        Notes on each stream; and its samples.
+
+    Raises:
+        RecordingError: see there.
+    """
+    file = Path(path)
+    contents = read(file, ResourceLimits(memory_bytes))
+    notes: list[Sequence[str]] = []
+    found: list[Floats] = []
+    for channels, rate_hz in streams:
+        columns, length = _channels(file, contents, channels)
+        rows, noted = place_at(file, contents, length, rate_hz)
+        samples = _together(columns, length, rows)
+        _refuse_impossible(file, list(channels), samples)
+        notes.append(noted)
+        found.append(samples)
+    return notes, found
 
 
 def channels_of(path: str, memory_bytes: int) -> tuple[dict[str, int], tuple[()]]:
@@ -88,6 +112,14 @@ def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, 
             why = f"holds no channel beside its time column {time!r}"
         raise RecordingError(f"{path} {why}; it holds {contents.listing()}")
     return channels, {name: length for name, length in lengths.items() if length < longest}
+
+
+def _channels(
+    path: Path, contents: Contents, channels: Mapping[str, str]
+) -> tuple[dict[str, NDArray[np.generic]], int]:
+    """The channels by the names that they are given, and their length."""
+    columns = {name: _channel(path, contents, variable) for name, variable in channels.items()}
+    return columns, _common_length(path, columns, channels)
 
 
 def _channel(path: Path, contents: Contents, variable: str) -> NDArray[np.generic]:

@@ -103,11 +103,7 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         RecordingError: nobody says the rate, the file contradicts itself or what is given, most samples are
             missing, or the rate is outside of `LEAST_RATE_HZ` to `MOST_RATE_HZ`.
     """
-    stated = {
-        name: value
-        for name, value in contents.scalars().items()
-        if name.rpartition(".")[2].lower() in RATE_NAMES
-    }
+    stated = _stated(contents)
     column = _time(path, contents, length)
     if given_hz is not None:
         others = "".join(
@@ -136,6 +132,42 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
     return Timing(float(rate_hz), source, column.stamps.rows, column.notes())
 
 
+def place_at(
+    path: Path, contents: Contents, length: int, rate_hz: float
+) -> tuple[NDArray[np.int64] | None, tuple[str, ...]]:
+    """Where samples have their places that are taken at a rate, whatever the file says about it.
+
+    Args:
+        path: the file, for messages.
+        contents: what it holds.
+        length: samples of a channel.
+        rate_hz: samples per second.
+
+    Returns:
+        As `Timing.rows` and `Timing.notes`. Nothing is said to be missing by a column of time that tells
+        another rate.
+
+    Raises:
+        RecordingError: most samples are missing.
+    """
+    stated, column = _stated(contents), _time(path, contents, length)
+    if other := _other_rates(stated, column, rate_hz):
+        note = (
+            f"the sampling rate of {path} is {other} by the file and {rate_hz:g} Hz by the machine file, "
+            "which is taken: correct the one that is wrong"
+        )
+        return None, (note,)
+    return (None, ()) if column is None else (column.stamps.rows, column.notes())
+
+
+def _stated(contents: Contents) -> dict[str, float]:
+    return {
+        name: value
+        for name, value in contents.scalars().items()
+        if name.rpartition(".")[2].lower() in RATE_NAMES
+    }
+
+
 def _refuse_contradictions(
     path: Path, stated: Mapping[str, float], column: _TimeColumn | None, given_hz: float | None
 ) -> None:
@@ -146,24 +178,32 @@ def _refuse_contradictions(
     Raises:
         RecordingError: they do.
     """
-    said = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
-    if column is not None:
-        said.append(f"{column.stamps.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
     if given_hz is None:
         if column is not None and any(not column.agrees(hz) for hz in stated.values()):
             raise RecordingError(
-                f"the sampling rate of {path} is {' and '.join(said)} by the file, which contradicts itself: "
-                "say which with --fs, or correct the file"
+                f"the sampling rate of {path} is {_rates(stated, column)} by the file, which contradicts "
+                "itself: say which with --fs, or correct the file"
             )
-        return
+    elif other := _other_rates(stated, column, given_hz):
+        raise RecordingError(
+            f"the sampling rate of {path} is {other} by the file and {given_hz:g} Hz as given: "
+            "leave --fs out, or correct it"
+        )
+
+
+def _other_rates(stated: Mapping[str, float], column: _TimeColumn | None, given_hz: float) -> str:
+    """The rates that a file tells, in words, if none is the one that is given; else empty."""
     agreed = any(abs(hz / given_hz - 1.0) <= SAME_RATE for hz in stated.values()) or (
         column is not None and column.agrees(given_hz)
     )
-    if said and not agreed:
-        raise RecordingError(
-            f"the sampling rate of {path} is {' and '.join(said)} by the file and {given_hz:g} Hz as given: "
-            "leave --fs out, or correct it"
-        )
+    return "" if agreed else _rates(stated, column)
+
+
+def _rates(stated: Mapping[str, float], column: _TimeColumn | None) -> str:
+    said = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
+    if column is not None:
+        said.append(f"{column.stamps.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
+    return " and ".join(said)
 
 
 def time_column(contents: Contents, length: int) -> str | None:
@@ -243,8 +283,15 @@ def _why_not(contents: Contents, length: int) -> str:
         if _is_named(name):
             with np.errstate(invalid="ignore"):
                 steps = np.diff(_seconds(name, contents.entries[name])[0])
+            known = steps[np.isfinite(steps)]
+            if not len(known):
+                return f", and its time column {name!r} has no two times in a row"
+            backward = int((known < 0.0).sum())
+            if backward == len(known):
+                return f", and the times of its column {name!r} go backwards, row by row"
+            some = f", and {backward:,} of them go back" if backward else ""
             return (
                 f", and the steps of its time column {name!r} are uneven "
-                f"({np.min(steps):.3g} to {np.max(steps):.3g} s)"
+                f"({np.min(known):.3g} to {np.max(known):.3g} s){some}"
             )
     return ""

@@ -13,12 +13,12 @@ from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import find
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
-    from daqsvc.confined.process import WorkResult
+    from daqsvc.confined.process import ConfinedProcess, WorkResult
 
     Floats: TypeAlias = NDArray[np.float64]
 
@@ -117,6 +117,33 @@ def load_recording(
     return Recording(samples=samples, source=path, **about)
 
 
+def load_streams(
+    path: Path,
+    streams: Sequence[tuple[Mapping[str, str], float]],
+    limits: ResourceLimits,
+    reader: ConfinedProcess,
+) -> list[tuple[Floats, Sequence[str]]]:
+    """Read the channels of several streams out of one file, each at a rate that is known.
+
+    Args:
+        path: the file, see `load_recording`.
+        streams: for each stream its channels, see `load_recording`, and its samples per second. Streams may
+            last for different times, the channels of one may not.
+        limits: what reading the file may take.
+        reader: the process that reads it; it is left as it is.
+
+    Returns:
+        For each stream its samples, float64 ``[n, channels]`` in the units of the file, and notes as in
+        `Recording`. Samples that are missing by a column of time are NaN. Where the file tells another rate
+        a note says so.
+
+    Raises:
+        RecordingError: see `load_recording`; but for the rate.
+    """
+    notes, samples = _there("load_streams", path, {"streams": list(streams)}, limits, reader)
+    return list(zip(samples, notes, strict=True))
+
+
 def list_channels(path: Path | str) -> dict[str, int]:
     """What can be loaded from a file: the number of samples of each numeric channel, by name.
 
@@ -175,16 +202,22 @@ def stop_reading() -> None:
     shared.close()
 
 
-def _there(function: str, path: Path, arguments: Mapping[str, Any]) -> WorkResult:
+def _there(
+    function: str,
+    path: Path,
+    arguments: Mapping[str, Any],
+    limits: ResourceLimits | None = None,
+    reader: ConfinedProcess = shared,
+) -> WorkResult:
     """Call a function of `daqsvc.recording.loading` about a file in the process that reads.
 
     Raises:
         RecordingError: the file cannot be read.
     """
     _, file_bytes = find(path)
-    limits = get_limits()
+    limits = limits or get_limits()
     try:
-        return shared.call(
+        return reader.call(
             f"daqsvc.recording.loading:{function}",
             {"path": str(path), "memory_bytes": limits.memory_bytes, **arguments},
             memory_bytes=limits.memory_bytes,
@@ -201,5 +234,8 @@ def _there(function: str, path: Path, arguments: Mapping[str, Any]) -> WorkResul
         if error.reason != "crash":
             remedy = f"unless it is that large it is damaged: {remedy.partition(': ')[2]}"
         if error.reason == "memory":
-            remedy = f"allow more (--max-memory; it is {limits.memory_bytes / 1e9:.3g} GB), or {remedy}"
+            remedy = (
+                f"allow more (--max-memory, or max_memory_gb of a replayed bus; it is "
+                f"{limits.memory_bytes / 1e9:.3g} GB), or {remedy}"
+            )
         raise RecordingError(f"{path} cannot be read: {error.how}; {remedy}") from None

@@ -17,7 +17,6 @@ from daqsvc.confined.limits import UNBOUNDED, Budget, CountedFile
 from drivers.replay.blf import BlfFile
 from drivers.replay.files import RecordedLogError, words
 from drivers.replay.lines import TextLog, whole
-from drivers.replay.table import no_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -79,7 +78,11 @@ class CanLog:
 
     def _open(self) -> Iterator[can.Message]:
         if not self._path.is_file():
-            raise ValueError(no_file(self._path))
+            raise ValueError(
+                "it is no file but a folder, pipe or device"
+                if self._path.exists()
+                else "there is no such file"
+            )
         zipped = self._path.suffix.lower() == ".gz"
         reader = MESSAGE_READERS.get((self._path.with_suffix("") if zipped else self._path).suffix.lower())
         if reader is SqliteReader:

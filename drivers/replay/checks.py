@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.section import UnusableValueError
 from drivers.can.settings import DbcLayout, PlainLayout
-from drivers.replay.settings import ReplayBus, TableLayout
+from drivers.replay.settings import TABLES, ReplayBus, TableLayout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -58,7 +58,7 @@ def check_replayed(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[
         if bus is not None and not table:
             yield Finding(
                 (*at, "layout", "columns"),
-                f'bus "{stream.bus}" has no columns: only the replay of an .npz or .csv file has',
+                f'bus "{stream.bus}" has no columns: only the replay of a table has ({TABLES})',
                 "describe the frames of the bus, or correct the bus of the stream",
             )
         for index, column in enumerate(layout.columns):

@@ -29,7 +29,6 @@ from drivers.replay.files import (
     TABLE_COUNTER_BITS,
     RecordedLogError,
     SampleTable,
-    kind_of,
     words,
 )
 from drivers.replay.growing import GrowingCandump, Place
@@ -158,7 +157,7 @@ class ReplayDriver:
     Once it has been played to its end and is not to be played again, the link is down with the reason "end of
     file". Played as fast as the receiver takes it, the samples' times run ahead of the clock.
 
-    A CAN log takes streams with a `drivers.frames.FrameLayout`, a table (``.npz``, ``.csv``) streams with a
+    A CAN log takes streams with a `drivers.frames.FrameLayout`, a table of samples streams with a
     `TableLayout`. When a recording is played again its samples are counted on, and nothing is lost. What can
     be read of one that is damaged is played, and that is its end.
 
@@ -170,6 +169,7 @@ class ReplayDriver:
     def __init__(self, bus: ReplayBus, port: BusPort) -> None:
         self.name = port.name
         self._path = bus.file
+        self._is_table = bus.is_table
         self._at_end = bus.at_end
         self._paced = bus.pace == "recorded"
         self.link = Link(f"replayed bus {port.name!r} ({self._path})")
@@ -232,14 +232,14 @@ class ReplayDriver:
             raise CannotOpenError(f"it cannot be opened: {words(error)}") from error
 
     def _open_file(self) -> RecordedLog:
+        if self._is_table:
+            return SampleTable(self._path, self._port.streams, self._first_index, self._limits, self._reader)
         if not self._path.exists():
             raise RecordedLogError(
                 f"there is no file {self._path}; correct the bus's file, or record it first"
             )
         if self._at_end == "wait":
             return GrowingCandump(self._path, self._sort, self._place)
-        if kind_of(self._path) == "table":
-            return SampleTable(self._path, self._port.streams, self._first_index, self._limits, self._reader)
         return CanLog(self._path, self._sort)
 
     def _close(self, recording: RecordedLog) -> None:
@@ -291,7 +291,12 @@ class ReplayDriver:
 
     def _begin_anew(self, recording: RecordedLog) -> None:
         """The recording is played from its beginning: nothing is missing between this and what was before."""
-        if not (isinstance(recording, SampleTable) and recording.seamless and self._to_its_end):
+        seamless = False
+        if isinstance(recording, SampleTable):
+            seamless = recording.seamless and self._to_its_end
+            for note in recording.notes:
+                self._say_once(note)
+        if not seamless:
             for assembler in self._assemblers.values():
                 assembler.begin_afresh()
         self._to_its_end = False

@@ -6,14 +6,16 @@ at the pace at which it was recorded.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import ResourceLimits
+from daqsvc.confined.process import ConfinedProcess
+from daqsvc.recording.errors import RecordingError
+from daqsvc.recording.recording import load_streams
 from drivers.frames import DecodedBatch, DecodedFrames
-from drivers.replay.table import TableError, read_columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,14 +23,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.confined.process import ConfinedProcess
     from drivers.base import StreamSpec
     from drivers.replay.settings import TableLayout
 
 PIECE_SAMPLES = 65_536
 TABLE_COUNTER_BITS = 32
-MOST_NAMED = 50
-"""Columns that a message names."""
 
 
 class RecordedLogError(Exception):
@@ -60,17 +59,18 @@ class RecordedLog(Protocol):
 
 
 class SampleTable:
-    """Samples in an NPZ file (an array per column) or a CSV file with a header; read into memory whole.
+    """Samples of any file that `daqsvc.recording` reads; read into memory whole.
 
     Args:
         path: the file.
         specs: the streams; their layouts are `TableLayout`.
         first_index: where each stream's count of samples goes on, by name; kept up to date.
         limits: what reading the file may take.
-        reader: reads it, and can be told to stop; unless given, one of its own.
+        reader: reads it, can be told to stop, and is closed then; unless given, one of its own.
 
     Attributes:
         seamless: whether all streams last as long: played again, it goes on without a step in time.
+        notes: what a person should know of how it was read, in sentences.
 
     Raises:
         RecordedLogError: the file cannot be read, a column is missing, or columns differ in length.
@@ -87,22 +87,20 @@ class SampleTable:
         reader: ConfinedProcess | None = None,
     ) -> None:
         self._first_index = first_index
-        wanted = [column.column for spec in specs for column in spec.layout.columns]
-        table = _table(path, wanted, limits or ResourceLimits(), reader)
+        wanted = [({one.name: one.column for one in spec.layout.columns}, spec.rate_hz) for spec in specs]
+        try:
+            with reader or ConfinedProcess() as process:
+                found = load_streams(path, wanted, limits or ResourceLimits(), process)
+        except RecordingError as error:
+            raise RecordedLogError(f"{error}") from error
+        self.notes = dict.fromkeys(note for _, notes in found for note in notes)
         self._streams: list[tuple[StreamSpec[TableLayout], NDArray[np.float32]]] = []
         for spec in specs:
-            named = spec.layout.columns
-            columns = [table[column.column] for column in named]
-            if len({column.shape for column in columns}) > 1 or columns[0].ndim != 1:
-                shapes = {n.column: list(c.shape) for n, c in zip(named, columns, strict=True)}
-                raise RecordedLogError(
-                    f"{path}: the columns of stream {spec.name!r} have the shapes {shapes}; "
-                    "they must have one dimension and one length"
-                )
-            values = np.empty((len(columns[0]), len(columns)), np.float32)
+            samples, _ = found.pop(0)  # so that they and the values need not all be held at once
+            values = np.empty(samples.shape, np.float32)
             with np.errstate(over="ignore", invalid="ignore"):
-                for i, column in enumerate(columns):
-                    values[:, i] = column * named[i].scale + named[i].offset
+                for i, column in enumerate(spec.layout.columns):
+                    values[:, i] = samples[:, i] * column.scale + column.offset
             self._streams.append((spec, values))
         self._t_ns = 0
         self.seamless = len({len(values) / spec.rate_hz for spec, values in self._streams}) == 1
@@ -142,32 +140,6 @@ class SampleTable:
         self._streams = []
 
 
-Kind = Literal["CAN log", "table"]
-
-
-def kind_of(path: Path) -> Kind:
-    """What a recording is, by its ending: ``.npz`` and ``.csv`` are tables, anything else a CAN log."""
-    return "table" if path.suffix.lower() in {".npz", ".csv"} else "CAN log"
-
-
 def words(error: BaseException) -> str:
     """What an error says, or its name if it says nothing."""
     return f"{error}" or type(error).__name__
-
-
-def _table(
-    path: Path, wanted: Sequence[str], limits: ResourceLimits, reader: ConfinedProcess | None
-) -> dict[str, NDArray[np.float64]]:
-    try:
-        there, found = read_columns(path, wanted, limits, reader)
-    except TableError as error:
-        raise RecordedLogError(
-            f"{path} cannot be read as a table of samples: {words(error)}; give an NPZ file with an array "
-            "per column, or a CSV file of numbers with the columns' names in its first line"
-        ) from error
-    if missing := [name for name in wanted if name not in found]:
-        shown = ", ".join(there[:MOST_NAMED]) + (
-            f" and {len(there) - MOST_NAMED} more" * (len(there) > MOST_NAMED)
-        )
-        raise RecordedLogError(f"{path} has no column {missing[0]!r}; it has {shown}")
-    return found

@@ -6,13 +6,14 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from daqsvc.recording.formats import READERS, named_as_table
 from daqsvc.settings.buses import Bus, Layout
 from daqsvc.settings.files import FilePath  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.packing import Scale  # noqa: TC001 - pydantic reads the annotations
 from daqsvc.settings.section import MOST_CHANNELS, Name, Quantity, Section, Text
 
-TABLES = frozenset({".npz", ".csv"})
-"""Endings of the files that hold a table of samples; any other is a CAN log."""
+TABLES = ", ".join(READERS)
+"""Endings of the files that hold a table of samples, in words; any other is a CAN log."""
 
 
 class ReplayBus(Bus):
@@ -25,7 +26,7 @@ class ReplayBus(Bus):
         FilePath,
         Field(
             description="a CAN log (.log, .asc, .blf, .trc; .gz behind it if zipped) or a table of samples "
-            "(.npz, .csv), relative to the machine file",
+            f"({TABLES}), relative to the machine file",
             examples=["run-up.blf"],
         ),
     ]
@@ -56,7 +57,7 @@ class ReplayBus(Bus):
     @property
     def is_table(self) -> bool:
         """Whether the file holds a table of samples rather than CAN frames."""
-        return self.file.suffix.lower() in TABLES
+        return named_as_table(self.file)
 
     @property
     def summary(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -10,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from support.bearing_signals import BALL, INNER, OPTIONS, OUTER, RATE_HZ, Housing, healthy
+from support.orbit_files import SPEED_RPM, Orbit
 from support.paths import ROOT
+
+from daqsvc.cli import main
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -316,6 +320,23 @@ def test_a_machine_file_is_judged_by_the_live_detector(verb: Run, tmp_path: Path
     assert bad_one["detectors"]["bearing"]["sensors"] == ["accel-de"]
     assert any(name.startswith("levels/") for name in bad_one["detectors"])
     assert set(found[2]["channels"]) == {"fan-end"}
+    left_out = f"drive-end: not judged, as the recording has no channel for accel-de of {tmp_path / 'm.toml'}"
+    assert [left_out in one["data_quality"]["problems"] for one in found] == [False, False, True]
+
+
+def test_a_person_reads_what_gives_the_verdict_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "m.toml").write_text(EXAMPLE.read_text().replace("speed_rpm = 1772.0", "speed_rpm = 1797.0"))
+    samples = {"accel-de": Housing(10.0, OUTER, seed=33).samples, "accel-fe": healthy(10.0, 32)}
+    np.savez(tmp_path / "bad.npz", **samples)
+    recording = str(tmp_path / "bad.npz")
+    assert main(["analyze", str(tmp_path / "m.toml"), recording, "--fs", "12000"]) == 0
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{recording}: outer race at drive-end, severity ")
+    # All the other detectors see nothing wrong.
+    assert [line.split(":")[0].strip() for line in lines[-2:]] == ["levels/accel-de", "levels/accel-fe"]
+    assert not [line for line in lines if "worst of" in line or line.strip().startswith("bearing:")]
 
 
 def test_what_calibrate_wrote_is_the_healthy_machine(verb: Run, tmp_path: Path) -> None:
@@ -343,6 +364,71 @@ def test_what_calibrate_wrote_is_the_healthy_machine(verb: Run, tmp_path: Path) 
     code, (found,), _ = verb("analyze", machine, tmp_path / "loud.npz", "--fs", 10_000, "--calibration", out)
     assert code == 3
     assert "sampled at 12000 Hz, not sampled at 10000 Hz" in found["refused"]
+
+
+def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path: Path) -> None:
+    samples = {name: healthy(10.0, seed) for name, seed in (("de", 41), ("fe", 42))}
+    loud = {name: x + 0.1 * np.random.default_rng(44).standard_normal(len(x)) for name, x in samples.items()}
+    for name, content in (("good", samples), ("loud", loud)):
+        np.savez(tmp_path / f"{name}.npz", **content)
+    good, run, out = (tmp_path / name for name in ("good.npz", "loud.npz", "motor.toml"))
+    both = ("--channels", "de,fe", *OPTIONS[2:])
+    assert verb("calibrate", good, *both, "--out", out)[0] == 0
+    assert verb("analyze", run, *both)[1][0]["verdict"] == "normal"
+    for options in (both, OPTIONS):
+        code, (against,), _ = verb("analyze", run, *options, "--baseline", good)
+        assert (code, against["verdict"]) == (0, "changed")
+        code, (found,), _ = verb("analyze", run, *options, "--calibration", out)
+        assert (code, found) == (0, against)
+    for option, value, said in (
+        ("--channels", "fe,de", "holds nothing of fe and de together; calibrate with --channels fe,de"),
+        ("--channels", "other", "has no channel 'other'"),
+        ("--fs", "10000", "is sampled at 12000 Hz, not sampled at 10000 Hz; calibrate as it is watched"),
+        ("--speed-rpm", "900", "is of a machine at 1797 rpm, not of a machine at 900 rpm"),
+    ):
+        code, (found,), _ = verb("analyze", run, *both, option, value, "--calibration", out)
+        assert (code, found["verdict"]) == (3, None)
+        assert said in found["refused"]
+
+
+def test_a_calibration_says_what_it_is_for(verb: Run, files: dict[str, Path], tmp_path: Path) -> None:
+    bearing, rotor = tmp_path / "bearing.toml", tmp_path / "rotor.toml"
+    assert verb("calibrate", files["baseline"], *OPTIONS, "--out", bearing)[0] == 0
+    probes = ("--probes", "x,y", "--speed-rpm", SPEED_RPM)
+    known = ("--natural-frequency-hz", 60, "--damping-ratio", 0.1)
+    orbit = Orbit().save(tmp_path / "orbit.npz")
+    assert verb("calibrate", orbit, *probes, *known, "--out", rotor)[0] == 0
+    for options, said in (
+        ((*probes, "--calibration", bearing), "bearing.toml: was written of bearings, for pipeline.bearing"),
+        ((*OPTIONS, "--calibration", rotor), "rotor.toml: was written of a rotor, for pipeline.rotor_syn"),
+        (
+            (*OPTIONS, "--baseline", bearing),
+            "takes a recording; a file that daqsvc calibrate wrote of bearings",
+        ),
+        (
+            (*OPTIONS[:6], "--baseline", bearing),
+            "is for --calibration, with --bearing or --orders or a machine",
+        ),
+        ((*OPTIONS, "--baseline", files["baseline"], "--calibration", bearing), "leave out one of them"),
+    ):
+        code, found, err = verb("analyze", files["healthy"], *options)
+        assert (code, found) == (2, [])
+        assert said in err
+
+
+def test_calibrate_says_of_times_that_go_back_as_analyze_does(
+    files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    x = Housing(seed=1).samples
+    t = np.arange(len(x)) / RATE_HZ
+    t[600:610] = t[600:610][::-1].copy()
+    np.savez(tmp_path / "back.npz", t=t, de=x)
+    recording, options = str(tmp_path / "back.npz"), ("--channels", "de", *OPTIONS[4:])
+    assert main(["analyze", recording, *options, "--json"]) == 0
+    (note,) = json.loads(capsys.readouterr().out)["data_quality"]["problems"]
+    assert "goes back in 9 steps" in note
+    assert main(["calibrate", recording, *options, "--json"]) == 0
+    assert capsys.readouterr().err == f"daqsvc calibrate: warning: {recording}: {note}\n"
 
 
 def test_calibrate_by_options_refuses_a_damaged_bearing(

@@ -70,7 +70,7 @@ def test_memory_is_bounded_where_nothing_says_how_much_is_needed(tmp_path):
     path.write_text("x,y\n" + "1,2\n" * 600_000)
     set_limits(ResourceLimits(12_000_000))
     with pytest.raises(
-        RecordingError, match=r"more memory than it may; allow more \(--max-memory; it is 0.012 GB"
+        RecordingError, match=r"more memory than it may; allow more \(--max-memory, or .*; it is 0.012 GB"
     ):
         load_recording(path, rate_hz=1000)
     set_limits(ResourceLimits())
@@ -121,6 +121,7 @@ def test_memory_is_given_on_the_command_line(tmp_path, capsys):
     assert "is not a number of GB from 0.05 to 1000" in capsys.readouterr().err
 
 
+SPIN = "support.confined_work:spin_with"
 COLUMNS = table_layout(("x", "x", 1.0, 0.0))
 
 
@@ -128,9 +129,7 @@ COLUMNS = table_layout(("x", "x", 1.0, 0.0))
 def test_a_replayed_table_is_refused_likewise(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(file_bombs.npz() if name == "a.npz" else file_bombs.npz_that_says_too_much())
-    with pytest.raises(
-        ReplayError, match=r"cannot be read as a table of samples: .*says that it (unpacks|holds)"
-    ):
+    with pytest.raises(ReplayError, match=r"a.npz is too large: its .*|said.npz .*says that it holds"):
         SampleTable(path, [StreamSpec("s", COLUMNS, 1000.0)], {})
 
 
@@ -200,10 +199,11 @@ def test_a_can_log_of_nothing_but_other_lines_is_given_up(tmp_path):
 async def test_a_table_that_takes_long_does_not_hold_up_the_end(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     np.savez(path, x=np.zeros(100))
-    monkeypatch.setattr("drivers.replay.table.COLUMNS", "support.confined_work:spin_with")
     spec = StreamSpec("s", COLUMNS, 1000.0)
     port = BusPort("t", [spec], SystemClock(), lambda _block: None)
     driver = ReplayDriver(replay_bus(file=path), port)
+    call = driver._reader.call
+    monkeypatch.setattr(driver._reader, "call", lambda _, *args, **kw: call(SPIN, *args, **kw))
     running = asyncio.create_task(driver.run())
     while driver._reader._running is None:
         await asyncio.sleep(0.01)

@@ -509,6 +509,20 @@ def test_a_time_column_that_goes_back_here_and_there_still_tells_the_rate(tmp_pa
             load_recording(path)
 
 
+def test_times_that_go_backwards_are_told(tmp_path):
+    t = np.arange(400) / 1000
+    with pytest.raises(RecordingError, match=r"the times of its column 't' go backwards"):
+        load_recording(save_with_time(tmp_path / "rig.csv", t[::-1]))
+    t = np.random.default_rng(1).normal(size=400)
+    with pytest.raises(
+        RecordingError, match=r"are uneven \(-\d.* to \d.* s\), and \d+ of them go back. Give"
+    ):
+        load_recording(save_with_time(tmp_path / "rig.csv", t))
+    t[::2] = np.nan
+    with pytest.raises(RecordingError, match=r"time column 't' has no two times in a row. Give it with --fs"):
+        load_recording(save_with_time(tmp_path / "rig.csv", t[:3]))
+
+
 def test_a_gap_beside_stamps_out_of_order_is_a_gap(tmp_path):
     t = np.arange(1000) / 500
     there = np.ones(1000, bool)

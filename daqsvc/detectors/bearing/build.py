@@ -86,6 +86,17 @@ def bearing_detector(
     )
 
 
+def healthy_machine(machine: MachineFile, given: Bearing, calibration: Path) -> BearingBaseline:
+    """The healthy machine of a file, if it is that of these bearings at their rate and speed.
+
+    Raises:
+        ValueError: it is not, the file cannot be used, or a bearing is not known.
+    """
+    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
+    rate_hz = machine.streams[machine.sensor(given.bearings[0].sensor).stream].rate_hz
+    return _fitting(calibration, bearings, rate_hz, machine.machine.speed_rpm)
+
+
 def pair_models(machine: MachineFile, given: Bearing) -> dict[tuple[str, ...], PairModel]:
     """Bearings with an accelerometer on rotor and housing, by the names of these in that order.
 

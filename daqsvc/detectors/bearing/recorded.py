@@ -16,7 +16,7 @@ from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.bearing.baseline import load_bearing_baseline
 from daqsvc.bearing.identify import ChangeRules, NotIdentifiableError, compare_residual
 from daqsvc.bearing.race.judge import race_test
-from daqsvc.detectors.bearing.build import bearing_detector, orders_of
+from daqsvc.detectors.bearing.build import bearing_detector, healthy_machine, orders_of
 from daqsvc.detectors.bearing.calibrating import HealthyRun
 from daqsvc.detectors.bearing.finding import BearingFinding, find
 from daqsvc.detectors.bearing.persistence import UNDETERMINED
@@ -108,6 +108,17 @@ class RecordedBearings(RecordedDetector[Bearing]):
         keyphasor = given.keyphasor if given.keyphasor in sensors else None
         return given.model_copy(update={"bearings": bearings, "keyphasor": keyphasor}) if bearings else None
 
+    def left_out(self, sensors: Container[str]) -> str:
+        """See `RecordedDetector.left_out`."""
+        missing = [bearing for bearing in self.given.bearings if bearing.sensor not in sensors]
+        if not missing:
+            return ""
+        bearings, accelerometers = (
+            ", ".join(texts) for texts in zip(*((b.name, b.sensor) for b in missing), strict=True)
+        )
+        why = f"the recording has no channel for {accelerometers} of {self.machine.path}"
+        return f"{bearings}: not judged, as {why}"
+
     def not_judged(self, recording: str, why: str) -> BearingVerdict:
         """See `RecordedDetector.not_judged`."""
         return BearingVerdict(
@@ -124,14 +135,25 @@ class RecordedBearings(RecordedDetector[Bearing]):
         statements: tuple[Statements, ...] = ()
         setup = setup_of(recorded.machine, given)
         if self.options.in_memory:
-            verdict = _against(recorded.recording, setup, self._healthy)
+            verdict = self._judged_whole(recorded, given, setup)
         else:
             detector = bearing_detector(recorded.machine, given, None, self.options.calibration)
             diagnoses, looks = _watched(detector, recorded)
             statements = (Statements(detector.name, tuple(diagnoses), recorded.recording.rate_hz),)
             verdict = _concluded(setup, recorded.recording, detector, diagnoses, looks)
         draw = partial(_draw, verdict) if verdict.races else None
-        return Evaluated(statements=statements, verdict=verdict, draw=draw, shown=False)
+        return Evaluated(statements=statements, verdict=verdict, draw=draw)
+
+    def _judged_whole(self, recorded: Recorded, given: Bearing, setup: BearingSetup) -> BearingVerdict:
+        """Judge a recording at one go, against the healthy machine if options tell of one."""
+        path = self.options.calibration
+        if path is None:
+            return _against(recorded.recording, setup, self._healthy)
+        baseline = healthy_machine(recorded.machine, given, path)
+        if len(setup.channels) > 1 and setup.channels not in baseline.residuals:
+            lacking = f"nothing of {' and '.join(setup.channels)} together"
+            raise ValueError(f"{path}: holds {lacking}; calibrate with --channels {','.join(setup.channels)}")
+        return analyse_bearings(recorded.recording, setup, baseline)
 
 
 def setup_of(machine: MachineFile, given: Bearing) -> BearingSetup:

@@ -104,9 +104,10 @@ def rate_of_stamps(seconds: Floats, *, surely_time: bool) -> StampedRate | None:
     with np.errstate(invalid="ignore"):  # infinities make NaN
         steps = np.diff(seconds)
     median = float(np.median(steps))
-    if not (np.isfinite(steps).all() and median > 0.0):
-        return _mean_rate(seconds) if surely_time else None
     backward = int((steps < 0.0).sum())
+    in_order = backward <= (1.0 - LEAST_IN_ORDER) * len(steps)
+    if not (np.isfinite(steps).all() and median > 0.0 and in_order):
+        return _mean_rate(seconds) if surely_time else None
     if backward:
         steps = np.diff(_in_order(seconds, median))
     ones = np.abs(steps - median) <= MOST_UNEVEN * median

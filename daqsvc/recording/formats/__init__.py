@@ -36,6 +36,11 @@ CAN_LOGS = (".blf", ".asc", ".log", ".trc")
 _LONGEST_REASON = 300
 
 
+def named_as_table(path: Path) -> bool:
+    """Whether a file is one that `read` reads, by its name."""
+    return path.name.lower().endswith(tuple(READERS))
+
+
 def named_as_can_log(path: Path) -> bool:
     """Whether a file is a CAN log by its name."""
     return path.name.lower().removesuffix(".gz").endswith(CAN_LOGS)

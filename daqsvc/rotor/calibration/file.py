@@ -320,6 +320,11 @@ def parse_record(text: str, path: Path) -> CalibrationRecord:
 
 
 def _record(document: Mapping[str, Any], path: Path) -> CalibrationRecord:
+    if document.get("kind") == "bearing":
+        raise CalibrationFileError(
+            f"{path}: was written of bearings, for pipeline.bearing.calibration or for --calibration with "
+            f"--bearing or --orders, and a rotor is watched here; {_REMEDY}"
+        )
     table = Table(document, path)
     version = table.whole("schema_version")
     if version != SCHEMA_VERSION:

@@ -157,7 +157,7 @@ async def test_the_samples_of_a_table_are_counted_on_when_it_is_played_again(tmp
     x, y = np.arange(250.0), np.linspace(-1, 1, 250)
     np.savez(tmp_path / "run.npz", probe_x=x, probe_y=y)
     (tmp_path / "run.csv").write_text(
-        "t,probe_x,probe_y\n" + "".join(f"{k},{a},{b}\n" for k, (a, b) in enumerate(zip(x, y, strict=True)))
+        "no,probe_x,probe_y\n" + "".join(f"{k},{a},{b}\n" for k, (a, b) in enumerate(zip(x, y, strict=True)))
     )
     table = table_layout(("x", "probe_x", 2.0, 1.0), ("y", "probe_y", 1.0, 0.0))
     for name in ("run.npz", "run.csv"):
@@ -198,9 +198,9 @@ async def test_lines_that_are_no_frames_are_counted_while_a_log_is_written(tmp_p
         ("a.blf", b"no BLF", "a.blf cannot be read as a CAN log"),
         ("a.xyz", b"", "a.xyz cannot be read as a CAN log: No read support for unknown log format"),
         ("a.db", b"", "a data base cannot be played, can_logconvert of python-can makes a BLF of it"),
-        ("a.npz", b"no zip", "a.npz cannot be read as a table of samples"),
-        ("a.csv", b"p,q\n1,2\n", "a.csv has no column 'x'; it has p, q"),
-        ("a.csv", b"x,y\n1,two\n", "a.csv cannot be read as a table of samples: could not convert"),
+        ("a.npz", b"no zip", "a.npz cannot be read: it is not a zip archive"),
+        ("a.csv", b"p,q\n1,2\n3,4\n", "a.csv has no channel 'x'; it holds p (2), q (2)"),
+        ("a.csv", b"x,y\n1,two\n", "a.csv is not numeric; it holds x (1), y (not numeric)"),
         ("a.log", None, "there is no file"),
     ],
 )

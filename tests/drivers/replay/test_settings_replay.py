@@ -68,7 +68,7 @@ def test_one_channel_of_a_can_log_is_described() -> None:
         (
             "gap.npz",
             "gap.blf",
-            "layout.columns = .* has no columns: only the replay of an .npz or .csv file has",
+            "layout.columns = .* has no columns: only the replay of a table has",
         ),
         (COLUMNS, FRAMES, "replays columns of a table, and this describes something else"),
         (COLUMNS, MODBUS, "replays columns of a table, and this describes something else"),
