@@ -91,7 +91,7 @@ class SimCommand:
             from sim_hw.bus_socket import run_hub  # noqa: PLC0415
 
             return run_hub(str(arguments.bus))
-        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
+        from daqsvc.recording import RecordingError  # noqa: PLC0415
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
         from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
         from drivers.frames import LayoutError  # noqa: PLC0415

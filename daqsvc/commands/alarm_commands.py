@@ -8,8 +8,7 @@ import pwd
 import sys
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
-from daqsvc.commands.option_types import alarm_id, duration, one_line
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, duration, one_line
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
 if TYPE_CHECKING:

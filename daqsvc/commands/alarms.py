@@ -7,8 +7,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
-from daqsvc.commands.option_types import count
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, count
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
 if TYPE_CHECKING:
@@ -85,16 +84,15 @@ class AlarmsCommand:
 
 
 def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
-    from daqsvc.commands import alarm_table  # noqa: PLC0415
-    from daqsvc.commands.alarm_journal import standing  # noqa: PLC0415
+    from daqsvc.commands.alarm_journal import current_table, history_table, standing  # noqa: PLC0415
 
     if arguments.json:
         for told in events:
             print(json.dumps(told))  # noqa: T201 - this is what the verb is for
     elif arguments.history is not None:
-        print(alarm_table.history(events) if events else "nothing has happened yet")  # noqa: T201
+        print(history_table(events) if events else "nothing has happened yet")  # noqa: T201
     elif events:
-        print(alarm_table.current(standing(store, events), time.time_ns()))  # noqa: T201
+        print(current_table(standing(store, events), time.time_ns()))  # noqa: T201
     else:
         print("no alarm has ever been raised" if arguments.all else "every alarm is normal")  # noqa: T201
 

@@ -1,4 +1,4 @@
-"""The parser of the command line, and the exit codes of its verbs.
+"""What all verbs of the command line share: parser, exit codes, values of options, signals that end one.
 
 What is wrong is said in one line, the usage only where it is asked for.
 """
@@ -6,7 +6,11 @@ What is wrong is said in one line, the usage only where it is asked for.
 from __future__ import annotations
 
 import argparse
+import math
 import re
+import signal
+from dataclasses import dataclass
+from decimal import Decimal
 from typing import Any, NoReturn
 
 EXIT_OK = 0
@@ -34,3 +38,147 @@ class ArgumentParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is, and exit with 2."""
         self.exit(EXIT_USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def signals_to_end() -> tuple[signal.Signals, ...]:
+    """SIGTERM, SIGINT, and SIGHUP of a terminal that goes, unless the verb is to outlive that (nohup)."""
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return (signal.SIGTERM, signal.SIGINT)
+    return (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+
+
+_ORBIT = "orbit:"
+_UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_PART = re.compile(r"([0-9]{1,9})([smhd])")
+_DURATION = re.compile(r"([0-9]{1,9}d)?([0-9]{1,9}h)?([0-9]{1,9}m)?([0-9]{1,9}s)?")
+
+LONGEST_S = 366 * 86_400
+"""Longest time that a duration can say."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedOption:
+    """What ``--speed-rpm`` says.
+
+    Attributes:
+        rpm: the speed, negative if clockwise.
+        orbit: whether the orbit's own 1X is followed about it.
+        step_rpm: the step of its last digit: 5111 is not 5111.000.
+    """
+
+    rpm: float | None
+    orbit: bool = False
+    step_rpm: float = 0.0
+
+
+def probe_pair(text: str) -> tuple[str, str]:
+    """``X,Y``: two channels."""
+    names = tuple(name.strip() for name in text.split(","))
+    if len(names) != 2 or not all(names) or names[0] == names[1]:
+        raise argparse.ArgumentTypeError(f"{text!r} does not name two probes; write X,Y")
+    return names[0], names[1]
+
+
+def speed(text: str) -> SpeedOption:
+    """``N``, ``-N`` or ``orbit:N``."""
+    orbit = text.startswith(_ORBIT)
+    value = _float(text.removeprefix(_ORBIT))
+    if not math.isfinite(value) or not 0.0 < abs(value) <= 1e6:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a speed; write revolutions per minute, negative if clockwise, or orbit:N"
+        )
+    exponent = Decimal(text.removeprefix(_ORBIT)).as_tuple().exponent
+    return SpeedOption(value, orbit, step_rpm=10.0**exponent if isinstance(exponent, int) else 0.0)
+
+
+def number(text: str) -> float:
+    """A finite number."""
+    value = _float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return value
+
+
+def positive(text: str) -> float:
+    """A finite number above 0."""
+    value = _float(text)
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """A finite number from 0 on."""
+    value = _float(text)
+    if not (math.isfinite(value) and value >= 0.0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 on")
+    return value
+
+
+def percent(text: str) -> float:
+    """A part in percent, from 0 to below 100."""
+    value = _float(text)
+    if not 0.0 <= value < 100.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a percentage from 0 to below 100")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on."""
+    value = _whole(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+    return value
+
+
+def duration(text: str) -> float:
+    """A time in seconds, written like ``90s``, ``30m``, ``8h``, ``2d`` or ``1h30m``."""
+    if not _DURATION.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time; write e.g. 90s, 30m, 8h, 2d or 1h30m")
+    total_s = sum(int(number) * _UNITS_S[unit] for number, unit in _PART.findall(text))
+    if not 0 < total_s <= LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time from 1s to {LONGEST_S // 86_400}d")
+    return float(total_s)
+
+
+def one_line(text: str) -> str:
+    """Text that can stand in a log."""
+    if not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text!r} is not printable; write one line of plain text")
+    return text
+
+
+def alarm_id(text: str) -> str:
+    """Name of an alarm, or the beginning of an id."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(
+            f"{text!r} names no alarm; write its name, or how its id begins in daqsvc alarms"
+        )
+    return text
+
+
+def calibration_length(text: str) -> int:
+    """Revolutions that make a baseline."""
+    from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy
+
+    value = _whole(text)
+    if not LEAST_REVOLUTIONS <= value <= 100_000:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} revolutions do not make a baseline; "
+            f"give a whole number from {LEAST_REVOLUTIONS} to 100000"
+        )
+    return value
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        return -1

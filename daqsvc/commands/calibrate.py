@@ -8,7 +8,7 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_REFUSED, EXIT_USAGE, signals_to_end
 from daqsvc.commands.recording_options import (
     add_calibrate_options,
     bearing_recording_misuse,
@@ -16,7 +16,6 @@ from daqsvc.commands.recording_options import (
     calibrates_bearing,
     split_files,
 )
-from daqsvc.commands.signals import signals_to_end
 
 if TYPE_CHECKING:
     import argparse
@@ -81,7 +80,7 @@ class CalibrateCommand:
                 return EXIT_USAGE
         from daqsvc.bearing.identify import NotIdentifiableError  # noqa: PLC0415
         from daqsvc.dsp.quality import RefusedError  # noqa: PLC0415
-        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
+        from daqsvc.recording import RecordingError  # noqa: PLC0415
         from daqsvc.rotor.synchronous.baseline import NotCalibratableError  # noqa: PLC0415
 
         try:

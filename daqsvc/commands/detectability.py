@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.arguments import EXIT_OK
-from daqsvc.commands.option_types import positive
+from daqsvc.commands.arguments import EXIT_OK, positive
 
 if TYPE_CHECKING:
     import argparse

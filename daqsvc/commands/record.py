@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc import kernel_cache
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE
-from daqsvc.commands.option_types import positive
-from daqsvc.commands.signals import signals_to_end
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive, signals_to_end
 
 if TYPE_CHECKING:
     import argparse

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.commands.option_types import (
+from daqsvc.commands.arguments import (
     calibration_length,
     count,
     not_negative,

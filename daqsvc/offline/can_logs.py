@@ -13,7 +13,7 @@ from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.snapshots import alignment
 from daqsvc.dsp.quality.rate import SAME_RATE
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import CAN_LOGS, named_as_can_log
 from daqsvc.recording.rate import MOST_STRETCHED
 from daqsvc.recording.recording import Recording

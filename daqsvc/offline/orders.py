@@ -17,7 +17,7 @@ from daqsvc.dsp.orders import OrderVectors, order_vectors
 from daqsvc.dsp.quality.recorded import DataQuality, known_against
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_recording
 from daqsvc.rotor.orders import OrderChange, OrderRules, compare_orders
 from daqsvc.settings.section import Section

@@ -22,7 +22,7 @@ from daqsvc.detectors.shaft.verdict import RotorVerdict
 from daqsvc.diagnosis.recorded import Recorded, worst
 from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality.recorded import known_against
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import named_as_can_log
 from daqsvc.recording.recording import (
     get_limits,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from daqsvc.confined.limits import GIGABYTE
 from daqsvc.dsp.quality.unit import LENGTH_UNITS, UM_PER_UNIT
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,8 +13,8 @@ import numpy as np
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.unit import refuse_beyond_any_unit
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import NUMERIC
-from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats import read
 from daqsvc.recording.rate import place_at, time_column, timing_of
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
+from daqsvc.recording import RecordingError
 from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
-from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

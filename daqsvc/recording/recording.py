@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedError, RaisedThereError, shared
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.formats import find
 
 if TYPE_CHECKING:

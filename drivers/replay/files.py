@@ -13,7 +13,7 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.confined.limits import ResourceLimits
 from daqsvc.confined.process import ConfinedProcess
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_streams
 from drivers.frames import DecodedBatch, DecodedFrames
 

@@ -115,7 +115,7 @@ def _run(arguments: argparse.Namespace) -> int:
     kernel_cache.prepare()
     try:
         import sim_hw.demo.session  # noqa: F401, PLC0415 - is all there that it needs?
-        from daqsvc.recording.errors import RecordingError  # noqa: PLC0415
+        from daqsvc.recording import RecordingError  # noqa: PLC0415
         from daqsvc.settings import MachineFileError  # noqa: PLC0415
         from sim_hw.scenario import ScenarioError  # noqa: PLC0415
     except ModuleNotFoundError as error:

@@ -8,9 +8,8 @@ import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.commands.alarm_commands import user_name
-from daqsvc.commands.alarm_journal import AlarmView
-from daqsvc.commands.alarm_table import ago, current
-from daqsvc.commands.option_types import duration
+from daqsvc.commands.alarm_journal import AlarmView, ago, current_table
+from daqsvc.commands.arguments import duration
 
 
 @pytest.mark.parametrize(
@@ -62,6 +61,6 @@ def test_what_lies_beneath_a_cover_is_shown() -> None:
         "wall_ns": 0,
         "message": "-",
     }
-    line = current([AlarmView(told, 0, "-")], 0).splitlines()[1]
+    line = current_table([AlarmView(told, 0, "-")], 0).splitlines()[1]
     assert "shelved until 2026-" in line
     assert "(over active acknowledged), chattering" in line

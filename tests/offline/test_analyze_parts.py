@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from support.orbit_files import AMPLITUDE_UM, RATE_HZ, SPEED_RPM, Orbit
 
-from daqsvc.commands.option_types import SpeedOption, speed
+from daqsvc.commands.arguments import SpeedOption, speed
 from daqsvc.detectors.rotor_synchronous.recorded import analyse, posterior
 from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.diagnosis.record import Diagnosis, Severity

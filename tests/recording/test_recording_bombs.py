@@ -19,7 +19,7 @@ from support.orbit_files import OPTIONS, Orbit
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.cli import main
 from daqsvc.confined.limits import ResourceLimits
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_recording, set_limits, shared, stop_reading
 from drivers.base import BusPort, StreamSpec
 from drivers.replay.can_log import CanLog

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from daqsvc.dsp.quality.unit import LENGTH_UNITS
+from daqsvc.recording import RecordingError
 from daqsvc.recording.channels import channel_map, metres_per_unit, sampling_rate_hz, to_um
-from daqsvc.recording.errors import RecordingError
 
 
 def test_channel_map():

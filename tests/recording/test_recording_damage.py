@@ -18,7 +18,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat, wavfile
 from support.examples import examples
 
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_recording
 
 pytestmark = pytest.mark.property

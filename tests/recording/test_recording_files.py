@@ -10,7 +10,7 @@ import pytest
 from scipy.io import savemat
 from support.paths import ROOT
 
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import list_channels, load_recording
 
 DATA = Path(os.environ.get("DAQSVC_DATA", ROOT / ".." / "shared" / "data")).resolve()

@@ -13,7 +13,7 @@ import pytest
 from scipy.io import savemat, wavfile
 
 from daqsvc.confined.limits import Budget, ResourceLimits
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.parquet import read_parquet
 from daqsvc.recording.recording import list_channels, load_recording
 

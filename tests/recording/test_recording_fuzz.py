@@ -16,7 +16,7 @@ from support.paths import ROOT
 
 from daqsvc.cli import main
 from daqsvc.offline.can_logs import load_can_log
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_recording, shared, stop_reading
 from daqsvc.settings import load_machine_file
 from drivers.can.plugin import frame_layout

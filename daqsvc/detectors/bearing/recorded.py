@@ -35,7 +35,7 @@ from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.clipped import ClippedError, refuse_clipped
 from daqsvc.dsp.quality.recorded import DataQuality
 from daqsvc.dsp.quality.unit import accelerometer_quality, refuse_no_machine, unit_problems
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_matching
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from daqsvc.confined.limits import Budget, TooLargeError
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.formats.delimited import read_csv
 from daqsvc.recording.formats.matlab import read_mat
 from daqsvc.recording.formats.numpy_archive import read_npz

@@ -1,18 +1,25 @@
-"""Text tables: CSV by whatever delimiter, with or without preamble and header, gzipped or not."""
+"""Text tables: CSV by whatever delimiter, with or without preamble and header, gzipped or not.
+
+The file may be in one of several encodings, and larger than it looks.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import gzip
+import io
 import re
-from typing import TYPE_CHECKING, TypeAlias
+import struct
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 
-from daqsvc.confined.limits import TooLargeError
+from daqsvc.confined.limits import CountedFile, TooLargeError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import LONGEST_NAME, Contents
-from daqsvc.recording.errors import RecordingError
 from daqsvc.recording.formats.table_layout import SNIFFED_LINES, is_number, layout_of
-from daqsvc.recording.formats.text_file import TextFile
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -23,6 +30,9 @@ if TYPE_CHECKING:
     from daqsvc.confined.limits import Budget
 
     Floats: TypeAlias = NDArray[np.float64]
+    from collections.abc import Iterator
+    from typing import BinaryIO
+
 
 STATEMENT = re.compile(r"#\s*([A-Za-z]\w*)\s*[=:]\s*([-+.\deE]+)\s*")
 """A number in a comment, e.g. ``# fs = 25600``."""
@@ -188,3 +198,80 @@ def _empty_cell(delimiter: str | None) -> re.Pattern[str] | None:
     between = re.escape(delimiter or "")
     blank = rf"[^\S{between}]*"
     return re.compile(rf'(?:(?<={between})|^){blank}(?:"")?{blank}(?=$|{between})')
+
+
+_BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+_BUFFER_BYTES = 1 << 18
+_GZIP_TRAILER_BYTES = 8
+
+
+class TextFile:
+    """A text file in UTF-16 (if a byte order mark says so), UTF-8, or else Latin-1.
+
+    Args:
+        path: the file; gzipped if it ends in ``.gz``.
+        budget: of the file; each reading of it may take as much.
+    """
+
+    def __init__(self, path: Path, budget: Budget) -> None:
+        self._path = path
+        self._budget = budget
+        self._zipped = path.name.lower().endswith(".gz")
+        with self._open() as file:
+            mark = file.read(2)
+            if self._zipped and _declared_bytes(path) > budget.most_bytes:
+                # Said at the end of the file, which is anything where that is cut off: so count.
+                counted = CountedFile(file, replace(budget))
+                while counted.read(_BUFFER_BYTES):
+                    pass
+        self._encoding = _BYTE_ORDER_MARKS.get(mark, "utf-8-sig")
+
+    @property
+    def may_be_latin_1(self) -> bool:
+        """Whether another encoding can be tried where this one fails."""
+        return self._encoding == "utf-8-sig"
+
+    def take_for_latin_1(self) -> None:
+        """Try that."""
+        self._encoding = "latin-1"
+
+    def lines(self) -> Iterator[str]:
+        r"""Its lines, with ``\n`` at their ends.
+
+        Raises:
+            UnicodeDecodeError: it is not in UTF-8.
+            RecordingError: it is not in UTF-16 though it says so.
+            TooLargeError: it unpacks to too much.
+        """
+        with self._open() as file:
+            counted = io.BufferedReader(CountedFile(file, replace(self._budget)), _BUFFER_BYTES)
+            with io.TextIOWrapper(counted, self._encoding) as text:
+                try:
+                    yield from text
+                except UnicodeError as error:
+                    if self.may_be_latin_1:
+                        raise
+                    raise RecordingError(
+                        f"{self._path} cannot be read: it is no text in UTF-16, as its first two bytes say "
+                        f"({error}); save it as CSV in UTF-8"
+                    ) from None
+
+    @contextmanager
+    def _open(self) -> Iterator[BinaryIO]:
+        with self._path.open("rb") as raw:
+            if self._zipped:
+                with gzip.open(raw) as file:
+                    yield cast("BinaryIO", file)
+            else:
+                yield raw
+
+
+def _declared_bytes(path: Path) -> int:
+    """What a gzip file says at its end that it unpacks to."""
+    with path.open("rb") as file:
+        size = file.seek(0, io.SEEK_END)
+        if size <= _GZIP_TRAILER_BYTES:
+            return 0
+        file.seek(-4, io.SEEK_END)
+        return int(struct.unpack("<I", file.read(4))[0])

@@ -1,17 +1,25 @@
-"""MATLAB files up to version 7."""
+"""MATLAB files up to version 7. Whether one of level 5 is whole is asked before SciPy reads it.
+
+SciPy trusts the type of each element and the number of a struct's fields: where they are damaged it reads
+outside of its memory, which ends the process instead of raising an error. Layout: MathWorks, "MAT-File
+Format", level 5.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import struct
+import zlib
+from typing import TYPE_CHECKING, NamedTuple
 
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns, flattened
-from daqsvc.recording.errors import RecordingError
-from daqsvc.recording.formats.mat_structure import check_mat_structure
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from daqsvc.confined.limits import Budget
+
 
 LEVEL_5 = 1
 """What SciPy calls the format of MATLAB 5 to 7."""
@@ -39,3 +47,144 @@ def read_mat(path: Path, budget: Budget) -> Contents:
     }
     check_columns(len(entries))
     return Contents(entries)
+
+
+HEADER_BYTES = 128
+BIG_ENDIAN = b"MI"
+
+INT8, INT32, UINT32, MATRIX, COMPRESSED, UTF8 = 1, 5, 6, 14, 15, 16
+NUMBERS = frozenset({1, 2, 3, 4, 5, 6, 7, 9, 12, 13})
+TEXT = NUMBERS | {16, 17, 18}
+NAME = frozenset({INT8, UTF8})
+SIZES = frozenset({INT32, UINT32})
+
+CELL, STRUCT, OBJECT, CHAR, SPARSE, FUNCTION, OPAQUE = 1, 2, 3, 4, 5, 16, 17
+NUMERIC_CLASSES = range(6, 16)
+COMPLEX = 0x800
+"""Flag of an array with a second, imaginary, part."""
+
+AFTER_FLAGS: Mapping[int, tuple[frozenset[int], ...]] = {
+    CELL: (SIZES, NAME),
+    STRUCT: (SIZES, NAME, SIZES, NAME),
+    OBJECT: (SIZES, NAME, NAME, SIZES, NAME),
+    CHAR: (SIZES, NAME, TEXT),
+    SPARSE: (SIZES, NAME, NUMBERS, NUMBERS, NUMBERS),
+    FUNCTION: (SIZES, NAME),
+    OPAQUE: (NAME, NAME, NAME),
+} | dict.fromkeys(NUMERIC_CLASSES, (SIZES, NAME, NUMBERS))
+"""Types of the elements of an array after its flags, before the arrays inside of it."""
+
+
+class _Element(NamedTuple):
+    kind: int
+    body: memoryview
+
+
+class _DamageError(ValueError):
+    """The structure is not that of a MATLAB file."""
+
+
+def check_mat_structure(path: Path, budget: Budget) -> None:
+    """Follow every element of a file of level 5.
+
+    Args:
+        path: the file.
+        budget: of the file; what its variables unpack to is counted.
+
+    Raises:
+        RecordingError: the file is damaged or cut short.
+        TooLargeError: it unpacks to more than it may.
+        zlib.error: a compressed variable is damaged.
+    """
+    content = memoryview(path.read_bytes())
+    order = ">" if bytes(content[126:HEADER_BYTES]) == BIG_ENDIAN else "<"
+    try:
+        for kind, body in _elements(content[HEADER_BYTES:], order):
+            variables = [_Element(kind, body)]
+            if kind == COMPRESSED:
+                variables = list(_elements(memoryview(_unpacked(body, budget)), order))
+            for variable in variables:
+                _check_array(variable, order)
+    except _DamageError as damage:
+        raise RecordingError(f"{path} cannot be read: {damage}; copy or save it anew") from None
+
+
+def _unpacked(body: memoryview, budget: Budget) -> bytes:
+    """A compressed variable, no more of it than the file may hold."""
+    unpacking = zlib.decompressobj()
+    found = unpacking.decompress(body, budget.left_bytes + 1)
+    budget.spend(len(found))
+    if not unpacking.eof:
+        raise _DamageError("a compressed variable is cut short")
+    return found
+
+
+def _elements(content: memoryview, order: str) -> Iterator[_Element]:
+    at = 0
+    while at < len(content):
+        if at + 8 > len(content):
+            raise _DamageError("it is cut short")
+        kind, size = struct.unpack_from(f"{order}II", content, at)
+        if kind >> 16:  # small element: up to four bytes in place of the size
+            kind, size, start, step = kind & 0xFFFF, kind >> 16, at + 4, 8
+            if size > 4:
+                raise _DamageError("the size of an element is damaged")
+        else:
+            start = at + 8
+            step = 8 + size + (-size % 8 if kind != COMPRESSED else 0)
+        if start + size > len(content):
+            raise _DamageError(
+                f"it is cut short or damaged: an element of {size} bytes has {len(content) - start} bytes"
+            )
+        yield _Element(kind, content[start : start + size])
+        at += step
+
+
+def _check_array(element: _Element, order: str) -> None:
+    if element.kind != MATRIX:
+        raise _DamageError(f"an element of type {element.kind} stands where an array belongs")
+    if not element.body:
+        return  # an empty array inside of another
+    flags, *parts = _elements(element.body, order)
+    if flags.kind != UINT32 or len(flags.body) != 8:
+        raise _DamageError("the flags of an array are damaged")
+    word = _integers(flags.body, order)[0]
+    array_class = word & 0xFF
+    expected = AFTER_FLAGS.get(array_class)
+    if expected is None:
+        raise _DamageError(f"there is no class {array_class} of arrays")
+    if word & COMPLEX and array_class in {*NUMERIC_CLASSES, SPARSE}:
+        expected += (NUMBERS,)
+    own, inside = parts[: len(expected)], parts[len(expected) :]
+    if len(own) < len(expected) or any(
+        part.kind not in kinds for part, kinds in zip(own, expected, strict=True)
+    ):
+        raise _DamageError(f"the parts of an array of class {array_class} are damaged")
+    if array_class != OPAQUE and (len(own[0].body) < 8 or len(own[0].body) % 4):
+        raise _DamageError("the dimensions of an array are damaged")
+    count = _arrays_inside(array_class, own, order)
+    if len(inside) != count:
+        raise _DamageError(f"an array of class {array_class} holds {len(inside)} others instead of {count}")
+    for part in inside:
+        _check_array(part, order)
+
+
+def _arrays_inside(array_class: int, own: list[_Element], order: str) -> int:
+    """How many arrays a cell, struct or object says that it holds."""
+    if array_class in {FUNCTION, OPAQUE}:
+        return 1
+    if array_class not in {CELL, STRUCT, OBJECT}:
+        return 0
+    count = 1
+    for size in _integers(own[0].body, order):
+        count *= size
+    if array_class == CELL:
+        return count
+    name_bytes = _integers(own[-2].body, order)
+    if len(name_bytes) != 1 or not name_bytes[0]:
+        raise _DamageError("the length of a struct's field names is damaged")
+    return int(count * (len(own[-1].body) // name_bytes[0]))
+
+
+def _integers(body: memoryview, order: str) -> tuple[int, ...]:
+    return struct.unpack_from(f"{order}{len(body) // 4}I", body)

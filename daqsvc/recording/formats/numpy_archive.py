@@ -6,8 +6,8 @@ import zipfile
 from typing import TYPE_CHECKING
 
 from daqsvc.confined.archives import load_array
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns, flattened
-from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path

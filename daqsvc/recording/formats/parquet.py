@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns, column_names
-from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.recording import RecordingError
 from daqsvc.recording.contents import Contents, check_columns
-from daqsvc.recording.errors import RecordingError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,8 +17,8 @@ from support.examples import first_of
 from support.paths import ROOT
 from support.waiting import PATIENCE_S, eventually_blocking
 
+from daqsvc.commands.arguments import signals_to_end
 from daqsvc.commands.record import ENDINGS
-from daqsvc.commands.signals import signals_to_end
 from sim_hw.bus_socket import UnixBus
 from sim_hw.bus_socket_hub import Hub
 

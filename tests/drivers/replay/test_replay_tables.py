@@ -16,7 +16,7 @@ from support.bus_tables import replay_bus, table_layout
 
 from daqsvc.acquisition.clock import DrivenClock
 from daqsvc.confined.process import ConfinedProcess
-from daqsvc.recording.errors import RecordingError
+from daqsvc.recording import RecordingError
 from daqsvc.recording.recording import load_recording
 from drivers.base import BusPort, StreamSpec
 from drivers.replay.driver import ReplayDriver
