@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ from sim_hw.nodes.modbus_unit import ModbusUnit, RingStore
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
 
 RATE_HZ = 1000
 OUTAGES = 20
+STALL_S = 2.2
+"""So long the machine stands still once: longer than a device may without having restarted."""
 CHANNELS = '[{ name = "x", type = "int16", scale = 1.0 }, { name = "y", type = "int16", scale = 1.0 }]'
 CAN_LAYOUT = f"""
 id = 0x101
@@ -96,17 +100,34 @@ unit = "g"
     return text + "\n[pipeline]\nring_s = 120.0\n"
 
 
+class SamplingUnit(ModbusUnit):
+    """A unit that has sampled up to the moment at which it is asked, however long the machine stood still."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.catch_up: Callable[[], None] = lambda: None
+
+    def answer(self, pdu: bytes) -> bytes:
+        """See `ModbusUnit.answer`."""
+        self.catch_up()
+        return super().answer(pdu)
+
+
 class ModbusDevice:
     """A unit that goes on sampling into its ring while its server is away."""
 
     def __init__(self) -> None:
-        self._unit = ModbusUnit()
+        self._unit = SamplingUnit()
         self._server = ModbusTcpServer({1: self._unit})
         self.tcp_port = 0
 
     async def start(self) -> None:
         await self._server.start()
         self.tcp_port = self._server.port
+
+    def sample_when_asked(self, catch_up: Callable[[], None]) -> None:
+        """Sample by ``catch_up`` before each reply."""
+        self._unit.catch_up = catch_up
 
     def serve(self, service: Service) -> None:
         """Lay the ring out as the machine file says."""
@@ -152,22 +173,30 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
         async def sample(seconds: float) -> None:
             """Let all devices sample and send for a while, whether anybody listens or not."""
             until_ns = service.clock.monotonic_ns() + round(seconds * NS_PER_S)
-            while (now_ns := service.clock.monotonic_ns()) < until_ns:
-                due = (now_ns - begun_ns) * RATE_HZ // NS_PER_S // PER_FRAME * PER_FRAME
-                for name, device in devices.items():
-                    while sent[name] < due:
-                        # No more at once than a device has in its ring.
-                        n = min(due - sent[name], 10 * PER_FRAME)
-                        device.flood(sent[name], samples_of(np.arange(sent[name], sent[name] + n)))
-                        sent[name] += n
+            while service.clock.monotonic_ns() < until_ns:
+                for name in devices:
+                    catch_up(name)
                 await asyncio.sleep(0.005)
 
+        def catch_up(name: str) -> None:
+            """Let a device sample and send what is due by now."""
+            due = (service.clock.monotonic_ns() - begun_ns) * RATE_HZ // NS_PER_S // PER_FRAME * PER_FRAME
+            while sent[name] < due:
+                # No more at once than a device has in its ring.
+                n = min(due - sent[name], 10 * PER_FRAME)
+                devices[name].flood(sent[name], samples_of(np.arange(sent[name], sent[name] + n)))
+                sent[name] += n
+
         begun_ns = service.clock.monotonic_ns()
+        modbus.sample_when_asked(lambda: catch_up("modbus"))
         async with asyncio.timeout(200):
             while any(service.rings[name].end_index == 0 for name in devices):
                 await sample(0.05)
-            for _ in range(OUTAGES):
+            for outage in range(OUTAGES):
                 await sample(rng.uniform(0.02, 0.3))
+                if outage == OUTAGES // 2:
+                    time.sleep(STALL_S)  # noqa: ASYNC251 - as a busy machine does
+                    await asyncio.sleep(0.1)  # whoever reads may come before the devices
                 for device in devices.values():
                     device.go_away()
                 await sample(rng.uniform(0.0, 0.3))
@@ -176,6 +205,7 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
                 ends = {name: service.rings[name].end_index for name in devices}
                 while any(service.rings[name].end_index == end for name, end in ends.items()):
                     await sample(0.05)
+            modbus.sample_when_asked(lambda: None)
             # The last frames of all have arrived when what was sent after the last outage has.
             while any(service.rings[name].end_index < sent[name] for name in devices):
                 await asyncio.sleep(0.01)

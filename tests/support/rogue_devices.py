@@ -22,7 +22,7 @@ from sim_hw.nodes.modbus_unit import ModbusUnit
 from sim_hw.nodes.serial_node import PseudoTerminal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 TICK_S = 0.005
 NOMINAL_HZ = 50.0
 SLOW_HZ = 200.0
-STILL = 77
+STILL = 3_000_000_077
+"""No device has counted so far since it was started: nothing behind it is taken for samples since then."""
 LEVELS = {"calm": 0.1, "loud": 8.0, "huge": 1e9}
 """RMS of what is measured, in the unit of the sensor: of 25 loud values never less than 3 by chance."""
 FAULTS = (
@@ -245,16 +246,14 @@ class RogueDevices(threading.Thread):
         """Samples that the sound device has sent."""
         return self._sent
 
-    def play(
-        self, machine: MachineFile, wanted: Sequence[str], phases: Sequence[Phase], phase_s: float
-    ) -> None:
-        """Begin: the sound device, and the rogues that are wanted."""
+    def play(self, machine: MachineFile, wanted: Mapping[str, Sequence[Phase]], phase_s: float) -> None:
+        """Begin: the sound device, and the rogues that are wanted, each with its phases."""
         self._phase_s = phase_s
         specs = {s: _spec(machine, s) for s in machine.streams}
         layout: FrameLayout = specs["sound"].layout
         self._can("sound", str(self.folder / "can-sound"))
         self._sound = layout
-        for k, name in enumerate(wanted):
+        for k, (name, phases) in enumerate(wanted.items()):
             if name in self._modbus:
                 self.nodes.append(Node(name, self._modbus[name].step, phases))
                 continue
