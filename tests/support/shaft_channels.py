@@ -74,5 +74,9 @@ def half_gone(part: NDArray[np.float32]) -> None:
     part[np.arange(len(part)) % 3 > 0, :2] = np.nan
 
 
+def keyphasor_of_wrong_bits(part: NDArray[np.float32]) -> None:
+    part[::7, 2] = 3e30
+
+
 def no_keyphasor(part: NDArray[np.float32]) -> None:
     part[:, 2] = -10.0

@@ -275,8 +275,9 @@ class BearingDetector:
             return
         volts = samples[:, self.keyphasor.column]
         try:
+            refuse_beyond_any_unit(volts, self.keyphasor.name)
             speed = measure_speed(volts, self.keyphasor, self._rate_hz)
-        except SpeedError as error:
+        except (SpeedError, UnfitError) as error:
             self._speed_unknown = True
             self._begin_anew()
             lost = lacking(self.keyphasor.name, volts, ", and pulses with them")

@@ -14,6 +14,7 @@ import numpy as np
 from daqsvc.detectors.levels.statements import Evidence, LevelStatements
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.dsp.quality.missing import BRIDGED, MOST_MISSING, not_judged, nothing_known, partly_missing
+from daqsvc.dsp.quality.unit import RESCALE, beyond_any_value
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -137,6 +138,12 @@ class TrendDetector:
             )
             return self._missing(channel, evidence, reason)
         self._missed[channel.sensor] = 0
+        if wrong := beyond_any_value(known):
+            reason = f"{channel.sensor} {wrong}; {RESCALE}"
+            share = 1.0 - len(known) / len(samples)
+            return self._statements.state(
+                channel.sensor, channel.limits, evidence, {}, {}, "not_ok", reason, share
+            )
         missing, value = len(samples) - len(known), _as_read(known)
         bounds: Bounds = {}
         if reason := _beyond_ok(channel, known):

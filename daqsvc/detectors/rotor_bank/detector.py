@@ -19,6 +19,7 @@ from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.missing import OBSERVED_SHARE
 from daqsvc.dsp.quality.probes import DEAD, RevolutionJudge, RevolutionQuality
 from daqsvc.dsp.quality.stuck import stands_still
+from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe, KeyphasorTracker
 from daqsvc.rotor.adaptation import VARIANCE_FACTOR, SteadyFit, adapted
 from daqsvc.rotor.bank import UNDETERMINED, BankReport, ModelBank
@@ -373,6 +374,8 @@ class RotorBankDetector:
             bad = self._judge.judge(probes, self._least_motion_um)
         if bad.quality != "good":
             return bad
+        if wrong := beyond_any_unit(self._last_revolution[:, 2]):
+            return RevolutionQuality("not_ok", f"{self._keyphasor.name} {wrong}; {RESCALE}")
         if (blind := self._tracker.revolutions_since_edge) > _BLIND_REVOLUTIONS:
             expected_rpm = 60.0 * self._rate_hz / self._nominal_period
             return RevolutionQuality(

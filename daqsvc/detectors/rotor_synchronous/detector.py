@@ -19,6 +19,7 @@ from daqsvc.detectors.rotor_synchronous.vector_checks import (
 from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality.probes import RevolutionJudge, RevolutionQuality
+from daqsvc.dsp.quality.unit import RESCALE, beyond_any_unit
 from daqsvc.dsp.speed.keyphasor import KeyphasorProbe
 from daqsvc.rotor.synchronous.watch import RotorWatch, WatchReport, WatchRules
 
@@ -151,6 +152,7 @@ class RotorSynchronousDetector:
         self._refused = ""
         self._t_end_ns = 0
         self._period_ns = 0.0
+        self._volts_unfit, self._volts_unfit_until = "", 0
         self._verdicts: deque[RevolutionQuality] = deque(maxlen=_REMEMBERED)
         self._ends: deque[int] = deque(maxlen=_REACH)
         self._speed_rpm = self._stated_rpm = abs(speed_rpm)
@@ -185,6 +187,7 @@ class RotorSynchronousDetector:
         """Take in a window without a break behind its first sample."""
         self._t_end_ns, self._period_ns = window.t_end_ns, window.period_ns
         self._count_missing(window)
+        self._look_at_volts(window)
         broken = bool(window.breaks)
         if broken or abs(window.first_index - self._turns.end_index) > self._turns.period:
             self._judge.reset()
@@ -195,6 +198,17 @@ class RotorSynchronousDetector:
         ]
         said.append(self._blind())
         return [diagnosis for diagnosis in said if diagnosis is not None]
+
+    def _look_at_volts(self, window: Window) -> None:
+        """Whether the keyphasor reads what no sensor measures; revolutions come some time after it."""
+        if not isinstance(self._reference, KeyphasorProbe):
+            return
+        if wrong := beyond_any_unit(window.samples[:, self._reference.column]):
+            self._volts_unfit = f"{self._reference.name} {wrong}; {RESCALE}"
+            end = window.first_index + len(window.samples)
+            self._volts_unfit_until = end + round(_BLIND_REVOLUTIONS * self._turns.period)
+        elif window.first_index >= self._volts_unfit_until:
+            self._volts_unfit = ""
 
     def _count_missing(self, window: Window) -> None:
         """Count the samples since the last statement, and those that lack a value of any sensor."""
@@ -269,8 +283,9 @@ class RotorSynchronousDetector:
         least_um = 0.0
         if self._refused and not self._rules.retry:
             return RevolutionQuality("not_ok", self._refused)
-        if not revolution.trusted or self._speed_rpm > _OVERSPEED * self._stated_rpm:
-            return RevolutionQuality("missing", self._angle_unknown())
+        overspeed = self._speed_rpm > _OVERSPEED * self._stated_rpm
+        if self._volts_unfit or not revolution.trusted or overspeed:
+            return self._angle_unknown()
         if calibration is not None:
             verdict = speed_verdict(self._speed_rpm, calibration)
             if verdict.quality != "good":
@@ -306,19 +321,23 @@ class RotorSynchronousDetector:
         patience = _ORBIT_LOCK_REVOLUTIONS if self._reference == "orbit" else _BLIND_REVOLUTIONS
         if self._turns.waiting_samples <= patience * 60.0 * self._rate_hz / slowest_rpm:
             return None
-        verdict = RevolutionQuality("missing", self._angle_unknown())
-        return self._stating(self._stater.maybe(self._standing(), verdict, *self._end(self._turns.end_index)))
+        end = self._end(self._turns.end_index)
+        return self._stating(self._stater.maybe(self._standing(), self._angle_unknown(), *end))
 
-    def _angle_unknown(self) -> str:
+    def _angle_unknown(self) -> RevolutionQuality:
+        if self._volts_unfit:
+            return RevolutionQuality("not_ok", self._volts_unfit)
         if isinstance(self._reference, KeyphasorProbe):
-            return (
+            return RevolutionQuality(
+                "missing",
                 f"{self._reference.name}: its pulses do not tell the shaft angle at {self._stated_rpm:.0f} "
                 "rpm; check that the shaft turns at that speed, and that the pulse crosses "
-                f"{self._reference.threshold_v} V"
+                f"{self._reference.threshold_v} V",
             )
-        return (
+        return RevolutionQuality(
+            "missing",
             f"no 1X is found in the orbit around {self._stated_rpm:.0f} rpm; check that the shaft turns at "
-            "that speed, or use a keyphasor"
+            "that speed, or use a keyphasor",
         )
 
     def _verdict(self) -> RevolutionQuality:

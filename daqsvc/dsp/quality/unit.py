@@ -47,6 +47,8 @@ MOST_IN_ANY_UNIT = 1e12
 """A larger value no sensor measures, in whatever unit: in micrometres it is a thousand kilometres."""
 _LEAST_SWING = 1e-12
 """Nor does any resolve less of a signal than this, from its lowest value to its highest."""
+_LEAST_VALUE = float(np.finfo(np.float32).tiny)
+"""Single values nearer to 0, and not 0, are other bits read as a float."""
 _LEAST_ORBIT_UM = 0.01
 _MOST_ORBIT_UM = 10_000.0
 _MOST_CLEARANCES = 20.0
@@ -68,6 +70,20 @@ def beyond_any_unit(signal: NDArray[np.floating]) -> str:
         f"holds {signal[first]:.4g} at sample {first} ({len(wrong)} of {len(signal)} samples are beyond "
         f"{MOST_IN_ANY_UNIT:g}), which no sensor measures in any unit"
     )
+
+
+def beyond_any_value(values: NDArray[np.floating]) -> str:
+    """What of values that stand each by itself no sensor can have measured; empty if nothing.
+
+    Args:
+        values: ``[n]``; what is not finite does not count.
+    """
+    if wrong := beyond_any_unit(values):
+        return wrong
+    small = np.flatnonzero((np.abs(values) < _LEAST_VALUE) & (values != 0.0))
+    if not len(small):
+        return ""
+    return f"holds {values[small[0]]:.4g} at sample {small[0]}, which no sensor resolves in any unit"
 
 
 RESCALE = "correct its scale or unit, or replace the file or the device that is broken"

@@ -70,6 +70,14 @@ def test_the_lines_are_looked_for_at_the_measured_speed() -> None:
     assert feed(detector(keyphasor=None), fast)[-1].decision != "outer"
 
 
+def test_volts_that_no_sensor_measures_are_named() -> None:
+    samples = at_speed(10.0, SPEED_RPM, 3, damaged=True)
+    samples[::1000, 1] = 3e30
+    said = feed(detector(), samples)
+    assert {one.quality for one in said} == {"not_ok"}
+    assert "key holds 3e+30 at sample 0" in said[-1].reason
+
+
 def test_another_speed_begins_anew_and_clears_nothing() -> None:
     watch = detector()
     slow = 0.85 * SPEED_RPM

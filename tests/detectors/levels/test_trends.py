@@ -57,6 +57,20 @@ def test_a_value_that_stands_still_is_no_dead_sensor():
     assert {d.quality for d in said} == {"good"}
 
 
+@pytest.mark.parametrize("value", [2e12, -3e38, 1e-40, -1e-45])
+@pytest.mark.parametrize("rate_hz", [1.0, 10.0])
+def test_a_value_that_no_sensor_measures_is_not_judged(value, rate_hz):
+    subject = detector(rate_hz=rate_hz, window_s=1.0)
+    before = subject.process(window([85.0] * 10, period_s=1.0 / rate_hz))[-1]
+    said = subject.process(window([20.0] * 9 + [value], first=10, period_s=1.0 / rate_hz))[-1]
+    assert (before.decision, said.decision) == ("alert", "alert" if rate_hz == 10.0 else "normal")
+    assert (said.quality, said.statistics) == ("not_ok", {})
+    assert said.reason.startswith(f"oil holds {np.float32(value):.4g} at sample ")
+    assert "in any unit; correct its scale or unit" in said.reason
+    after = subject.process(window([0.0] * 10, first=20, period_s=1.0 / rate_hz))[-1]
+    assert (after.quality, after.decision) == ("good", "danger")
+
+
 def test_a_fast_trend_is_averaged_over_its_window():
     fast = detector(rate_hz=10.0, window_s=1.0)
     assert fast.block == 10

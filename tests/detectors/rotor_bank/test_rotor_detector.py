@@ -6,7 +6,17 @@ import math
 
 import numpy as np
 import pytest
-from support.shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
+from support.shaft_channels import (
+    FIRST,
+    channels_of,
+    dead,
+    feed,
+    gone,
+    half_gone,
+    infinite,
+    keyphasor_of_wrong_bits,
+    no_keyphasor,
+)
 
 from daqsvc.detectors.rotor_bank.detector import KeyphasorProbe, Probe, RotorBankDetector, RotorMode
 from daqsvc.diagnosis.detector import Window
@@ -207,6 +217,7 @@ def keyphasor_gone(part):
         (half_gone, "missing", "of 64 samples of a revolution are missing"),
         (no_keyphasor, "missing", "keyphasor: no pulse"),
         (keyphasor_gone, "missing", "keyphasor: no pulse"),
+        (keyphasor_of_wrong_bits, "not_ok", "keyphasor holds 3e+30 at sample"),
     ],
 )
 def test_bad_sensor_is_named_and_the_decision_held(worn, spoil, quality, reason):

@@ -7,7 +7,17 @@ import re
 
 import numpy as np
 import pytest
-from support.shaft_channels import FIRST, channels_of, dead, feed, gone, half_gone, infinite, no_keyphasor
+from support.shaft_channels import (
+    FIRST,
+    channels_of,
+    dead,
+    feed,
+    gone,
+    half_gone,
+    infinite,
+    keyphasor_of_wrong_bits,
+    no_keyphasor,
+)
 
 from daqsvc.detectors.rotor_synchronous.detector import RotorSynchronousDetector
 from daqsvc.diagnosis.detector import Window
@@ -264,6 +274,7 @@ BAD = [
     (half_gone, "missing", "samples of a revolution are missing"),
     (no_keyphasor, "missing", "keyphasor: its pulses do not tell the shaft angle"),
     (noise_for_keyphasor, "missing", "keyphasor: its pulses do not tell the shaft angle"),
+    (keyphasor_of_wrong_bits, "not_ok", "keyphasor holds 3e+30 at sample"),
 ]
 
 
