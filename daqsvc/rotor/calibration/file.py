@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic_core import PydanticCustomError
 
 from daqsvc.confined.small_toml import TomlFileError, parse_toml, read_toml
 from daqsvc.rotor.calibration.run_up import RunUpFit
@@ -23,7 +24,11 @@ from daqsvc.rotor.synchronous.baseline import SPEED_TOLERANCE, Calibration
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from pydantic_core import ErrorDetails
+
+
+class CalibrationFileError(ValueError):
+    """A calibration file cannot be read, used or written; the message says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +126,175 @@ _PREAMBLE = """\
 # The healthy machine, as `daqsvc calibrate` saw it. Lengths in um, angles in degrees from the keyphasor's
 # mark in the direction of rotation (x is mirrored if the shaft turns clockwise). +- is a standard deviation.
 """
+
+
+_RESTORE = "restore the file, or calibrate again"
+_MISTAKES = {
+    "extra_forbidden": "there is no such key; remove it, or calibrate again",
+    "finite_number": f"it must be a finite number; {_RESTORE}",
+    "float_type": f"it must be a finite number; {_RESTORE}",
+    "model_type": f"it must be a table; {_RESTORE}",
+    "string_type": f"it must be a text in quotes; {_RESTORE}",
+}
+
+
+def _refused(value: object, why: str) -> PydanticCustomError:
+    return PydanticCustomError("refused", "{why}", {"why": why, "value": value})
+
+
+def _number(*, above: float = -math.inf, least: float = -math.inf, below: float = math.inf) -> AfterValidator:
+    """A number within bounds."""
+    bounds = (("above", above), ("at least", least), ("below", below))
+    wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds if math.isfinite(bound))
+
+    def check(value: float) -> float:
+        if not (value > above and value >= least and value < below):
+            raise _refused(value, f"it must be {wanted}; {_RESTORE}")
+        return value
+
+    return AfterValidator(check)
+
+
+def _whole(least: int) -> BeforeValidator:
+    """A whole number."""
+
+    def check(value: object) -> object:
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise _refused(value, f"it must be a whole number from {least} on; {_RESTORE}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def _list(wanted: str, length: int | None = None, of: type = object) -> BeforeValidator:
+    """A list of that length, of any length if there is none."""
+
+    def check(value: object) -> object:
+        if (
+            not isinstance(value, list)
+            or (length is not None and len(value) != length)
+            or not all(isinstance(part, of) for part in value)
+        ):
+            raise _refused(value, f"it must be {wanted}; {_RESTORE}")
+        return value
+
+    return BeforeValidator(check)
+
+
+def _this_version(version: int) -> int:
+    if version != SCHEMA_VERSION:
+        raise _refused(version, f"this program reads version {SCHEMA_VERSION}; calibrate again with it")
+    return version
+
+
+def _rising(speeds: list[float]) -> list[float]:
+    if not 0.0 < speeds[0] < speeds[1]:
+        raise _refused(speeds, "give the lowest and the highest speed")
+    return speeds
+
+
+def _variances(covariance: list[list[float]]) -> list[list[float]]:
+    diagonal = [row[i] for i, row in enumerate(covariance)]
+    if min(diagonal) < 0.0:
+        raise _refused(diagonal, "no variance can be below 0")
+    return covariance
+
+
+Positive = Annotated[float, _number(above=0.0)]
+NotNegative = Annotated[float, _number(least=0.0)]
+Tolerance = Annotated[float, _number(least=0.0, below=1.0)]
+DampingRatio = Annotated[float, _number(above=0.0, below=1.0)]
+Count = Annotated[int, _whole(1)]
+_Row = Annotated[list[float], _list("4 numbers", 4)]
+
+
+class _FileTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class _RotorTable(_FileTable):
+    natural_frequency_hz: Positive
+    damping_ratio: DampingRatio
+    natural_frequency_tolerance: Tolerance
+    damping_tolerance: Tolerance
+    clearance_um: Positive | None = None
+    static_sag_um: float | None = None
+
+
+class _ComplexTable(_FileTable):
+    re: float
+    im: float
+
+    def made(self) -> complex:
+        return complex(self.re, self.im)
+
+
+class _RunUpTable(_FileTable):
+    verdict: str = ""
+    source: str = ""
+    speed_range_rpm: Annotated[list[float], _list("2 numbers", 2), AfterValidator(_rising)]
+    covariance: Annotated[list[_Row], _list("4 rows of 4 numbers", 4), AfterValidator(_variances)]
+    natural_frequency_hz: Positive
+    damping_ratio: DampingRatio
+    eccentricity_um: _ComplexTable
+    centre_um: _ComplexTable
+    centre_uncertainty_um: NotNegative
+    ellipticity: NotNegative
+    noise_um: NotNegative
+    fit_error: NotNegative
+    revolutions: Count
+
+    def made(self) -> RunUpFit:
+        low, high = self.speed_range_rpm
+        figures = self.model_dump(exclude={"verdict", "source"}) | {
+            "speed_range_rpm": (low, high),
+            "covariance": np.array(self.covariance, dtype=np.float64),
+            "eccentricity_um": self.eccentricity_um.made(),
+            "centre_um": self.centre_um.made(),
+        }
+        return RunUpFit(**figures)
+
+
+class _ComponentTable(_ComplexTable):
+    revolution_variance: Positive
+
+
+class _SteadyTable(_FileTable):
+    verdict: str = ""
+    source: str = ""
+    mean_position_um: _ComponentTable
+    forward_1x_um: _ComponentTable
+    backward_1x_um: _ComponentTable
+    forward_2x_um: _ComponentTable
+    backward_2x_um: _ComponentTable
+    speed_rpm: Positive
+    revolutions: Count
+    noise_variance_um2: Positive
+    noise_relative_variance: Positive
+    samples_per_rev: Positive
+    fit_error: NotNegative | None = None
+
+    def made(self, rotor: LavalRotor) -> Calibration:
+        components: list[_ComponentTable] = [getattr(self, key) for key in _COMPONENTS]
+        return Calibration(
+            rotor=rotor,
+            speed_rpm=self.speed_rpm,
+            revolutions=self.revolutions,
+            baseline=np.array([component.made() for component in components]),
+            variance=np.array([component.revolution_variance for component in components]),
+            noise=self.noise_variance_um2,
+            noise_variance=self.noise_relative_variance,
+            samples_per_rev=self.samples_per_rev,
+            fit_error=self.fit_error,
+        )
+
+
+class _File(_FileTable):
+    schema_version: Annotated[int, AfterValidator(_this_version), _whole(0)]
+    written: str = ""
+    rotor: _RotorTable
+    run_up: _RunUpTable | None = None
+    steady: Annotated[list[_SteadyTable], _list("[[steady]] tables", of=dict)] = []
 
 
 def load_calibration(path: Path | str, speed_rpm: float | None = None) -> Calibration:
@@ -325,96 +499,33 @@ def _record(document: Mapping[str, Any], path: Path) -> CalibrationRecord:
             f"{path}: was written of bearings, for pipeline.bearing.calibration or for --calibration with "
             f"--bearing or --orders, and a rotor is watched here; {_REMEDY}"
         )
-    table = Table(document, path)
-    version = table.whole("schema_version")
-    if version != SCHEMA_VERSION:
-        raise table.wrong(
-            "schema_version",
-            version,
-            f"this program reads version {SCHEMA_VERSION}; calibrate again with it",
-        )
-    written = table.text("written", default="")
-    rotor = _rotor(table.table("rotor"))
-    run_up, run_up_source = None, ""
-    if (run_up_table := table.optional_table("run_up")) is not None:
-        run_up_source = run_up_table.text("source", default="")
-        run_up = _run_up(run_up_table)
-    steady, sources = [], []
-    for part in table.tables("steady"):
-        sources.append(part.text("source", default=""))
-        steady.append(_steady(part, rotor))
-    if run_up is None and not steady:
+    try:
+        table = _File.model_validate(document)
+    except ValidationError as error:
+        raise CalibrationFileError(f"{path}: {_message(error.errors()[0])}") from None
+    if table.run_up is None and not table.steady:
         raise CalibrationFileError(f"{path}: neither [run_up] nor [[steady]] is there; calibrate again")
-    table.nothing_else()
+    rotor = LavalRotor(**table.rotor.model_dump())
     return CalibrationRecord(
         rotor=rotor,
-        steady=tuple(steady),
-        steady_sources=tuple(sources),
-        run_up=run_up,
-        run_up_source=run_up_source,
-        written=written,
+        steady=tuple(part.made(rotor) for part in table.steady),
+        steady_sources=tuple(part.source for part in table.steady),
+        run_up=None if table.run_up is None else table.run_up.made(),
+        run_up_source="" if table.run_up is None else table.run_up.source,
+        written=table.written,
     )
 
 
-def _rotor(table: Table) -> LavalRotor:
-    rotor = LavalRotor(
-        natural_frequency_hz=table.number("natural_frequency_hz", above=0.0),
-        damping_ratio=table.number("damping_ratio", above=0.0, below=1.0),
-        natural_frequency_tolerance=table.number("natural_frequency_tolerance", least=0.0, below=1.0),
-        damping_tolerance=table.number("damping_tolerance", least=0.0, below=1.0),
-        clearance_um=table.optional_number("clearance_um", above=0.0),
-        static_sag_um=table.optional_number("static_sag_um"),
-    )
-    table.nothing_else()
-    return rotor
-
-
-def _run_up(table: Table) -> RunUpFit:
-    table.text("verdict", default="")
-    low, high = table.numbers("speed_range_rpm", 2)
-    if not 0.0 < low < high:
-        raise table.wrong("speed_range_rpm", [low, high], "give the lowest and the highest speed")
-    covariance = table.matrix("covariance", 4)
-    if np.any(np.diag(covariance) < 0.0):
-        raise table.wrong("covariance", np.diag(covariance).tolist(), "no variance can be below 0")
-    fit = RunUpFit(
-        natural_frequency_hz=table.number("natural_frequency_hz", above=0.0),
-        damping_ratio=table.number("damping_ratio", above=0.0, below=1.0),
-        eccentricity_um=table.complex_number("eccentricity_um"),
-        centre_um=table.complex_number("centre_um"),
-        covariance=covariance,
-        centre_uncertainty_um=table.number("centre_uncertainty_um", least=0.0),
-        ellipticity=table.number("ellipticity", least=0.0),
-        noise_um=table.number("noise_um", least=0.0),
-        fit_error=table.number("fit_error", least=0.0),
-        speed_range_rpm=(low, high),
-        revolutions=table.whole("revolutions", least=1),
-    )
-    table.nothing_else()
-    return fit
-
-
-def _steady(table: Table, rotor: LavalRotor) -> Calibration:
-    table.text("verdict", default="")
-    baseline, variance = [], []
-    for key in _COMPONENTS:
-        part = table.table(key)
-        baseline.append(complex(part.number("re"), part.number("im")))
-        variance.append(part.number("revolution_variance", above=0.0))
-        part.nothing_else()
-    calibration = Calibration(
-        rotor=rotor,
-        speed_rpm=table.number("speed_rpm", above=0.0),
-        revolutions=table.whole("revolutions", least=1),
-        baseline=np.array(baseline, dtype=np.complex128),
-        variance=np.array(variance, dtype=np.float64),
-        noise=table.number("noise_variance_um2", above=0.0),
-        noise_variance=table.number("noise_relative_variance", above=0.0),
-        samples_per_rev=table.number("samples_per_rev", above=0.0),
-        fit_error=table.optional_number("fit_error", least=0.0),
-    )
-    table.nothing_else()
-    return calibration
+def _message(error: ErrorDetails) -> str:
+    """A mistake by key, value and remedy."""
+    key = ""
+    for step in error["loc"]:
+        key += f"[{step}]" if key == ".steady" else "" if isinstance(step, int) else f".{step}"
+    key = key.removeprefix(".")
+    if error["type"] == "missing":
+        return f"{key} is missing; {_RESTORE}"
+    value = error.get("ctx", {}).get("value", error["input"])
+    return f"{key} = {value!r}: {_MISTAKES.get(error['type'], error['msg'])}"
 
 
 def _with(value: float, deviation: float) -> str:
@@ -442,141 +553,3 @@ def _quoted(text: str) -> str:
         else:
             escaped.append(letter)
     return f'"{"".join(escaped)}"'
-
-
-_RESTORE = "restore the file, or calibrate again"
-
-
-class CalibrationFileError(ValueError):
-    """A calibration file cannot be read, used or written; the message says why and what to do."""
-
-
-class Table:
-    """A table of a calibration file.
-
-    Args:
-        values: what it holds.
-        path: the file.
-        name: keys that lead to it.
-    """
-
-    def __init__(self, values: Mapping[str, Any], path: Path, name: str = "") -> None:
-        self._values = values
-        self._path = path
-        self._name = name
-        self._read: set[str] = set()
-
-    def wrong(self, key: str, value: object, remedy: str) -> CalibrationFileError:
-        """The error about a value."""
-        return CalibrationFileError(f"{self._path}: {self._place(key)} = {value!r}: {remedy}")
-
-    def number(
-        self,
-        key: str,
-        *,
-        above: float = -math.inf,
-        least: float = -math.inf,
-        below: float = math.inf,
-    ) -> float:
-        """A finite number.
-
-        Raises:
-            CalibrationFileError: it is not there, no number, or outside of its bounds.
-        """
-        value = self._number(key, self._get(key))
-        if not (value > above and value >= least and value < below):
-            bounds = [
-                f"{word} {bound:g}"
-                for word, bound in (("above", above), ("at least", least), ("below", below))
-                if math.isfinite(bound)
-            ]
-            raise self.wrong(key, value, f"it must be {' and '.join(bounds)}; {_RESTORE}")
-        return value
-
-    def optional_number(self, key: str, **bounds: float) -> float | None:
-        """The same, or None if it is not there."""
-        return self.number(key, **bounds) if key in self._values else None
-
-    def numbers(self, key: str, count: int) -> list[float]:
-        """So many finite numbers."""
-        value = self._get(key)
-        if not isinstance(value, list) or len(value) != count:
-            raise self.wrong(key, value, f"it must be {count} numbers; {_RESTORE}")
-        return [self._number(key, part) for part in value]
-
-    def matrix(self, key: str, size: int) -> NDArray[np.float64]:
-        """A square of finite numbers."""
-        value = self._get(key)
-        if not isinstance(value, list) or len(value) != size:
-            raise self.wrong(key, value, f"it must be {size} rows of {size} numbers; {_RESTORE}")
-        rows = [Table({key: row}, self._path, self._name).numbers(key, size) for row in value]
-        return np.array(rows, dtype=np.float64)
-
-    def complex_number(self, key: str) -> complex:
-        """A table of ``re`` and ``im``."""
-        part = self.table(key)
-        value = complex(part.number("re"), part.number("im"))
-        part.nothing_else()
-        return value
-
-    def whole(self, key: str, *, least: int = 0) -> int:
-        """A whole number."""
-        value = self._get(key)
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise self.wrong(key, value, f"it must be a whole number from {least} on; {_RESTORE}")
-        return value
-
-    def text(self, key: str, *, default: str) -> str:
-        """A text, or the default if it is not there."""
-        self._read.add(key)
-        value = self._values.get(key, default)
-        if not isinstance(value, str):
-            raise self.wrong(key, value, f"it must be a text in quotes; {_RESTORE}")
-        return value
-
-    def table(self, key: str) -> Table:
-        """A table inside."""
-        value = self._get(key)
-        if not isinstance(value, dict):
-            raise self.wrong(key, value, f"it must be a table; {_RESTORE}")
-        return Table(value, self._path, self._place(key))
-
-    def optional_table(self, key: str) -> Table | None:
-        """The same, or None if it is not there."""
-        return self.table(key) if key in self._values else None
-
-    def tables(self, key: str) -> list[Table]:
-        """Tables in a row, none if the key is not there."""
-        self._read.add(key)
-        value = self._values.get(key, [])
-        if not isinstance(value, list) or not all(isinstance(part, dict) for part in value):
-            raise self.wrong(key, value, f"it must be [[{key}]] tables; {_RESTORE}")
-        return [Table(part, self._path, f"{self._place(key)}[{i}]") for i, part in enumerate(value)]
-
-    def nothing_else(self) -> None:
-        """Refuse keys that nobody has read.
-
-        Raises:
-            CalibrationFileError: there is one.
-        """
-        for key, value in self._values.items():
-            if key not in self._read:
-                raise self.wrong(key, value, "there is no such key; remove it, or calibrate again")
-
-    def _get(self, key: str) -> Any:
-        self._read.add(key)
-        if key not in self._values:
-            raise CalibrationFileError(f"{self._path}: {self._place(key)} is missing; {_RESTORE}")
-        return self._values[key]
-
-    def _number(self, key: str, value: object) -> float:
-        number = math.nan
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            # A whole number may be too large for a float.
-            number = float(value) if abs(value) <= sys.float_info.max else math.inf
-        if not math.isfinite(number):
-            raise self.wrong(key, value, f"it must be a finite number; {_RESTORE}")
-        return number
-
-    def _place(self, key: str) -> str:
-        return f"{self._name}.{key}" if self._name else key
