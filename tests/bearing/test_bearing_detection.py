@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
+from daqsvc.bearing import likelihood
 from daqsvc.bearing.isolation import IsolationRule, isolation_spectrum
 from daqsvc.bearing.likelihood import WhittleDetector, detection_spectrum
 from daqsvc.bearing.residual import TwoSensorResidual
-from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
+from daqsvc.bearing.two_sensors import HealthyPair, TwoSensorMonitor, learn_pair
 from sim_hw.reproduce.bearing.design import S1, S3
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 RATE_HZ = 48_000.0
 
@@ -42,14 +48,36 @@ def hits(races: tuple[int, ...], size: float, count: int = 40) -> np.ndarray:
     return residual
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _quick_limits() -> Iterator[None]:
+    """Limits from a fifth of the simulated frames: right within a few percent, which these cases clear."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(likelihood, "DRAWN_FRAMES", 40_000)
+        yield
+
+
 @pytest.fixture(scope="module")
 def healthy() -> np.ndarray:
     return separated(noise(3.0))
 
 
+@pytest.fixture(scope="module")
+def detector(healthy) -> WhittleDetector:
+    return detection(healthy)
+
+
+@pytest.fixture(scope="module")
+def rule(healthy) -> IsolationRule:
+    return isolation_rule(healthy)
+
+
+@pytest.fixture(scope="module")
+def pair() -> HealthyPair:
+    return learn_pair(S3, RATE_HZ, noise(3.0))
+
+
 @pytest.mark.parametrize(("races", "verdict"), [((0,), "inner"), ((1,), "outer"), ((0, 1), "ball")])
-def test_hits_name_their_race(healthy, races, verdict):
-    detector, rule = detection(healthy), isolation_rule(healthy)
+def test_hits_name_their_race(detector, rule, races, verdict):
     window = hits(races, 1e-6)
     assert detector.judge(window).detected
     isolation = rule.judge(window)
@@ -58,21 +86,20 @@ def test_hits_name_their_race(healthy, races, verdict):
     assert isolation.hits >= 30
 
 
-def test_noise_leaves_the_race_open(healthy):
-    rule = isolation_rule(healthy)
+def test_noise_leaves_the_race_open(rule):
     isolation = rule.judge(separated(noise(0.5, 1)))
     assert isolation.verdict == "inner_or_outer"
     assert set(isolation.group) == {"inner", "outer", "ball"}
 
 
-def test_a_window_of_missing_samples_only_is_open(healthy):
-    assert isolation_rule(healthy).judge(np.full((1000, 2), np.nan)).hits == 0
+def test_a_window_of_missing_samples_only_is_open(rule):
+    assert rule.judge(np.full((1000, 2), np.nan)).hits == 0
 
 
-def test_missing_samples_do_not_alarm(healthy):
+def test_missing_samples_do_not_alarm(detector):
     window = separated(noise(1.0, 2))
     window[20_000:20_400] = np.nan
-    assert not detection(healthy).judge(window).detected
+    assert not detector.judge(window).detected
 
 
 def test_a_rarer_false_alarm_has_a_higher_limit(healthy):
@@ -92,8 +119,8 @@ def test_a_rate_too_low_for_the_bearing_leaves_every_fault_open():
 
 
 @pytest.mark.parametrize("louder", [(2.0, 2.0), (3.0, 1.0), (1.0, 3.0)])
-def test_steady_noise_is_a_change_and_no_race(louder):
-    monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
+def test_steady_noise_is_a_change_and_no_race(pair, louder):
+    monitor = TwoSensorMonitor(pair)
     finding = monitor.evaluate(noise(0.5, 7) * louder)
     assert (finding.verdict, finding.group) == ("changed", ("changed",))
     assert finding.detection.detected
@@ -101,20 +128,18 @@ def test_steady_noise_is_a_change_and_no_race(louder):
     assert finding.isolation is None
 
 
-def test_a_level_that_differs_from_run_to_run_is_no_fault():
-    healthy = learn_pair(S3, RATE_HZ, noise(3.0))
+def test_a_level_that_differs_from_run_to_run_is_no_fault(pair):
     louder = 10.0 ** (1.5 / 20.0) * noise(2.5, 8)
-    assert TwoSensorMonitor(healthy, false_alarm_rate=1e-4).evaluate(louder).detection.detected
-    allowing = TwoSensorMonitor(healthy, false_alarm_rate=1e-4, repeatability_db=0.8)
+    assert TwoSensorMonitor(pair, false_alarm_rate=1e-4).evaluate(louder).detection.detected
+    allowing = TwoSensorMonitor(pair, false_alarm_rate=1e-4, repeatability_db=0.8)
     assert not allowing.evaluate(louder).detection.detected
 
 
-def test_a_spectrum_of_another_rate_is_refused():
-    healthy = learn_pair(S3, RATE_HZ, noise(3.0))
+def test_a_spectrum_of_another_rate_is_refused(pair):
     with pytest.raises(ValueError, match=r"\d+ lines; there are \d+ at 24000 samples"):
-        WhittleDetector(S3, 24_000.0, healthy.detection)
+        WhittleDetector(S3, 24_000.0, pair.detection)
     with pytest.raises(ValueError, match=r"lines; there are \d+ at 24000 samples"):
-        IsolationRule(S3, 24_000.0, healthy.isolation)
+        IsolationRule(S3, 24_000.0, pair.isolation)
 
 
 def test_short_records_and_dead_sensors_are_named():
@@ -134,8 +159,8 @@ def test_short_records_and_dead_sensors_are_named():
         detection(noise(2.0)).judge(noise(0.004))
 
 
-def test_the_monitor_is_calm_on_the_machine_that_it_has_learnt():
-    monitor = TwoSensorMonitor(learn_pair(S3, RATE_HZ, noise(3.0)))
+def test_the_monitor_is_calm_on_the_machine_that_it_has_learnt(pair):
+    monitor = TwoSensorMonitor(pair)
     y = noise(2.0, 5)
     findings = [monitor.evaluate(part) for part in np.split(y, 4)]
     assert [finding.verdict for finding in findings] == ["normal"] * 4
