@@ -21,9 +21,10 @@ from __future__ import annotations
 import cmath
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numba import njit
 from scipy.linalg import solve_discrete_lyapunov
 
 from daqsvc.rotor import kernels
@@ -31,7 +32,6 @@ from daqsvc.rotor.discretise import (
     axis_flow,
     axis_process_covariance,
     constant_gain,
-    contact_substeps,
     discretise,
 )
 
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from daqsvc.rotor.model import NormalisedRotor
 
     Floats = NDArray[np.float64]
+    Observers = NDArray[np.void]
     Complexes = NDArray[np.complex128]
 
 
@@ -395,15 +396,20 @@ def simulate_rubs(
     rng = np.random.default_rng(seed)
     start = rng.uniform(0.0, 2.0 * math.pi, (len(pairs), RUNS))
     angle = start + w * duration * np.arange(n)[:, np.newaxis, np.newaxis]
-    others = [modes[i] for i, _ in pairs]
-    rubs = [modes[j] for _, j in pairs]
-    motion = _Motion(others, start, duration=duration, process_noise=process_noise, rng=rng)
-    z = np.empty((n, len(pairs), RUNS), dtype=np.complex128)
-    motion.run(others, z[:begins], angle[:begins])
-    motion.run(rubs, z[begins:ends], angle[begins:ends])
-    motion.run(others, z[ends:], angle[ends:])
-    z += noise * (rng.standard_normal(z.shape) + 1j * rng.standard_normal(z.shape))
     observers = discretise(modes, noise=noise, duration=duration, variance_factor=variance_factor)
+    kicks = np.array(
+        [np.linalg.cholesky(axis_process_covariance(m.rotor, process_noise, duration)) for m in modes]
+    )
+    z = np.empty((n, len(pairs), RUNS), dtype=np.complex128)
+    states = np.zeros((len(pairs), RUNS, 4))
+    others, rubs = np.array(pairs).T
+    before = others
+    for mode, part in ((others, slice(begins)), (rubs, slice(begins, ends)), (others, slice(ends, n))):
+        draws = rng.standard_normal((len(z[part]), 2, 2, len(pairs), RUNS))
+        _move(observers[before], observers[mode], kicks[mode], angle[part], draws, states, z[part])
+        _check_bounded([modes[i] for i in mode], z[part][-1])
+        before = mode
+    z += noise * (rng.standard_normal(z.shape) + 1j * rng.standard_normal(z.shape))
     return [
         RubPair(i, j, _log_likelihood_ratios(observers[[0, i, j]], z[:, p], angle[:, p]), per_rev)
         for p, (i, j) in enumerate(pairs)
@@ -426,90 +432,51 @@ def _log_likelihood_ratios(observers: NDArray[np.void], z: Complexes, angle: Flo
     return llr
 
 
-class _Motion:
-    """The disc's motion in many runs at once, pair by run; its state is continuous through every change."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move(
+    before: Observers,
+    observers: Observers,
+    kicks: Floats,
+    angle: Floats,
+    draws: Floats,
+    states: Floats,
+    z: Complexes,
+) -> None:
+    """The disc's motion in many runs, pair by run; its state is continuous through the change of the mode.
 
-    def __init__(
-        self,
-        modes: Sequence[BankMode],
-        angle: Floats,
-        *,
-        duration: float,
-        process_noise: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._duration = duration
-        self._process_noise = process_noise
-        self._rng = rng
-        speed = modes[0].rotor.w
-        orbit = _column([mode.rotor.orbit() for mode in modes]) * np.exp(1j * angle)
-        self._z = orbit + _column([mode.rotor.rest for mode in modes])
-        self._v = 1j * speed * orbit
-
-    def run(self, modes: Sequence[BankMode], z: Complexes, angle: Floats) -> None:
-        """Positions from the state on.
-
-        Args:
-            modes: the mode of every pair.
-            z: complex128 ``[n, pairs, RUNS]``, out: positions, in clearances.
-            angle: float64 ``[n, pairs, RUNS]``, shaft angles, rad.
-
-        Raises:
-            ValueError: the disc has left its housing: the mode has no bounded motion.
-        """
-        rotors = [mode.rotor for mode in modes]
-        speed = rotors[0].w
-        substeps = max(contact_substeps(mode.rotor, self._duration) if mode.rub else 1 for mode in modes)
-        step = self._duration / substeps
-        half = [_column(entry) for entry in np.array([axis_flow(r, step / 2).ravel() for r in rotors]).T]
-        radius = _column([rotor.orbit() for rotor in rotors])
-        rest = _column([rotor.rest for rotor in rotors])
-        stiffness = _column([mode.rotor.contact_stiffness if mode.rub else 0.0 for mode in modes])
-        alpha = _column([rotor.alpha for rotor in rotors])
-        mu = _column([rotor.mu for rotor in rotors])
-        surface = _column([speed * rotor.contact_radius for rotor in rotors])
-        shake = [
-            np.linalg.cholesky(axis_process_covariance(r, self._process_noise, self._duration)).ravel()
-            for r in rotors
-        ]
-        shake_xx, _, shake_vx, shake_vv = (_column(entry) for entry in np.array(shake).T)
-        half_turn, turn = np.exp(0.5j * speed * step), np.exp(1j * speed * step)
-        for k in range(len(z)):
-            z[k] = self._z
-            pointer = np.exp(1j * angle[k])
-            orbit = radius * pointer
-            d, v = self._z - orbit - rest, self._v - 1j * speed * orbit
-            for _ in range(substeps):
-                d, v = half[0] * d + half[1] * v, half[2] * d + half[3] * v
-                middle = orbit * half_turn
-                position, velocity = middle + rest + d, 1j * speed * middle + v
-                v = v + step * _contact(position, velocity, stiffness, alpha, mu, surface)
-                d, v = half[0] * d + half[1] * v, half[2] * d + half[3] * v
-                orbit = orbit * turn
-            a, b = self._rng.standard_normal((2, 2, *d.shape))
-            kick_x, kick_v = a[0] + 1j * a[1], b[0] + 1j * b[1]
-            self._z = orbit + rest + d + shake_xx * kick_x
-            self._v = 1j * speed * orbit + v + shake_vx * kick_x + shake_vv * kick_v
-        escaped = ~(np.abs(self._z) < kernels.ESCAPE_RADIUS).all(axis=1)
-        if escaped.any():
-            name = modes[int(escaped.argmax())].name
-            raise ValueError(
-                f"rotor bank: in mode {name!r} the disc leaves its housing, more than "
-                f"{kernels.ESCAPE_RADIUS:g} clearances from the centre: this mode has no bounded motion; "
-                "raise its damping ratio, or lower the contact stiffness or the friction"
-            )
+    Args:
+        before: ``[pairs]`` of `discretise.OBSERVER`, the modes that the states are counted from.
+        observers: ``[pairs]``, the modes from now on.
+        kicks: float64 ``[pairs, 2, 2]``, lower root of the process noise's covariance of a sample.
+        angle: float64 ``[n, pairs, RUNS]``, shaft angles, rad.
+        draws: float64 ``[n, 2, 2, pairs, RUNS]``, normal: for position and velocity, for each axis.
+        states: float64 ``[pairs, RUNS, 4]``, deviations from the orbit, changed in place.
+        z: complex128 ``[n, pairs, RUNS]``, out: positions, in clearances.
+    """
+    for p in range(len(states)):
+        mode, xx, vx, vv = observers[p], kicks[p, 0, 0], kicks[p, 1, 0], kicks[p, 1, 1]
+        for r in range(states.shape[1]):
+            cos, sin = math.cos(angle[0, p, r]), math.sin(angle[0, p, r])
+            state = (states[p, r, 0], states[p, r, 1], states[p, r, 2], states[p, r, 3])
+            state = kernels.transfer(before[p], mode, cos, sin, state)
+            for k in range(len(z)):
+                cos, sin = math.cos(angle[k, p, r]), math.sin(angle[k, p, r])
+                x, _, y, _ = kernels.orbit(mode, cos, sin)
+                z[k, p, r] = complex(x + state[0], y + state[2])
+                dx, du, dy, dv = kernels.predict(mode, cos, sin, state)
+                a_x, a_y = draws[k, 0, 0, p, r], draws[k, 0, 1, p, r]
+                b_x, b_y = draws[k, 1, 0, p, r], draws[k, 1, 1, p, r]
+                state = (dx + xx * a_x, du + vx * a_x + vv * b_x, dy + xx * a_y, dv + vx * a_y + vv * b_y)
+            states[p, r, 0], states[p, r, 1], states[p, r, 2], states[p, r, 3] = state
 
 
-def _contact(
-    z: Complexes, velocity: Complexes, stiffness: Floats, alpha: Floats, mu: Floats, surface: Floats
-) -> Complexes:
-    """Acceleration by the contact: Hertzian repulsion and Coulomb friction against the slip."""
-    radius = np.maximum(np.abs(z), 1.0)
-    slip = surface + (z.conjugate() * velocity).imag / radius
-    force = stiffness * (radius - 1.0) ** alpha / radius
-    return np.asarray(-force * z * (1.0 + 1j * mu * np.sign(slip)), dtype=np.complex128)
-
-
-def _column(values: Sequence[Any] | Floats) -> Any:
-    """One figure for each pair, for all its runs."""
-    return np.asarray(values)[:, np.newaxis]
+def _check_bounded(modes: Sequence[BankMode], z: Complexes) -> None:
+    """Raises ValueError where the disc has left its housing; complex128 ``[pairs, RUNS]``, positions."""
+    escaped = ~(np.abs(z) < kernels.ESCAPE_RADIUS).all(axis=1)
+    if escaped.any():
+        name = modes[int(escaped.argmax())].name
+        raise ValueError(
+            f"rotor bank: in mode {name!r} the disc leaves its housing, more than "
+            f"{kernels.ESCAPE_RADIUS:g} clearances from the centre: this mode has no bounded motion; "
+            "raise its damping ratio, or lower the contact stiffness or the friction"
+        )
