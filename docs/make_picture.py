@@ -28,7 +28,9 @@ def main() -> None:
     script = script_of(arguments)
     console = Console(record=True, width=WIDTH, file=io.StringIO())
     view = View(script, arguments.speed, Console(file=io.StringIO()))
-    session = DemoSession(script, speed=arguments.speed, broker_url=arguments.broker, hear=view.hear)
+    session = DemoSession(
+        script, speed=arguments.speed, broker_url=arguments.broker, on_message=view.on_message
+    )
     outcome = asyncio.run(session.run())
     console.print(view.picture())
     view.show_summary(summarise(script, outcome, speed=arguments.speed), console)

@@ -65,14 +65,14 @@ def misplaced(
 ) -> str | None:
     """What is wrong with options of a recording without one, or of a scenario beside one; None if nothing."""
     if arguments.recording is None:
-        if option := given(arguments, of_recordings):
+        if option := first_option(arguments, of_recordings):
             return f"{option} goes with a recording; give that with --recording, or leave {option} out"
-    elif option := given(arguments, of_scenarios):
+    elif option := first_option(arguments, of_scenarios):
         return f"{option} goes with a scenario, and --recording plays a recording; leave one of the two out"
     return None
 
 
-def given(arguments: argparse.Namespace, names: Iterable[str]) -> str | None:
+def first_option(arguments: argparse.Namespace, names: Iterable[str]) -> str | None:
     """The first of these options that is on the command line, as it is written there."""
     return next(
         (f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name) is not None), None

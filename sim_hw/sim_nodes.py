@@ -229,9 +229,9 @@ class ReplyFaults:
             "duplicate": [link for _, link in faults.link if link.duplicate],
             "reorder": [link for _, link in faults.link if link.reorder],
         }
-        if asked := [name for name, asked_for in impossible.items() if asked_for]:
+        if names := [name for name, asked_for in impossible.items() if asked_for]:
             raise NodeError(
-                f"the scenario's fault {asked[0]!r} cannot be played on Modbus, where units only answer; "
+                f"the scenario's fault {names[0]!r} cannot be played on Modbus, where units only answer; "
                 "there are silence, delay, and link with drop and corrupt"
             )
         self.injected: Counter[str] = Counter()

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from daqsvc.commands.arguments import EXIT_FAILED
 from daqsvc.recording.channels import channel_map, sampling_rate_hz
-from sim_hw.arguments import add_random, add_recording, add_speed, given, misplaced, positive
+from sim_hw.arguments import add_random, add_recording, add_speed, first_option, misplaced, positive
 from sim_hw.demo.machines import DemoError
 
 if TYPE_CHECKING:
@@ -185,8 +185,10 @@ def _say(message: str) -> None:
 def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
     from sim_hw.demo.session import DemoSession, summarise  # noqa: PLC0415
 
-    def play(hear: Callable[[Received], None]) -> DemoOutcome:
-        session = DemoSession(script, speed=arguments.speed, broker_url=arguments.broker, hear=hear)
+    def play(on_message: Callable[[Received], None]) -> DemoOutcome:
+        session = DemoSession(
+            script, speed=arguments.speed, broker_url=arguments.broker, on_message=on_message
+        )
         return asyncio.run(_interruptible(session.run()))
 
     if arguments.json:
@@ -196,7 +198,7 @@ def _play(script: Script, arguments: argparse.Namespace) -> dict[str, Any]:
     from sim_hw.demo.view import View  # noqa: PLC0415
 
     with View(script, arguments.speed) as view:
-        outcome = play(view.hear)
+        outcome = play(view.on_message)
     summary = summarise(script, outcome, speed=arguments.speed)
     view.show_summary(summary)
     return summary
@@ -346,7 +348,7 @@ def misuse(arguments: argparse.Namespace) -> str | None:
     """What is wrong with arguments that are valid each for itself; None if nothing is."""
     if wrong := misplaced(arguments, OF_RECORDINGS, OF_SCENARIOS):
         return wrong
-    if arguments.baseline is None and (option := given(arguments, OF_BASELINES)):
+    if arguments.baseline is None and (option := first_option(arguments, OF_BASELINES)):
         return f"{option} goes with a baseline; give that with --baseline, or leave {option} out"
     if (arguments.bearing is None) != (arguments.speed_rpm is None):
         return "--bearing and --speed-rpm go together: its lines lie at multiples of the speed; give both"

@@ -67,14 +67,14 @@ class Listener:
     Args:
         url: the broker, ``mqtt://host:port``.
         base: topic of the box.
-        hear: called with each message.
+        on_message: called with each message.
     """
 
-    def __init__(self, url: str, base: str, hear: Callable[[Received], None]) -> None:
+    def __init__(self, url: str, base: str, on_message: Callable[[Received], None]) -> None:
         parts = urlsplit(url)
         self._host, self._port = parts.hostname or "localhost", parts.port or DEFAULT_PORT
         self._base = base
-        self._hear = hear
+        self._on_message = on_message
         self._subscribed = asyncio.Event()
         self._been_online = False
         self._offline = asyncio.Event()
@@ -111,7 +111,7 @@ class Listener:
             self._been_online |= online
             if self._been_online and not online:
                 self._offline.set()
-        self._hear(Received(kind, topic, content))
+        self._on_message(Received(kind, topic, content))
 
     async def subscribed(self) -> None:
         """Wait until nothing that is published from now on can be missed."""
@@ -207,7 +207,7 @@ class DemoSession:
         script: what to play.
         speed: simulated over real time; 1 for real time, on the real clock.
         broker_url: an MQTT broker; None to start one inside the process.
-        hear: called with each message that came back from the broker.
+        on_message: called with each message that came back from the broker.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class DemoSession:
         *,
         speed: float,
         broker_url: str | None,
-        hear: Callable[[Received], None],
+        on_message: Callable[[Received], None],
     ) -> None:
         self.script = script
         self.speed = speed
@@ -224,14 +224,14 @@ class DemoSession:
         self.node: CanNode | None = None
         self.outcome = DemoOutcome()
         self._broker_url = broker_url
-        self._hear = hear
+        self._on_message = on_message
 
     async def run(self) -> DemoOutcome:
         """Play it from the beginning to the end.
 
         Raises:
             DemoError: the broker cannot be reached or was lost, or the service did not start.
-            Exception: what ``hear`` raised; the service has been stopped.
+            Exception: what ``on_message`` raised; the service has been stopped.
         """
         async with contextlib.AsyncExitStack() as stack:
             url = self._broker_url
@@ -334,7 +334,7 @@ class DemoSession:
             self.outcome.alarms += 1
         if message.kind == "diagnosis" and message.payload["changed"]:
             self.outcome.diagnoses.append(message.payload)
-        self._hear(message)
+        self._on_message(message)
 
 
 def _node(bus: can.BusABC, layout: FrameLayout, script: Script) -> CanNode:

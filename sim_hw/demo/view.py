@@ -83,7 +83,7 @@ class View:
             if exc is None:
                 self._console.print(self.picture())
 
-    def hear(self, message: Received) -> None:
+    def on_message(self, message: Received) -> None:
         """Take a message in."""
         payload = message.payload
         self._now_ns = max(self._now_ns, payload["monotonic_ns"])

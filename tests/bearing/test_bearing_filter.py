@@ -73,10 +73,10 @@ def test_the_separating_gain_separates_at_every_frequency(parameters):
 def test_the_separating_gain_leaves_four_eigenvalues_at_the_origin(parameters):
     model = BearingModel(parameters)
     closed = model.A + separating_gain(model, (-100.0, -200.0)) @ model.C
-    found = np.sort(np.abs(np.linalg.eigvals(closed)))
+    eigenvalues = np.sort(np.abs(np.linalg.eigvals(closed)))
     # A fourfold eigenvalue is only found to the fourth root of the rounding.
-    assert (found[:4] < 1e-3 * np.abs(closed).max() ** 0.5).all()
-    assert found[4:] == pytest.approx([100.0, 200.0], rel=0.2)
+    assert (eigenvalues[:4] < 1e-3 * np.abs(closed).max() ** 0.5).all()
+    assert eigenvalues[4:] == pytest.approx([100.0, 200.0], rel=0.2)
 
 
 def test_no_filter_of_the_paper_is_ever_unstable():
@@ -93,9 +93,9 @@ def test_no_filter_of_the_paper_is_ever_unstable():
 def test_the_fixed_eigenvalues_are_those_of_the_closed_loop(parameters):
     model = BearingModel(parameters)
     closed = model.A + paper_gain(model, (-31.0, -57.0)) @ model.C
-    found = np.linalg.eigvals(closed)
+    eigenvalues = np.linalg.eigvals(closed)
     for root in fixed_eigenvalues(model).roots:
-        assert np.abs(found - root).min() < 1e-6 * np.abs(root)
+        assert np.abs(eigenvalues - root).min() < 1e-6 * np.abs(root)
 
 
 def test_an_eigenvalue_that_does_not_decay_is_refused():

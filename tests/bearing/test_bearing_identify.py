@@ -52,10 +52,10 @@ def test_two_sensors_are_identified_with_their_coupling() -> None:
     assert model.spectral_radius == pytest.approx(np.abs(np.linalg.eigvals(companion)).max(), abs=0.01)
     assert model.whiteness.p_value > 0.01
     assert model.whiteness.predictable < 1e-3
-    found = model.innovations(x)
-    np.testing.assert_allclose(np.cov(found.T), np.eye(2), atol=0.01)
+    innovations = model.innovations(x)
+    np.testing.assert_allclose(np.cov(innovations.T), np.eye(2), atol=0.01)
     behind = e[2:] @ np.linalg.inv(np.linalg.cholesky(COVARIANCE)).T
-    assert np.abs(found - behind).max() < 0.1
+    assert np.abs(innovations - behind).max() < 0.1
 
 
 def test_one_sensor_is_identified_whatever_its_unit() -> None:
@@ -86,10 +86,10 @@ def test_a_model_of_too_low_an_order_is_not_white() -> None:
 
 def test_whiteness_is_calibrated_on_noise() -> None:
     rng = np.random.default_rng(5)
-    found = [whiteness(rng.standard_normal((4000, 2))) for _ in range(200)]
-    rejected = sum(one.p_value < 0.05 for one in found)
+    results = [whiteness(rng.standard_normal((4000, 2))) for _ in range(200)]
+    rejected = sum(one.p_value < 0.05 for one in results)
     assert 2 <= rejected <= 22  # 10 are expected; P(outside) < 1e-3
-    assert np.median([one.predictable for one in found]) < 5e-3
+    assert np.median([one.predictable for one in results]) < 5e-3
 
 
 def test_missing_samples_spoil_no_more_than_what_needs_them() -> None:
@@ -136,21 +136,21 @@ def reference():
 @pytest.mark.parametrize(("order", "size"), [(INNER, 0.6), (OUTER, 0.4)])
 def test_damage_raises_the_innovations(reference, order, size) -> None:
     x = healthy(5.0, 8) + knocks(5.0, order, 9, size=size)
-    found = compare_residual(reference, reference.levels_db(x[:, np.newaxis]))
-    assert found.changed
-    assert found.departure > 1.5
-    assert found.ratio > 1.3
-    assert int(np.argmax(found.rise_db[1:])) in {5, 6}  # where 3.1 kHz is
-    assert not found.quiet
-    assert not found.gain
+    change = compare_residual(reference, reference.levels_db(x[:, np.newaxis]))
+    assert change.changed
+    assert change.departure > 1.5
+    assert change.ratio > 1.3
+    assert int(np.argmax(change.rise_db[1:])) in {5, 6}  # where 3.1 kHz is
+    assert not change.quiet
+    assert not change.gain
 
 
 def test_the_same_machine_at_another_unbalance_has_not_changed(reference) -> None:
     phase = 2.0 * np.pi * SPEED_RPM / 60.0 * np.arange(60_000) / RATE_HZ
     x = healthy(5.0, 11) + 0.5 * np.cos(phase)
-    found = compare_residual(reference, reference.levels_db(x[:, np.newaxis]))
-    assert not found.changed
-    assert abs(found.rise_db[0]) < 0.5
+    change = compare_residual(reference, reference.levels_db(x[:, np.newaxis]))
+    assert not change.changed
+    assert abs(change.rise_db[0]) < 0.5
 
 
 def test_false_alarms_come_no_more_often_than_stated() -> None:

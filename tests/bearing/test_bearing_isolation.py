@@ -85,9 +85,9 @@ def rightly(said: dict[str, list[str]], faults: tuple[str, ...]) -> tuple[int, i
     ],
 )
 def test_four_classes_where_the_races_look_different(name, snr_db, mismatch, target):
-    said = verdicts(name, snr_db, mismatch)
-    print(report(f"{name} {snr_db:g} dB {mismatch:.0%}", said))
-    assert may_be(*rightly(said, FAULTS), target), report(name, said)
+    by_fault = verdicts(name, snr_db, mismatch)
+    print(report(f"{name} {snr_db:g} dB {mismatch:.0%}", by_fault))
+    assert may_be(*rightly(by_fault, FAULTS), target), report(name, by_fault)
 
 
 @pytest.mark.parametrize(
@@ -100,26 +100,26 @@ def test_four_classes_where_the_races_look_different(name, snr_db, mismatch, tar
     ],
 )
 def test_three_classes_where_the_races_look_alike(name, snr_db, mismatch, target):
-    said = verdicts(name, snr_db, mismatch)
-    print(report(f"{name} {snr_db:g} dB {mismatch:.0%}", said))
-    assert may_be(*rightly(said, ("inner", "outer", "ball")), target), report(name, said)
+    by_fault = verdicts(name, snr_db, mismatch)
+    print(report(f"{name} {snr_db:g} dB {mismatch:.0%}", by_fault))
+    assert may_be(*rightly(by_fault, ("inner", "outer", "ball")), target), report(name, by_fault)
 
 
 @pytest.mark.parametrize("name", ["S1", "S2", "S3"])
 def test_faults_far_below_the_noise_are_detected(name):
-    said = verdicts(name, -15.0, 0.2)
-    print(report(f"{name} -15 dB 20%", said))
-    found = sum(verdict != "normal" for fault in FAULTS[1:] for verdict in said[fault])
-    assert may_be(found, 3 * RUNS, 0.99), report(name, said)
+    by_fault = verdicts(name, -15.0, 0.2)
+    print(report(f"{name} -15 dB 20%", by_fault))
+    detected = sum(verdict != "normal" for fault in FAULTS[1:] for verdict in by_fault[fault])
+    assert may_be(detected, 3 * RUNS, 0.99), report(name, by_fault)
 
 
 def test_a_race_that_cannot_be_told_is_not_guessed():
-    said = verdicts("S1", -5.0, 0.1)
-    print(report("S1 -5 dB 10%", said))
+    by_fault = verdicts("S1", -5.0, 0.1)
+    print(report("S1 -5 dB 10%", by_fault))
     for fault in ("inner", "outer"):
-        wrong = sum(verdict not in {fault, "inner_or_outer", "normal"} for verdict in said[fault])
+        wrong = sum(verdict not in {fault, "inner_or_outer", "normal"} for verdict in by_fault[fault])
         assert wrong <= 0.05 * RUNS
-    open_ = sum(said[fault].count("inner_or_outer") for fault in ("inner", "outer", "ball"))
+    open_ = sum(by_fault[fault].count("inner_or_outer") for fault in ("inner", "outer", "ball"))
     assert open_ >= 0.5 * 3 * RUNS
 
 

@@ -46,9 +46,9 @@ def test_both_must_stand_by_themselves(
     inner_z: float, outer_z: float, verdict: str, group: tuple[str, ...]
 ) -> None:
     inner, outer = (replace(WEAK, z=z, depth=0.5, severity=0.5 * z) for z in (inner_z, outer_z))
-    found = decide({"inner": inner, "outer": outer, "ball": WEAK}, RaceRules())
-    assert (found.verdict, found.group) == (verdict, group)
-    assert found.both == (verdict != "inner_or_outer" and len(group) == 2)
+    decision = decide({"inner": inner, "outer": outer, "ball": WEAK}, RaceRules())
+    assert (decision.verdict, decision.group) == (verdict, group)
+    assert decision.both == (verdict != "inner_or_outer" and len(group) == 2)
 
 
 @pytest.mark.data

@@ -146,12 +146,12 @@ def judged(record: Record, spoil: Callable[..., None], seed: int) -> tuple[str, 
 )
 def test_damage_stays_named_and_good_order_good(data: Path, spoil: Callable[..., None]) -> None:
     answers = [(r, *judged(r, spoil, seed=1)) for r in records(data)]
-    said = [(r.name, r.truth, verdict, round(normal, 3)) for r, verdict, normal in answers]
-    assert not [s for s in said if s[2] not in {s[1], "normal", "refused"}]
-    missed = [s for s in said if s[1] != "normal" and s[2] == "normal"]
+    table = [(r.name, r.truth, verdict, round(normal, 3)) for r, verdict, normal in answers]
+    assert not [s for s in table if s[2] not in {s[1], "normal", "refused"}]
+    missed = [s for s in table if s[1] != "normal" and s[2] == "normal"]
     assert not [s for s in missed if s[3] >= SURE]
     assert len(missed) <= 1, missed
-    assert sum(s[2] == "refused" for s in said) <= 2, said
+    assert sum(s[2] == "refused" for s in table) <= 2, table
 
 
 @pytest.mark.parametrize("held", [False, True])

@@ -13,9 +13,9 @@ def test_no_line_of_another_part_is_where_the_foremost_part_has_one() -> None:
     # The ball's line is put beside a sideband of the inner race's.
     bearing = BearingOrders(inner=INNER, outer=OUTER, ball=(INNER - 1.0) / 2.0, cage=CAGE)
     samples = Housing(order=INNER, size=1.5, seed=3).samples
-    said = race_test(samples, RATE_HZ, SPEED_RPM, bearing)
-    assert said.verdict == "inner"
-    assert sum(line.part == "inner" for line in said.lines) >= 8
-    explained = part_lines("inner", said.evidence["inner"].order, bearing)
-    others = [line.order for line in said.lines if line.part != "inner"]
+    verdict = race_test(samples, RATE_HZ, SPEED_RPM, bearing)
+    assert verdict.verdict == "inner"
+    assert sum(line.part == "inner" for line in verdict.lines) >= 8
+    explained = part_lines("inner", verdict.evidence["inner"].order, bearing)
+    others = [line.order for line in verdict.lines if line.part != "inner"]
     assert not [order for order in others for own in explained if abs(order / own - 1.0) < EXPLAINED_SHARE]

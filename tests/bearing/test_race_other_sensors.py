@@ -34,12 +34,12 @@ def heard(data: Path, sensor: str, designation: str) -> Counter[tuple[str, str]]
 
 @pytest.mark.parametrize("sensor", ["FE", "BA"])
 def test_other_sensors_hear_the_same_part_or_none(data: Path, sensor: str) -> None:
-    found = heard(data, sensor, "6205-2RS")
-    assert not [pair for pair in found if pair[1] not in {pair[0], "normal"}]
-    assert found["inner", "inner"] + found["outer", "outer"] >= 15
+    verdicts = heard(data, sensor, "6205-2RS")
+    assert not [pair for pair in verdicts if pair[1] not in {pair[0], "normal"}]
+    assert verdicts["inner", "inner"] + verdicts["outer", "outer"] >= 15
 
 
 def test_the_base_shows_no_damage_of_the_fan_ends_good_bearing(data: Path) -> None:
-    found = heard(data, "BA", "6203-2RS")
-    assert sum(found.values()) >= 25
-    assert {verdict for _, verdict in found} == {"normal"}
+    verdicts = heard(data, "BA", "6203-2RS")
+    assert sum(verdicts.values()) >= 25
+    assert {verdict for _, verdict in verdicts} == {"normal"}

@@ -42,8 +42,8 @@ def test_running_median_follows_a_ramp_and_passes_over_lines() -> None:
     ramp = np.linspace(1.0, 3.0, 4000)
     lines = ramp.copy()
     lines[::97] += 100.0
-    found = running_median(lines, 200)
-    assert np.abs(found[200:-200] - ramp[200:-200]).max() < 0.06
+    medians = running_median(lines, 200)
+    assert np.abs(medians[200:-200] - ramp[200:-200]).max() < 0.06
 
 
 def test_whitening_leaves_phases_and_clips_lines() -> None:
@@ -180,11 +180,11 @@ def test_a_damaged_balls_line_is_not_taken_for_another_speed() -> None:
 
 def evidence(**z_and_depth: tuple[float, float]) -> dict[Part, PartEvidence]:
     """Evidence with the default limits; parts not named have none."""
-    found = {}
+    by_part = {}
     for part in PARTS:
         z, depth = z_and_depth.get(part, (0.0, 0.05))
         ball = part == "ball"
-        found[part] = PartEvidence(
+        by_part[part] = PartEvidence(
             z=z,
             depth=depth,
             steadiness=0.7,
@@ -195,7 +195,7 @@ def evidence(**z_and_depth: tuple[float, float]) -> dict[Part, PartEvidence]:
             false_alarm_probability=false_alarm_probability(z),
             order=1.0,
         )
-    return found
+    return by_part
 
 
 @pytest.mark.parametrize(
@@ -225,16 +225,16 @@ def test_a_part_is_named_by_significance_and_size(
 
 
 def test_knocks_are_not_strikes() -> None:
-    found = evidence(outer=(15.0, 0.3))
-    assert decide(found, RULES).verdict == "outer"
-    found["outer"] = replace(found["outer"], steadiness=0.22)
-    assert decide(found, RULES).verdict == "normal"
+    parts = evidence(outer=(15.0, 0.3))
+    assert decide(parts, RULES).verdict == "outer"
+    parts["outer"] = replace(parts["outer"], steadiness=0.22)
+    assert decide(parts, RULES).verdict == "normal"
 
 
 def test_what_is_not_testable_is_not_named() -> None:
-    found = evidence(ball=(30.0, 0.9))
-    found["ball"] = replace(found["ball"], testable=False)
-    assert decide(found, RULES).verdict == "normal"
+    parts = evidence(ball=(30.0, 0.9))
+    parts["ball"] = replace(parts["ball"], testable=False)
+    assert decide(parts, RULES).verdict == "normal"
 
 
 def baseline(**z_and_depth: tuple[float, float]) -> RaceBaseline:

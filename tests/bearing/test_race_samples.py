@@ -211,9 +211,9 @@ def test_a_shape_is_a_wrong_sample_only_if_nothing_else_is_there() -> None:
     single, struck = noise.copy(), noise.copy()
     single[30_000] += 60.0
     struck[30_000 : 30_000 + 240] += ringing(60.0)
-    found = despiked(single, whitening(single), whitening, REVOLUTION)
-    assert found.spikes == (30_000,)
-    assert found.steps == ()
+    repaired = despiked(single, whitening(single), whitening, REVOLUTION)
+    assert repaired.spikes == (30_000,)
+    assert repaired.steps == ()
     left = despiked(struck, whitening(struck), whitening, REVOLUTION)
     assert left.spikes == ()
     assert left.values is struck

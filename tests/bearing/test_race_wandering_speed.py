@@ -45,9 +45,9 @@ def test_a_damaged_race_is_found_while_the_speed_rises_or_falls(share: float) ->
     steady = strikes("inner", SECONDS)
     verdict = race_test(ramped(steady, share), RATE_HZ, SPEED_RPM, BEARING)
     assert verdict.verdict == "inner"
-    told = race_test(steady, RATE_HZ, SPEED_RPM, BEARING)
-    assert verdict.evidence["inner"].z > 0.7 * told.evidence["inner"].z
-    assert not any("wanders" in note for note in told.notes)
+    steady_verdict = race_test(steady, RATE_HZ, SPEED_RPM, BEARING)
+    assert verdict.evidence["inner"].z > 0.7 * steady_verdict.evidence["inner"].z
+    assert not any("wanders" in note for note in steady_verdict.notes)
 
 
 def test_a_track_makes_a_ramp_even() -> None:

@@ -29,14 +29,14 @@ def test_noise_never_makes_a_ball_of_the_sidebands_of_a_damaged_outer_race(
     records: dict[str, Record], name: str
 ) -> None:
     record = records[name]
-    said = []
+    verdicts = []
     for level_db in (10.0, 5.0, 0.0):
         for seed in range(4):
             noise = np.random.default_rng(seed).standard_normal(len(record.samples))
             noisy = record.samples + noise * record.samples.std() * 10.0 ** (-level_db / 20.0)
-            said.append(race_test(noisy, record.rate_hz, record.speed_rpm, record.bearing).verdict)
-    assert set(said) <= {"outer", "normal"}
-    assert said.count("outer") >= 6
+            verdicts.append(race_test(noisy, record.rate_hz, record.speed_rpm, record.bearing).verdict)
+    assert set(verdicts) <= {"outer", "normal"}
+    assert verdicts.count("outer") >= 6
 
 
 def test_halves_exchanged_make_no_ball_of_a_damaged_outer_race(records: dict[str, Record]) -> None:

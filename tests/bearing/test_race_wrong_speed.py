@@ -49,20 +49,20 @@ def test_wrong_speeds_are_refused_or_not_confirmed(data: Path) -> None:
         signs = random.choice([-1.0, 1.0], FACTORS)
         return [(factor, 1.0) for factor in 1.0 + signs * random.uniform(0.04, 0.3, FACTORS)]
 
-    found = outcomes(data, some)
-    assert found["confirmed"] <= 0.03 * found["judged"]
-    assert found["refused"] >= 0.8 * found["judged"]
-    assert found["wrong part"] <= 0.01 * found["judged"]
+    counts = outcomes(data, some)
+    assert counts["confirmed"] <= 0.03 * counts["judged"]
+    assert counts["refused"] >= 0.8 * counts["judged"]
+    assert counts["wrong part"] <= 0.01 * counts["judged"]
 
 
 def test_wrong_sampling_rates_name_no_wrong_part(data: Path) -> None:
-    found = outcomes(data, lambda _: [(1.0, rate) for rate in (0.5, 10.0 / 12.0, 2.0)])
-    assert found["confirmed"] <= 0.03 * found["judged"]
-    assert found["wrong part"] == 0
+    counts = outcomes(data, lambda _: [(1.0, rate) for rate in (0.5, 10.0 / 12.0, 2.0)])
+    assert counts["confirmed"] <= 0.03 * counts["judged"]
+    assert counts["wrong part"] == 0
 
 
 def test_speeds_wrong_by_little_are_put_right(data: Path) -> None:
-    found = outcomes(data, lambda _: [(0.986, 1.0), (1.014, 1.0)])
+    counts = outcomes(data, lambda _: [(0.986, 1.0), (1.014, 1.0)])
     # Of 57 records 33 are right as stated.
-    assert found["right"] >= 2 * 33 - 2
-    assert found["refused"] + found["wrong part"] == 0
+    assert counts["right"] >= 2 * 33 - 2
+    assert counts["refused"] + counts["wrong part"] == 0

@@ -137,9 +137,9 @@ def test_a_person_finds_amplitude_phase_uncertainty_noise_and_verdict() -> None:
     text = record_text(record(5110.0))
     assert "95 um at -89.8 degrees, +- 0.071 each" in text
     assert "3.16 um rms of a sample of one probe" in text
-    told = tomllib.loads(text)["steady"][0]
-    assert told["verdict"] == calibration().describe()
-    assert told["source"] == "a.npz"
+    table = tomllib.loads(text)["steady"][0]
+    assert table["verdict"] == calibration().describe()
+    assert table["source"] == "a.npz"
     assert max(map(len, text.splitlines())) < 400
 
 

@@ -55,35 +55,35 @@ def at_speed(w, *modes):
      (5, 42.0, 78.0, 95.0), (20, 61.0, 192.0, 138.0)],
 )  # fmt: skip
 def test_evidence_is_that_of_simulated_seeds(snr_db, n_f1, f1_n, f1l2_f1):
-    found = foresee(N, F1, F1L2, snr_db=snr_db)
-    assert found.pair("N", "F1").nats_per_rev == pytest.approx(n_f1, rel=0.02)
-    assert found.pair("F1", "N").nats_per_rev == pytest.approx(f1_n, rel=0.02)
-    assert found.pair("F1L2", "F1").nats_per_rev == pytest.approx(f1l2_f1, rel=0.02)
+    prediction = foresee(N, F1, F1L2, snr_db=snr_db)
+    assert prediction.pair("N", "F1").nats_per_rev == pytest.approx(n_f1, rel=0.02)
+    assert prediction.pair("F1", "N").nats_per_rev == pytest.approx(f1_n, rel=0.02)
+    assert prediction.pair("F1L2", "F1").nats_per_rev == pytest.approx(f1l2_f1, rel=0.02)
 
 
 @pytest.mark.parametrize(
     ("snr_db", "f1", "f1l2"), [(-5, 3.18, 2.95), (-2.5, 2.42, 2.34), (0, 1.88, 1.92), (5, 1.25, 1.34)]
 )
 def test_delay_is_near_the_median_of_simulated_seeds(snr_db, f1, f1l2):
-    found = foresee(N, F1, F1L2, snr_db=snr_db)
-    assert found.pair("F1", "N").delay_rev == pytest.approx(f1, rel=0.15)
-    assert found.pair("F1L2", "F1").delay_rev == pytest.approx(f1l2, rel=0.15)
+    prediction = foresee(N, F1, F1L2, snr_db=snr_db)
+    assert prediction.pair("F1", "N").delay_rev == pytest.approx(f1, rel=0.15)
+    assert prediction.pair("F1L2", "F1").delay_rev == pytest.approx(f1l2, rel=0.15)
 
 
 @pytest.mark.parametrize(("w", "nats"), [(0.8, 7.7), (0.9, 11.0), (1.1, 16.0), (1.2, 21.0)])
 def test_unbalance_and_damping_part_off_resonance(w, nats):
-    found = foresee(*at_speed(w, N, U2, F1))
-    assert found.pair("F1", "U2").nats_per_rev == pytest.approx(nats, rel=0.03)
-    assert found.ambiguities == ()
+    prediction = foresee(*at_speed(w, N, U2, F1))
+    assert prediction.pair("F1", "U2").nats_per_rev == pytest.approx(nats, rel=0.03)
+    assert prediction.ambiguities == ()
 
 
 def test_unbalance_and_damping_look_the_same_at_resonance():
-    found = foresee(N, U2, F1)
-    (ambiguity,) = found.ambiguities
+    prediction = foresee(N, U2, F1)
+    (ambiguity,) = prediction.ambiguities
     assert ambiguity.modes == ("U2", "F1")
     assert ambiguity.nats_per_rev == pytest.approx(0.0, abs=0.01)
-    assert found.pair("U2", "F1").delay_rev == math.inf
-    assert found.pair("U2", "N").delay_rev < 3.0
+    assert prediction.pair("U2", "F1").delay_rev == math.inf
+    assert prediction.pair("U2", "N").delay_rev < 3.0
     # It opens where it says, as much as it says, and not a step nearer; the sampling rate stays.
     w = ambiguity.opens_at_w
     duration = 2.0 * math.pi / PER_REV
@@ -141,17 +141,19 @@ def test_a_bank_that_trusts_its_models_less_gathers_less():
 
 def test_thresholds_belong_to_transitions():
     thresholds = ((0.0, 10.0, 10.0), (30.0, 0.0, 10.0), (30.0, 30.0, 0.0))
-    found = foresee(N, F1, F1L2, threshold_nats=thresholds)
-    assert {p.threshold_nats for p in found.pairs if p.rival == "N"} == {10.0}
-    assert found.pair("N", "F1").threshold_nats == 30.0
-    assert found.pair("N", "F1").delay_rev > foresee(N, F1, threshold_nats=10.0).pair("N", "F1").delay_rev
-    assert found.false_alarms_per_1000_rev == pytest.approx(1000 * PER_REV * 2 * math.exp(-10.0))
+    prediction = foresee(N, F1, F1L2, threshold_nats=thresholds)
+    assert {p.threshold_nats for p in prediction.pairs if p.rival == "N"} == {10.0}
+    assert prediction.pair("N", "F1").threshold_nats == 30.0
+    assert (
+        prediction.pair("N", "F1").delay_rev > foresee(N, F1, threshold_nats=10.0).pair("N", "F1").delay_rev
+    )
+    assert prediction.false_alarms_per_1000_rev == pytest.approx(1000 * PER_REV * 2 * math.exp(-10.0))
 
 
 @pytest.mark.parametrize("snr_db", [0.0, 10.0])
 @pytest.mark.parametrize("calibration_rev", [20.0, 50.0])
 def test_synchronous_vector_is_limited_by_its_calibration(snr_db, calibration_rev):
-    found = foresee(
+    prediction = foresee(
         N,
         F1,
         snr_db=snr_db,
@@ -159,7 +161,7 @@ def test_synchronous_vector_is_limited_by_its_calibration(snr_db, calibration_re
         process_noise=1e-12,
         faults=("unbalance", "static_load"),
     )
-    unbalance, load = found.smallest
+    unbalance, load = prediction.smallest
     delta = math.sqrt(20.0 / (calibration_rev * PER_REV * 10.0 ** (snr_db / 10.0)))
     delta = math.hypot(delta, math.sqrt(20.0) * 0.002)  # no baseline is believed better than 0.2 %
     assert (unbalance.fault, unbalance.healthy) == ("unbalance", 1.0)
@@ -169,8 +171,8 @@ def test_synchronous_vector_is_limited_by_its_calibration(snr_db, calibration_re
 
 
 def test_smallest_change_takes_as_long_as_it_says():
-    found = foresee(N, F1, within_rev=40.0, faults=FAULTS)
-    changes = {change.fault: change.by_bank for change in found.smallest}
+    prediction = foresee(N, F1, within_rev=40.0, faults=FAULTS)
+    changes = {change.fault: change.by_bank for change in prediction.smallest}
     for just in (
         mode("unbalance", e=0.1 * changes["unbalance"]),
         mode("damping_loss", zeta=changes["damping_loss"]),
@@ -188,18 +190,18 @@ def test_ac_coupled_probes_see_no_static_load():
 
 
 def test_rub_is_simulated_and_says_so():
-    found = foresee(N, F1, R)
-    assert {(p.truth, p.rival) for p in found.pairs if p.simulated} == {
+    prediction = foresee(N, F1, R)
+    assert {(p.truth, p.rival) for p in prediction.pairs if p.simulated} == {
         ("N", "R"), ("R", "N"), ("F1", "R"), ("R", "F1")
     }  # fmt: skip
-    assert found == foresee.__wrapped__(N, F1, R)
+    assert prediction == foresee.__wrapped__(N, F1, R)
     # The flexible observer of the rub is a weak rival; the rub itself is nothing like a steady orbit.
-    assert 5.0 < found.pair("N", "R").nats_per_rev < 20.0
-    assert found.pair("R", "N").nats_per_rev > 200.0
-    assert 0.5 < found.pair("R", "F1").delay_rev < 2.0
+    assert 5.0 < prediction.pair("N", "R").nats_per_rev < 20.0
+    assert prediction.pair("R", "N").nats_per_rev > 200.0
+    assert 0.5 < prediction.pair("R", "F1").delay_rev < 2.0
     # Fast sampling does not make a simulation long, nor the figures different.
     fast = foresee(N, R, per_rev=1000, snr_db=-10.0 * math.log10(1000 / PER_REV))
-    assert fast.pair("R", "N").nats_per_rev == pytest.approx(found.pair("R", "N").nats_per_rev, rel=0.1)
+    assert fast.pair("R", "N").nats_per_rev == pytest.approx(prediction.pair("R", "N").nats_per_rev, rel=0.1)
 
 
 def test_linear_mode_that_would_touch_is_named():
@@ -244,29 +246,29 @@ def two_look_alike(tmp_path_factory):
 
 def test_verb_tells_what_looks_the_same_and_where_it_does_not(two_look_alike, capsys):
     assert verb(two_look_alike) == 0
-    said = capsys.readouterr().out
-    assert "F1 and U2 cannot be told apart at 600 rpm; at 6" in said
-    assert "nats a revolution." in said
-    assert max(map(len, said.splitlines())) <= 110
+    output = capsys.readouterr().out
+    assert "F1 and U2 cannot be told apart at 600 rpm; at 6" in output
+    assert "nats a revolution." in output
+    assert max(map(len, output.splitlines())) <= 110
     assert verb(two_look_alike, "--speed-rpm", 540) == 0
-    said = capsys.readouterr().out
-    assert "laval-rig at 540 rpm" in said
-    assert "All modes can be told apart at 540 rpm" in said
+    output = capsys.readouterr().out
+    assert "laval-rig at 540 rpm" in output
+    assert "All modes can be told apart at 540 rpm" in output
 
 
 def test_verb_as_json_in_the_units_of_the_file(two_look_alike, capsys):
     assert verb(two_look_alike, "--json", "--false-alarms-per-1000-rev", 0.5, "--process-noise", 1e-9) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["machine"], said["speed_rpm"], said["noise_um"]) == ("laval-rig", 600.0, 2.0)
-    assert said["modes"] == ["N", "F1", "U2"]
-    assert said["false_alarms_per_1000_rev"] == pytest.approx(0.5)
-    pairs = {(pair["truth"], pair["rival"]): pair for pair in said["pairs"]}
+    output = json.loads(capsys.readouterr().out)
+    assert (output["machine"], output["speed_rpm"], output["noise_um"]) == ("laval-rig", 600.0, 2.0)
+    assert output["modes"] == ["N", "F1", "U2"]
+    assert output["false_alarms_per_1000_rev"] == pytest.approx(0.5)
+    pairs = {(pair["truth"], pair["rival"]): pair for pair in output["pairs"]}
     assert len(pairs) == 6
     assert pairs["F1", "N"]["threshold_nats"] == pytest.approx(math.log(1000 * 64 * 2 / 0.5))
     assert pairs["F1", "U2"]["delay_rev"] is None
-    (ambiguous,) = said["ambiguous"]
+    (ambiguous,) = output["ambiguous"]
     assert 420.0 < ambiguous["opens_at_rpm"] < 780.0
-    changes = {change["fault"]: change for change in said["smallest_change"]}
+    changes = {change["fault"]: change for change in output["smallest_change"]}
     assert list(changes) == ["unbalance", "damping_loss", "stiffness_loss", "static_load"]
     # sqrt(20 / (50 * 64 * SNR)) of the 1X amplitude, and the floor of 0.2 % of it.
     amplitude_um = 100.0 * AMPLITUDE

@@ -112,7 +112,7 @@ def observed(before, after, noise, *, settled_rev, seeds):
 
 def foreseen(before, after, noise, **options):
     names = ["N", *(name for name in (before, after) if name != "N")]
-    found = detectability(
+    prediction = detectability(
         [MODES[name] for name in names],
         noise=noise,
         duration=DURATION,
@@ -120,7 +120,7 @@ def foreseen(before, after, noise, **options):
         faults=(),
         **options,
     )
-    forward, back = found.pair(after, before), found.pair(before, after)
+    forward, back = prediction.pair(after, before), prediction.pair(before, after)
     return back.nats_per_rev, forward.nats_per_rev, forward.delay_rev
 
 
@@ -141,17 +141,17 @@ def foreseen(before, after, noise, **options):
 )
 def test_evidence_and_delay_come_true(snr_db, before, after, settled_rev):
     noise = noise_at(snr_db)
-    told = foreseen(before, after, noise, process_noise=CALM)
+    predicted = foreseen(before, after, noise, process_noise=CALM)
     seen = observed(before, after, noise, settled_rev=settled_rev, seeds=50)
-    assert told == pytest.approx(seen, rel=0.15)
+    assert predicted == pytest.approx(seen, rel=0.15)
 
 
 @pytest.mark.parametrize("other", ["N", "F1L2"])
 def test_evidence_and_delay_of_a_rub_come_true(other):
     noise = noise_at(0)
-    told = foreseen(other, "R", noise, process_noise=CALM)
+    predicted = foreseen(other, "R", noise, process_noise=CALM)
     seen = observed(other, "R", noise, settled_rev=30, seeds=20)
-    assert told == pytest.approx(seen, rel=0.15)
+    assert predicted == pytest.approx(seen, rel=0.15)
 
 
 @pytest.mark.parametrize("process_noise", [1e-4, 1e-6])

@@ -75,17 +75,17 @@ def test_the_delay_is_that_of_the_departure_test(fault):
 
 
 def test_every_fault_moves_what_physics_moves():
-    found = {one.fault: one for one in FOUND.faults}
-    assert found["unbalance"].change_um == pytest.approx(
-        (found["unbalance"].smallest - 1.0) * HEALTHY.amplitude_um, rel=1e-3
+    by_fault = {one.fault: one for one in FOUND.faults}
+    assert by_fault["unbalance"].change_um == pytest.approx(
+        (by_fault["unbalance"].smallest - 1.0) * HEALTHY.amplitude_um, rel=1e-3
     )
-    assert found["static_load"].smallest == pytest.approx(FOUND.smallest_um[0], rel=0.01)
-    assert found["damping_loss"].healthy == 0.1
-    assert 0.05 < found["damping_loss"].smallest < 0.1
-    assert 0.9 < found["stiffness_loss"].smallest < 1.0
+    assert by_fault["static_load"].smallest == pytest.approx(FOUND.smallest_um[0], rel=0.01)
+    assert by_fault["damping_loss"].healthy == 0.1
+    assert 0.05 < by_fault["damping_loss"].smallest < 0.1
+    assert 0.9 < by_fault["stiffness_loss"].smallest < 1.0
     coupled = vector_detectability(HEALTHY, THRESHOLD_NATS, ac_coupled=True)
     assert coupled.faults[-1].smallest is None
-    assert coupled.faults[2].smallest < found["stiffness_loss"].smallest
+    assert coupled.faults[2].smallest < by_fault["stiffness_loss"].smallest
 
 
 def test_the_group_opens_where_no_loss_of_damping_can_do_it():
@@ -122,8 +122,10 @@ def test_the_command_asks_for_what_is_not_known(capsys):
     for name in ("laval-rig", "rotor-synchronous"):
         file = str(CONFIG / f"{name}.toml")
         assert main(["detectability", file, "--false-alarms-per-1000-rev", "1e9"]) == 2
-        said = capsys.readouterr().err
-        assert said.strip() == (f"{file}: --false-alarms-per-1000-rev = 1e+09: give a rate from 1e-09 to 10")
+        errors = capsys.readouterr().err
+        assert errors.strip() == (
+            f"{file}: --false-alarms-per-1000-rev = 1e+09: give a rate from 1e-09 to 10"
+        )
 
 
 def test_the_command_tells_stated_noise_in_text_and_json(capsys):
@@ -133,12 +135,12 @@ def test_the_command_tells_stated_noise_in_text_and_json(capsys):
     assert "noise 1 um, 50 revolutions of calibration; a change is an alarm at 20.3 nats" in text
     assert f"one group at 1500 rpm; at {FOUND.opens_at_rpm:.6g} rpm a grown unbalance is told from it" in text
     assert main([*arguments, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
-    assert found["smallest_um"]["1"] == pytest.approx(FOUND.smallest_um[1])
-    assert found["ambiguous"][0]["opens_at_rpm"] == pytest.approx(FOUND.opens_at_rpm)
-    assert [one["fault"] for one in found["smallest_change"]] == [one.fault for one in FOUND.faults]
+    output = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert output["smallest_um"]["1"] == pytest.approx(FOUND.smallest_um[1])
+    assert output["ambiguous"][0]["opens_at_rpm"] == pytest.approx(FOUND.opens_at_rpm)
+    assert [one["fault"] for one in output["smallest_change"]] == [one.fault for one in FOUND.faults]
     assert main([*arguments, "--json", "--false-alarms-per-1000-rev", "1"]) == 0
-    assert json.loads(capsys.readouterr().out)["smallest_um"]["1"] < found["smallest_um"]["1"]
+    assert json.loads(capsys.readouterr().out)["smallest_um"]["1"] < output["smallest_um"]["1"]
 
 
 def test_a_calibration_tells_noise_and_variance(tmp_path, capsys):
@@ -147,7 +149,7 @@ def test_a_calibration_tells_noise_and_variance(tmp_path, capsys):
     text = MACHINE.read_text().replace("calibrate_revolutions = 50", 'calibration = "healthy.toml"')
     (tmp_path / "machine.toml").write_text(re.sub(r"clearance_um = [\d.]+", "clearance_um = 100.0", text))
     assert main(["detectability", str(tmp_path / "machine.toml"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["calibration_rev"] == 200
+    output = json.loads(capsys.readouterr().out)
+    assert output["calibration_rev"] == 200
     expected = vector_detectability(noisier, THRESHOLD_NATS).smallest_um[1]
-    assert found["smallest_um"]["1"] == pytest.approx(expected)
+    assert output["smallest_um"]["1"] == pytest.approx(expected)

@@ -35,10 +35,10 @@ def record(
     """Orders 1 to 3 of three axes from an arbitrary shaft angle, and noise."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * rpm / 60.0 / RATE_HZ * np.arange(n)
-    found = 0.9 + noise * rng.standard_normal((n, 3))
+    samples = 0.9 + noise * rng.standard_normal((n, 3))
     for order, (amplitude, factor) in enumerate(zip(HARMONICS, scale, strict=True), 1):
-        found += amplitude * factor * np.real(np.outer(np.exp(1j * order * angle), AXES))
-    return found
+        samples += amplitude * factor * np.real(np.outer(np.exp(1j * order * angle), AXES))
+    return samples
 
 
 def orders(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), **more: float) -> OrderVectors:
@@ -50,37 +50,37 @@ def compared(scale: tuple[float, ...], seed: int = 10, **more: float) -> OrderCh
 
 
 def test_measures_amplitudes_and_phases_between_channels() -> None:
-    found = orders(1, noise=0.0)
-    mean = found.amplitudes.mean(axis=0)
+    vectors = orders(1, noise=0.0)
+    mean = vectors.amplitudes.mean(axis=0)
     np.testing.assert_allclose(np.abs(mean), np.outer(HARMONICS, np.abs(AXES)), rtol=2e-3)
     np.testing.assert_allclose(mean[:, 1] / mean[:, 0], 0.7j, rtol=2e-3)
-    assert found.revolutions == 48
-    assert found.residual_rms.max() < 1e-2
+    assert vectors.revolutions == 48
+    assert vectors.residual_rms.max() < 1e-2
 
 
 @pytest.mark.parametrize("rpm", [1460.0, 1499.3, 1500.0, 1531.7])
 def test_finds_the_speed_with_an_honest_uncertainty(rpm: float) -> None:
     errors = []
     for seed in range(12):
-        found = orders(seed, rpm=rpm)
-        assert found.speed_seen
-        errors.append((found.speed_rpm - rpm) / found.speed_uncertainty_rpm)
-        assert found.speed_uncertainty_rpm < 0.5
+        vectors = orders(seed, rpm=rpm)
+        assert vectors.speed_seen
+        errors.append((vectors.speed_rpm - rpm) / vectors.speed_uncertainty_rpm)
+        assert vectors.speed_uncertainty_rpm < 0.5
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 2.0
 
 
 def test_says_when_no_order_stands_out() -> None:
     rng = np.random.default_rng(5)
-    found = order_vectors(rng.standard_normal((4000, 2)), RATE_HZ, RPM)
-    assert not found.speed_seen
-    assert found.speed_uncertainty_rpm > 10.0
+    vectors = order_vectors(rng.standard_normal((4000, 2)), RATE_HZ, RPM)
+    assert not vectors.speed_seen
+    assert vectors.speed_uncertainty_rpm > 10.0
 
 
 def test_takes_no_line_between_the_harmonics_for_the_shaft() -> None:
     samples = record(3)
     belt = 3.0 * np.cos(2.0 * np.pi * 1.013 * 2.0 * RPM / 60.0 / RATE_HZ * np.arange(len(samples)))
-    found = order_vectors(samples + belt[:, np.newaxis], RATE_HZ, RPM)
-    assert found.speed_rpm == pytest.approx(RPM, abs=1.5)
+    vectors = order_vectors(samples + belt[:, np.newaxis], RATE_HZ, RPM)
+    assert vectors.speed_rpm == pytest.approx(RPM, abs=1.5)
 
 
 def test_missing_samples_cost_little() -> None:

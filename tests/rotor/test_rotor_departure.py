@@ -29,8 +29,8 @@ def evidence(revolutions, seed, change=0.0, calibrated=CALIBRATED):
     test = DepartureTest(SPREAD, threshold_nats=1e9, energy_threshold_nats=1e9, least_reference=calibrated)
     for _ in range(calibrated):
         test.add(np.zeros(5, dtype=np.complex128), float(noise[:calibrated].mean()), 0.0)
-    said = [test.add(vectors[i], float(noise[i]), 0.0) for i in range(calibrated, count)]
-    return np.array([e.nats for e in said]), np.array([e.energy_nats for e in said])
+    evidence = [test.add(vectors[i], float(noise[i]), 0.0) for i in range(calibrated, count)]
+    return np.array([e.nats for e in evidence]), np.array([e.energy_nats for e in evidence])
 
 
 def alarms(statistic, threshold):
@@ -60,12 +60,12 @@ def test_the_smallest_visible_change_is_that_of_the_law(calibrated):
     threshold = threshold_for(0.1)
     window = 128
     visible = math.sqrt(threshold * (1.0 / window + 1.0 / calibrated))
-    found = {}
+    seen = {}
     for part in (0.4, 1.4):
         runs = [evidence(140, seed, part * visible, calibrated)[0].max() > threshold for seed in range(40)]
-        found[part] = sum(runs)
-    assert found[0.4] <= 4
-    assert found[1.4] >= 36
+        seen[part] = sum(runs)
+    assert seen[0.4] <= 4
+    assert seen[1.4] >= 36
 
 
 def test_a_rate_that_cannot_be_is_refused():

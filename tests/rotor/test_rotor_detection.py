@@ -53,12 +53,12 @@ def diagnose(samples, snr_db, **rules):
         rules=DecisionRules(**rules),
     )
     period_ns = 1e9 / 640.0
-    said = []
+    decisions = []
     for begin in range(0, len(samples), 4 * detector.block):
         part = samples[begin : begin + 4 * detector.block]
         t_end_ns = round((begin + len(part) - 1) * period_ns)
-        said += detector.process(Window(begin, part, t_end_ns, period_ns))
-    return said
+        decisions += detector.process(Window(begin, part, t_end_ns, period_ns))
+    return decisions
 
 
 @functools.cache
@@ -155,14 +155,14 @@ def test_paper_rule_declares_the_true_mode_most_of_the_time_but_not_always():
     # A reset at 0.9 makes about two declarations a revolution, and up to one in ten of them is wrong by
     # construction: good to look at, useless as an alarm.
     run = runs.paper_run(0)
-    said = diagnose(run.channels(0.0, 0), 0.0, rule="paper")
+    diagnoses = diagnose(run.channels(0.0, 0), 0.0, rule="paper")
     n = len(run.angle)
     declared = np.full(n, -1)
-    changes = [d for d in said if d.changed]
+    changes = [d for d in diagnoses if d.changed]
     for change in changes:
         declared[change.end_index :] = ORDER.index(change.decision)
     begins = [0, *(round(at * runs.PER_REV) for at in run.begins)]
     for mode, (begin, end) in enumerate(itertools.pairwise([*begins, n])):
         assert (declared[begin:end] == mode).mean() > 0.7, ORDER[mode]
     assert len(changes) > 3 * len(ORDER)
-    assert {d.severity for d in said} == {"normal"}
+    assert {d.severity for d in diagnoses} == {"normal"}

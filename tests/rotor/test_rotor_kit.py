@@ -119,10 +119,10 @@ def test_known_changes_of_unbalance_are_unbalance(data: Path, plane: int) -> Non
     for (speed_id, before), (other, after) in itertools.permutations(groups, 2):
         if speed_id != other:
             continue
-        found = judged(groups[speed_id, before], groups[speed_id, after], variance, speed_id)
+        verdict = judged(groups[speed_id, before], groups[speed_id, after], variance, speed_id)
         total += 1
-        right += "unbalance" in found.group
-        assert found.verdict not in ("normal", "small_change", "static_load", "rub", "unmodelled")
+        right += "unbalance" in verdict.group
+        assert verdict.verdict not in ("normal", "small_change", "static_load", "rub", "unmodelled")
     assert total == 32
     assert right >= 31
 
@@ -133,5 +133,5 @@ def test_repeats_are_no_change(data: Path, plane: int) -> None:
     variance = scatter(groups)
     for (speed_id, _), vectors in groups.items():
         for i in range(len(vectors) if len(vectors) > 1 else 0):
-            found = judged(np.delete(vectors, i, axis=0), vectors[i : i + 1], variance, speed_id)
-            assert found.verdict in ("normal", "small_change")
+            verdict = judged(np.delete(vectors, i, axis=0), vectors[i : i + 1], variance, speed_id)
+            assert verdict.verdict in ("normal", "small_change")

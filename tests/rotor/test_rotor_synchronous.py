@@ -17,11 +17,11 @@ VECTORS = np.array(
 
 
 def test_whole_revolutions_are_recovered_exactly():
-    found = synchronous_vectors(orbits(VECTORS))
-    np.testing.assert_allclose(found.vectors, VECTORS, atol=1e-12)
-    np.testing.assert_allclose(found.noise, 0.0, atol=1e-12)
-    assert found.samples.tolist() == [64.0, 64.0, 64.0]
-    assert found.end_index.tolist() == [64, 128, 192]
+    fitted = synchronous_vectors(orbits(VECTORS))
+    np.testing.assert_allclose(fitted.vectors, VECTORS, atol=1e-12)
+    np.testing.assert_allclose(fitted.noise, 0.0, atol=1e-12)
+    assert fitted.samples.tolist() == [64.0, 64.0, 64.0]
+    assert fitted.end_index.tolist() == [64, 128, 192]
 
 
 @pytest.mark.parametrize("period", [17.3, 50.77, 333.31])
@@ -42,26 +42,26 @@ def test_revolutions_of_a_broken_number_of_samples_are_recovered_exactly(period)
         period_samples=np.full(len(starts), period),
         trusted=np.ones(len(starts), dtype=bool),
     )
-    found = synchronous_vectors(cut)
-    np.testing.assert_allclose(found.vectors, np.tile(VECTORS[0], (len(starts), 1)), atol=1e-9)
-    assert found.end_index[-1] == 100 + keep.sum()
+    fitted = synchronous_vectors(cut)
+    np.testing.assert_allclose(fitted.vectors, np.tile(VECTORS[0], (len(starts), 1)), atol=1e-9)
+    assert fitted.end_index[-1] == 100 + keep.sum()
 
 
 def test_missing_samples_change_nothing_but_the_count():
     cut = orbits(VECTORS)
     cut.xy[64 + 5 : 64 + 12] = np.nan
-    found = synchronous_vectors(cut)
-    np.testing.assert_allclose(found.vectors, VECTORS, atol=1e-9)
-    assert found.samples.tolist() == [64.0, 57.0, 64.0]
+    fitted = synchronous_vectors(cut)
+    np.testing.assert_allclose(fitted.vectors, VECTORS, atol=1e-9)
+    assert fitted.samples.tolist() == [64.0, 57.0, 64.0]
 
 
 def test_a_revolution_with_too_little_of_it_there_is_not_fitted():
     cut = orbits(VECTORS)
     cut.xy[64 : 64 + 20] = np.nan
-    found = synchronous_vectors(cut)
-    assert found.usable.tolist() == [True, False, True]
-    assert np.isnan(found.vectors[1]).all()
-    np.testing.assert_allclose(found.vectors[[0, 2]], VECTORS[[0, 2]], atol=1e-9)
+    fitted = synchronous_vectors(cut)
+    assert fitted.usable.tolist() == [True, False, True]
+    assert np.isnan(fitted.vectors[1]).all()
+    np.testing.assert_allclose(fitted.vectors[[0, 2]], VECTORS[[0, 2]], atol=1e-9)
 
 
 def test_a_revolution_whose_angle_is_not_trusted_is_not_fitted():
@@ -71,16 +71,16 @@ def test_a_revolution_whose_angle_is_not_trusted_is_not_fitted():
 
 
 def test_the_residual_is_the_noise_of_a_sample():
-    found = synchronous_vectors(orbits(np.tile(HEALTHY, (400, 1)), noise_um=3.0))
-    assert found.noise.mean() == pytest.approx(2.0 * 3.0**2, rel=0.02)
-    scatter = np.var(found.vectors[:, 1])
-    assert scatter == pytest.approx(found.noise.mean() / 64, rel=0.15)
+    fitted = synchronous_vectors(orbits(np.tile(HEALTHY, (400, 1)), noise_um=3.0))
+    assert fitted.noise.mean() == pytest.approx(2.0 * 3.0**2, rel=0.02)
+    scatter = np.var(fitted.vectors[:, 1])
+    assert scatter == pytest.approx(fitted.noise.mean() / 64, rel=0.15)
 
 
 def test_no_revolutions_make_no_vectors():
-    found = synchronous_vectors(orbits(np.empty((0, 5))))
-    assert len(found) == 0
-    assert found.vectors.shape == (0, 5)
+    fitted = synchronous_vectors(orbits(np.empty((0, 5))))
+    assert len(fitted) == 0
+    assert fitted.vectors.shape == (0, 5)
 
 
 def test_parts_are_joined_in_order():

@@ -64,50 +64,52 @@ def row(truth):
     """What the bank said in every run of a truth."""
     names = [mode.name for mode in bank().modes]
     change = runs.TWELVE_PLANTS[truth]
-    said = []
+    diagnoses = []
     for i in range(ONSETS):
         changes = [(BEFORE_REV, change)] if change else []
         run = runs.run(changes, BEFORE_REV + AFTER_REV + 1.0, i)
         onset = round((run.begins[0] if change else BEFORE_REV) * runs.PER_REV)
-        said += [
+        diagnoses += [
             Said(copy.deepcopy(bank()), names, run.xy(SNR_DB, 1000 * i + j), run.angle, onset)
             for j in range(NOISES)
         ]
-    finals = {name: sum(s.decision == name for s in said) for name in names}
-    departed = np.array([np.inf if s.departed is None else s.departed for s in said])
+    finals = {name: sum(s.decision == name for s in diagnoses) for name in names}
+    departed = np.array([np.inf if s.departed is None else s.departed for s in diagnoses])
     print(
         f"{truth:3} {[f'{k} {v}' for k, v in finals.items() if v]}, departure {np.median(departed):.2f} rev"
     )
-    return said
+    return diagnoses
 
 
 @pytest.mark.parametrize("truth", [name for name in runs.TWELVE_PLANTS if name not in TWINS])
 def test_fault_and_level_are_right_after_thirty_revolutions(truth):
-    said = row(truth)
-    right = sum(s.decision == truth for s in said)
+    runs_of_truth = row(truth)
+    right = sum(s.decision == truth for s in runs_of_truth)
     # At the target's 97 %, 120 runs would have 114 right or more with 95 % confidence.
-    assert right >= 0.97 * len(said), [s.decision for s in said if s.decision != truth]
+    assert right >= 0.97 * len(runs_of_truth), [s.decision for s in runs_of_truth if s.decision != truth]
     # A shaft that is 5 % softer differs by one nat a revolution; all else is told apart without a doubt.
-    assert truth in {"N", "K1", "K2"} or all(s.group == set() for s in said if s.decision == truth)
+    assert truth in {"N", "K1", "K2"} or all(s.group == set() for s in runs_of_truth if s.decision == truth)
 
 
 @pytest.mark.parametrize("truth", sorted(TWINS))
 def test_twins_are_one_group(truth):
-    said = row(truth)
-    in_group = sum(s.decision in TWINS and s.group == TWINS for s in said)
-    assert in_group >= 0.98 * len(said), [(s.decision, s.group) for s in said]
+    runs_of_truth = row(truth)
+    in_group = sum(s.decision in TWINS and s.group == TWINS for s in runs_of_truth)
+    assert in_group >= 0.98 * len(runs_of_truth), [(s.decision, s.group) for s in runs_of_truth]
     # Nobody is told that one of the two has turned into the other.
-    assert all({a, b} != TWINS for s in said for (_, a), (_, b) in zip(s.named, s.named[1:], strict=False))
+    assert all(
+        {a, b} != TWINS for s in runs_of_truth for (_, a), (_, b) in zip(s.named, s.named[1:], strict=False)
+    )
 
 
 def test_departure_is_told_at_once_and_its_name_later():
     for truth in ("U3", "D2", "R", "L3"):
-        said = row(truth)
-        departed = np.array([s.departed for s in said])
-        named = np.array([s.named[0][0] for s in said])
+        runs_of_truth = row(truth)
+        departed = np.array([s.departed for s in runs_of_truth])
+        named = np.array([s.named[0][0] for s in runs_of_truth])
         assert np.median(departed) < 1.5, truth
         assert (named - departed).mean() > 2.0, truth
-        assert np.mean([truth in s.candidates or len(s.candidates) > 0 for s in said]) == 1.0
+        assert np.mean([truth in s.candidates or len(s.candidates) > 0 for s in runs_of_truth]) == 1.0
 
 
 def test_settling_keeps_milder_faults_of_other_kinds_out_of_it():
@@ -121,8 +123,8 @@ def test_settling_keeps_milder_faults_of_other_kinds_out_of_it():
                 runs.models(), noise=runs.sigma(SNR_DB), duration=runs.DURATION, rules=rules, decision=0
             )
             onset = round(run.begins[0] * runs.PER_REV)
-            said = Said(subject, names, run.xy(SNR_DB, 1000 * i), run.angle, onset)
-            wrong += sum(name != "R" for _, name in said.named)
+            outcome = Said(subject, names, run.xy(SNR_DB, 1000 * i), run.angle, onset)
+            wrong += sum(name != "R" for _, name in outcome.named)
         return wrong
 
     assert misnamed(0.0) >= ONSETS
@@ -132,7 +134,7 @@ def test_settling_keeps_milder_faults_of_other_kinds_out_of_it():
 def test_healthy_machine_is_left_alone():
     # 0.3 false declarations in 1000 revolutions: in 14 runs of 12 truths of 20 revolutions, 40,000 in all
     # at 120 runs, 12 are expected; 4 standard deviations fewer are what is allowed here.
-    said = [s for truth in runs.TWELVE_PLANTS for s in row(truth)]
-    false = [s.false for s in said if s.false]
-    revolutions = BEFORE_REV * len(said)
+    outcomes = [s for truth in runs.TWELVE_PLANTS for s in row(truth)]
+    false = [s.false for s in outcomes if s.false]
+    revolutions = BEFORE_REV * len(outcomes)
     assert sum(map(len, false)) <= max(1.0, 0.3 * revolutions / 1000.0), false

@@ -70,8 +70,8 @@ def test_a_change_is_said_at_once_and_named_after_it_has_settled():
 
 def test_every_fault_has_its_level():
     watch, _ = life((100, HEALTHY), (60, UNBALANCE))
-    found = watch.finish()
-    level = levels(found, watch.calibration)["unbalance"]
+    report = watch.finish()
+    level = levels(report, watch.calibration)["unbalance"]
     assert level["ratio"] == pytest.approx(0.3, abs=0.03)
     assert level["eccentricity_change_um"] == pytest.approx(7.0, rel=0.05)
     watch, _ = life((100, HEALTHY), (60, LOAD))
@@ -80,17 +80,17 @@ def test_every_fault_has_its_level():
     assert level["shift_deg"] == pytest.approx(math.degrees(math.atan2(-4.0, 6.0)), abs=3.0)
     softer = 1.0 / (0.8 - 1.0 + 0.36j) * 0.36j
     watch, _ = life((100, HEALTHY), (60, with_change(dc=-2.5j, forward=HEALTHY[1] * (softer - 1.0))))
-    found = watch.finish()
-    assert found.verdict == "stiffness_loss"
-    assert levels(found, watch.calibration)["stiffness_loss"]["stiffness"] == pytest.approx(0.8, abs=0.02)
+    report = watch.finish()
+    assert report.verdict == "stiffness_loss"
+    assert levels(report, watch.calibration)["stiffness_loss"]["stiffness"] == pytest.approx(0.8, abs=0.02)
 
 
 def test_the_damping_that_is_left_is_told():
     less = complex(unbalance_response(1.0, 0.09) / unbalance_response(1.0, 0.18))
     watch, _ = life((100, HEALTHY), (60, with_change(forward=HEALTHY[1] * (less - 1.0))))
-    found = watch.finish()
-    assert set(found.group) == {"unbalance", "damping_loss"}
-    assert levels(found, watch.calibration)["damping_loss"]["damping_ratio"] == pytest.approx(0.09, rel=0.05)
+    report = watch.finish()
+    assert set(report.group) == {"unbalance", "damping_loss"}
+    assert levels(report, watch.calibration)["damping_loss"]["damping_ratio"] == pytest.approx(0.09, rel=0.05)
 
 
 def test_a_second_fault_is_another_change():
@@ -207,9 +207,9 @@ def test_a_speed_that_is_wrong_is_found_and_told(error, noise_um):
         period_samples=np.full(50, float(PER_REV)),
         trusted=np.ones(50, dtype=bool),
     )
-    told = refusal(cut)
-    assert "not locked to the shaft" in told
-    speed = float(told.split("turns at ")[1].split(" rpm")[0])
+    reason = refusal(cut)
+    assert "not locked to the shaft" in reason
+    speed = float(reason.split("turns at ")[1].split(" rpm")[0])
     assert speed == pytest.approx(600.0 * (1.0 + error), abs=0.6)
 
 
@@ -225,8 +225,8 @@ def test_noise_without_an_orbit_is_told():
 
 def test_a_fault_during_calibration_is_refused():
     vectors = np.vstack([np.tile(HEALTHY, (25, 1)), np.tile(LOAD, (25, 1))])
-    told = refusal(orbits(vectors, NOISE_UM))
-    assert "not steady: the mean position moves" in told
+    reason = refusal(orbits(vectors, NOISE_UM))
+    assert "not steady: the mean position moves" in reason
 
 
 def test_a_service_tries_again_and_a_recording_does_not():
@@ -290,8 +290,8 @@ def test_steady_machines_are_calibrated_nearly_always():
 
 
 def test_a_keyphasor_that_misses_every_second_revolution_is_told():
-    told = refusal(orbits(np.tile(np.array([0.0, 0.1, 0.0, 20.0, 0.0]), (50, 1)), 0.3))
-    assert "one pulse a revolution" in told
+    reason = refusal(orbits(np.tile(np.array([0.0, 0.1, 0.0, 20.0, 0.0]), (50, 1)), 0.3))
+    assert "one pulse a revolution" in reason
 
 
 def test_a_rotor_that_cannot_whirl_like_that_makes_no_names_by_its_model():
@@ -313,9 +313,11 @@ def test_a_steady_whirl_is_one_alarm_that_is_held_and_no_fault_of_the_shaft(orde
     reports = watch.evaluate(synchronous_vectors(cut), cut)
     assert sum(report.departed for report in reports) <= 2
     assert all(report.state == "departed" for report in reports if report.revolution > 105)
-    found = watch.finish()
-    assert found.group == ("unmodelled",)
-    assert levels(found, watch.calibration)["unmodelled"]["nonsynchronous_um"] == pytest.approx(4.5, rel=0.4)
+    identification = watch.finish()
+    assert identification.group == ("unmodelled",)
+    assert levels(identification, watch.calibration)["unmodelled"]["nonsynchronous_um"] == pytest.approx(
+        4.5, rel=0.4
+    )
 
 
 def test_a_probe_that_gets_noisier_is_no_rub():

@@ -37,11 +37,11 @@ def test_a_damaged_race_of_a_recording_is_named_and_alarmed_live(
 ) -> None:
     options = ("--bearing", "6205-2RS", "--speed-rpm", f"{SPEED_RPM:g}", "--speed", "4", "--json")
     assert demo(damaged, *options) == 0
-    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    said = [one for one in told if one["type"] == "diagnosis" and one["detector"] == "bearing"]
-    assert said[-1]["decision"] == "outer"
-    assert said[-1]["sensors"] == ["de"]
-    alarms = [one for one in told if one["type"] == "alarm"]
+    messages = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    diagnoses = [one for one in messages if one["type"] == "diagnosis" and one["detector"] == "bearing"]
+    assert diagnoses[-1]["decision"] == "outer"
+    assert diagnoses[-1]["sensors"] == ["de"]
+    alarms = [one for one in messages if one["type"] == "alarm"]
     assert len(alarms) == 1
     assert "damage of the outer race at de" in json.dumps(alarms[0])
 

@@ -105,9 +105,9 @@ def test_misuse_is_a_usage_error(arguments: str, words: str, capsys: pytest.Capt
 def test_a_password_in_the_address_is_not_repeated(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         arguments_of("--broker", "mqtt://daq:hunter2@box")
-    said = capsys.readouterr().err
-    assert "does not log in" in said
-    assert "hunter2" not in said
+    errors = capsys.readouterr().err
+    assert "does not log in" in errors
+    assert "hunter2" not in errors
 
 
 def test_what_is_right_stays_right() -> None:
@@ -169,9 +169,11 @@ def test_channels_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.Capt
 # What ends the playing before its time.
 
 
-async def broken_off(script: Script, hear: Callable[[Received], None], url: str | None = None) -> DemoSession:
+async def broken_off(
+    script: Script, on_message: Callable[[Received], None], url: str | None = None
+) -> DemoSession:
     """The session after its failure, with the service stopped and not much played."""
-    playing = DemoSession(script, speed=20, broker_url=url, hear=hear)
+    playing = DemoSession(script, speed=20, broker_url=url, on_message=on_message)
     with pytest.raises((BrokenPipeError, DemoError)) as failed:
         await playing.run()
     playing.error = failed.value  # type: ignore[attr-defined]
@@ -190,11 +192,11 @@ async def test_whoever_listens_no_more_ends_it(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(Service, "run", watched)
 
-    def hear(message: Received) -> None:
+    def on_message(message: Received) -> None:
         if message.kind == "diagnosis":
             raise BrokenPipeError
 
-    playing = await broken_off(recorded(tmp_path), hear)
+    playing = await broken_off(recorded(tmp_path), on_message)
     assert isinstance(playing.error, BrokenPipeError)  # type: ignore[attr-defined]
     assert ended == ["in order"]
 
@@ -204,12 +206,12 @@ async def test_a_lost_broker_ends_it_and_is_said(tmp_path: Path) -> None:
         running = embedded._broker
         assert running is not None
 
-        def hear(message: Received) -> None:
+        def on_message(message: Received) -> None:
             if message.kind == "diagnosis":
                 for writer in running.writers:
                     writer.transport.abort()
 
-        playing = await broken_off(recorded(tmp_path), hear, embedded.url)
+        playing = await broken_off(recorded(tmp_path), on_message, embedded.url)
         assert f"the broker {embedded.url} was lost" in str(playing.error)  # type: ignore[attr-defined]
 
 
@@ -224,7 +226,7 @@ async def test_kernels_may_take_their_time(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(Service, "run", slow)
     script = recorded(tmp_path, duration_s=1.0)
     # Only the kernels are slow: the links come up within the limit that was lowered for them.
-    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=lambda _: None).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=lambda _: None).run()
     assert outcome.complete
 
 
@@ -247,8 +249,10 @@ def test_a_closed_pipe_ends_it_quietly(tmp_path: Path) -> None:
         assert json.loads(running.stdout.readline())["type"]
         running.stdout.close()
         # A host that starves it is told of, which is no matter of the pipe.
-        said = [line for line in running.stderr.read().splitlines() if "the process stood still" not in line]
-        assert said == []
+        errors = [
+            line for line in running.stderr.read().splitlines() if "the process stood still" not in line
+        ]
+        assert errors == []
         assert running.wait() == 0
     assert left_behind(tmp_path) == []
 
@@ -274,8 +278,8 @@ def test_signals_end_it_in_order(number: int, tmp_path: Path) -> None:
         running.stdout.readline()
         assert left_behind(tmp_path)
         running.send_signal(number)
-        _, said = running.communicate()
-        assert without_delays(said) == ["daqsvc demo: interrupted"]
+        _, errors = running.communicate()
+        assert without_delays(errors) == ["daqsvc demo: interrupted"]
         assert running.returncode == 1
     assert left_behind(tmp_path) == []
 
@@ -294,8 +298,8 @@ def test_a_background_job_that_ignores_ctrl_c_ends_in_order_on_sigterm(tmp_path:
         assert running.stdout is not None
         running.stdout.readline()
         running.send_signal(signal.SIGTERM)
-        _, said = running.communicate()
-    assert (without_delays(said), running.returncode) == (["daqsvc demo: interrupted"], 1)
+        _, errors = running.communicate()
+    assert (without_delays(errors), running.returncode) == (["daqsvc demo: interrupted"], 1)
     assert left_behind(tmp_path) == []
 
 
@@ -332,7 +336,7 @@ async def test_a_low_terminal_shows_loss_lag_and_the_newest_alarm() -> None:
     console = Console(width=60, height=24, file=io.StringIO())
     script = script_of(arguments_of())
     view = View(script, 1000, console)
-    await DemoSession(script, speed=1000, broker_url=None, hear=view.hear).run()
+    await DemoSession(script, speed=1000, broker_url=None, on_message=view.on_message).run()
     lines = console.render_lines(view.picture(), pad=False)
     seen = ["".join(segment.text for segment in line) for line in lines][:22]
     text = "\n".join(seen)

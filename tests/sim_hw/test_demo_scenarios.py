@@ -25,8 +25,8 @@ def demo(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[s
     """Exit code, summary and what was written to stderr."""
     code = main(["demo", "--speed", "1000", "--json", *options])
     heard = capsys.readouterr()
-    said = [json.loads(line) for line in heard.out.splitlines()]
-    return code, said[-1] if said else {}, heard.err
+    messages = [json.loads(line) for line in heard.out.splitlines()]
+    return code, messages[-1] if messages else {}, heard.err
 
 
 @pytest.mark.parametrize(

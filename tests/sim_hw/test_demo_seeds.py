@@ -25,8 +25,8 @@ def test_the_demo_declares_the_papers_modes_in_order(seed: int) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    said = [line for line in lines if line["type"] == "diagnosis" and line["detector"] == "rotor-bank"]
-    assert [line["decision"] for line in said if line["changed"]] == MODES
+    diagnoses = [line for line in lines if line["type"] == "diagnosis" and line["detector"] == "rotor-bank"]
+    assert [line["decision"] for line in diagnoses if line["changed"]] == MODES
     summary = lines[-1]
     assert summary["declared"] == MODES
     assert summary["wrong_declarations"] == 0

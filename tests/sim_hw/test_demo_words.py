@@ -35,11 +35,11 @@ def alarm(name, shown_by_s):
 def test_alarms_are_shown_with_times_that_go_forward():
     def act(view):
         window = {"end_index": 640}
-        view.hear(
+        view.on_message(
             Received("diagnosis", "", {"detector": "levels/x", "monotonic_ns": 10**9, "window": window})
         )
         for name, shown_by_s in (("long window", 16.5), ("revolution", 16.12), ("later", 17.0)):
-            view.hear(alarm(name, shown_by_s))
+            view.on_message(alarm(name, shown_by_s))
 
     times_s = [float(at) for at in re.findall(r"^ *(\d+\.\d+) s", shown(act), re.MULTILINE)]
     assert times_s == [16.5, 16.5, 17.0]

@@ -208,11 +208,11 @@ def test_wrong_changes_excuse_the_mode_before_for_three_revolutions_only() -> No
 @pytest.fixture
 def small_study(monkeypatch: pytest.MonkeyPatch) -> None:
     """One figure and two rows at once instead of the paper's."""
-    found = ResultRow(
+    rows = ResultRow(
         name="a", figure="1", paper="a | b", obtained="2 clearances", agrees=True, values={"b": 2.0}
     )
     silent = ResultRow(name="b", figure="2", paper="", obtained="a point " * 30, agrees=None, remark="why")
-    findings = Findings((found, silent), {"fig1": lambda figure: figure.subplots().plot([0.0, 1.0])})
+    findings = Findings((rows, silent), {"fig1": lambda figure: figure.subplots().plot([0.0, 1.0])})
     monkeypatch.setattr(command, "STUDIES", (Study("a study", lambda _seed, _snr_db: findings),))
 
 
@@ -223,9 +223,9 @@ def test_a_study_needs_only_a_place_in_the_list(tmp_path: Path, capsys: pytest.C
     assert "a \\| b" in (tmp_path / "results.md").read_text(encoding="utf-8")
     table = list(csv.reader(io.StringIO((tmp_path / "results.csv").read_text(encoding="utf-8"))))
     assert [(line[0], *line[-2:]) for line in table[1:]] == [("a", "b", "2.0"), ("b", "", "")]
-    said = capsys.readouterr().out
-    assert "2 clearances" in said
-    assert "(nothing)" in said
+    output = capsys.readouterr().out
+    assert "2 clearances" in output
+    assert "(nothing)" in output
 
 
 @pytest.mark.parametrize("width", [80, 110, 200])
@@ -244,8 +244,8 @@ def test_missing_matplotlib_is_told_before_anything_is_done(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["reproduce", "--out", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert said.splitlines() == [
+    errors = capsys.readouterr().err
+    assert errors.splitlines() == [
         "daqsvc reproduce: the figures need matplotlib; install it with: pip install 'daqsvc[plot]'"
     ]
     assert not (tmp_path / "out").exists()
@@ -266,10 +266,10 @@ def test_out_that_cannot_be_used_is_told_in_a_line(
         (tmp_path / "full", "fig1.png cannot be written: Is a directory; "),
     ):
         assert cli.main(["reproduce", "--out", str(out)]) == 1
-        said = capsys.readouterr().err
-        assert said.startswith("daqsvc reproduce: ")
-        assert words in said
-        assert len(said.splitlines()) == 1
+        errors = capsys.readouterr().err
+        assert errors.startswith("daqsvc reproduce: ")
+        assert words in errors
+        assert len(errors.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -50,8 +50,8 @@ def rig_file(folder: Path, path: Path, port: int) -> Path:
 
 
 def status_of(consumer: Consumer) -> dict[str, Any]:
-    found = consumer.on("/status")
-    return found[-1].payload["figures"] if found else {}
+    status = consumer.on("/status")
+    return status[-1].payload["figures"] if status else {}
 
 
 def figures(consumer: Consumer, group: str, name: str, figure: str) -> Any:

@@ -71,8 +71,8 @@ class AlarmRig:
             last[event.alarm] = event
         after = AlarmRig(*self.rules, handling=self.handling, clock=self.clock)
         after.events = list(self.events)
-        told = [alarm_event(alarm_payload(event, 1, "series").to_json()) for event in last.values()]
-        after.told(after.manager.resume(told, active_detectors or {}, conditions))
+        events = [alarm_event(alarm_payload(event, 1, "series").to_json()) for event in last.values()]
+        after.told(after.manager.resume(events, active_detectors or {}, conditions))
         return after
 
     def told(self, events: Sequence[AlarmEvent]) -> Sequence[AlarmEvent]:

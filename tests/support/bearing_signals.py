@@ -28,11 +28,11 @@ def healthy(seconds: float, seed: int, *, rate_hz: float = RATE_HZ) -> Floats:
     n = round(seconds * rate_hz)
     noise = rng.standard_normal(n + 64)
     taps = np.exp(-np.arange(32) / 6.0) * np.cos(2.0 * np.pi * 0.2 * np.arange(32))
-    found = 0.05 * np.convolve(noise, taps, mode="same")[:n]
+    noisy = 0.05 * np.convolve(noise, taps, mode="same")[:n]
     phase = 2.0 * np.pi * TURNS_PER_S * np.arange(n) / rate_hz + rng.uniform(0.0, 6.0)
     for order, amplitude in ((1, 0.02), (2, 0.03), (4, 0.015), (7, 0.005)):
-        found += amplitude * np.cos(order * phase + order)
-    return found
+        noisy += amplitude * np.cos(order * phase + order)
+    return noisy
 
 
 def knocks(
@@ -87,10 +87,10 @@ class Housing:
     @property
     def samples(self) -> Floats:
         """In g, float64 ``[n]``."""
-        found = healthy(self.seconds, self.seed, rate_hz=self.rate_hz)
+        samples = healthy(self.seconds, self.seed, rate_hz=self.rate_hz)
         if self.order is not None:
             loaded = 0.8 if self.order == INNER else 0.0
-            found += knocks(
+            samples += knocks(
                 self.seconds,
                 self.order,
                 self.seed + 1000,
@@ -98,7 +98,7 @@ class Housing:
                 rate_hz=self.rate_hz,
                 loaded=loaded,
             )
-        return found
+        return samples
 
     def save(self, path: Path, name: str = "de") -> Path:
         """Write it as a file that states no rate."""

@@ -24,8 +24,8 @@ def modbus_bus(**options: Any) -> ModbusTcpBus | ModbusRtuBus:
         own = {key: value for key, value in options.items() if key != "quiet_ms"}  # of serial lines only
         tcp = ModbusTcpBus.model_validate({"driver": "modbus", **own, "host": "192.0.2.10"})
         return tcp.model_copy(update={"host": options["host"]})
-    given = {"driver": "modbus", "baud": 19_200, **options, "serial_port": "/dev/ttyS0"}
-    return ModbusRtuBus.model_validate(given).model_copy(update={"serial_port": options["serial_port"]})
+    table = {"driver": "modbus", "baud": 19_200, **options, "serial_port": "/dev/ttyS0"}
+    return ModbusRtuBus.model_validate(table).model_copy(update={"serial_port": options["serial_port"]})
 
 
 def replay_bus(**options: Any) -> ReplayBus:

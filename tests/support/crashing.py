@@ -28,11 +28,11 @@ def dies_at(step: int, work: Callable[[], object]) -> int:
     if child:
         os.close(writer)
         with os.fdopen(reader, "rb") as told:
-            said = told.read()
+            output = told.read()
         _, status = os.waitpid(child, 0)
         code = os.waitstatus_to_exitcode(status)
-        assert code in {0, DIED}, said.decode()
-        return step if code == DIED else int(said)
+        assert code in {0, DIED}, output.decode()
+        return step if code == DIED else int(output)
     done = 0
     quit_ = os._exit
     write = os.write

@@ -50,16 +50,16 @@ TEMPLATE = re.compile(
 
 def rendered(template: str, payload: dict[str, Any]) -> str:
     """What Jinja makes of the templates that are used; any other template fails."""
-    found = TEMPLATE.fullmatch(template)
-    assert found, f"a template beyond what these rules know: {template}"
+    match = TEMPLATE.fullmatch(template)
+    assert match, f"a template beyond what these rules know: {template}"
     value: Any = payload
-    for dotted, bracketed in re.findall(r"\.([a-z]\w*)|\['([^'\\]+)'\]", found["path"]):
+    for dotted, bracketed in re.findall(r"\.([a-z]\w*)|\['([^'\\]+)'\]", match["path"]):
         value = value[dotted or bracketed]
-    if found["given"] and not value.get(found["given"]):
+    if match["given"] and not value.get(match["given"]):
         return "None"
-    if found["last"]:
-        value = value.get(found["last"])
-    return json.dumps(value) if found["json"] else str(value)
+    if match["last"]:
+        value = value.get(match["last"])
+    return json.dumps(value) if match["json"] else str(value)
 
 
 def check_discovery(topic: str, payload: dict[str, Any]) -> None:

@@ -53,17 +53,17 @@ seen, wanted, todo = set(), set(), sys.argv[1:]
 while todo:
     if (name := todo.pop()) not in seen:
         seen.add(name)
-        told = json.loads((home / name / "manifest.json").read_text())
-        wanted.update(told.get("requirements", []))
-        todo.extend(told.get("dependencies", []))
+        manifest = json.loads((home / name / "manifest.json").read_text())
+        wanted.update(manifest.get("requirements", []))
+        todo.extend(manifest.get("dependencies", []))
 print("\\n".join(sorted(wanted)))
 """
 
 
 def environment() -> Path:
     """The folder of an environment with Home Assistant; skips where none can be made."""
-    if given := os.environ.get("DAQSVC_HOME_ASSISTANT"):
-        return Path(given)
+    if path := os.environ.get("DAQSVC_HOME_ASSISTANT"):
+        return Path(path)
     for (major, minor), release in RELEASES.items():
         python = _python(major, minor)
         if python is not None:
@@ -120,14 +120,14 @@ class HomeAssistant:
 
     def set_up(self, broker_port: int) -> None:
         """What a person clicks through: an owner, then the MQTT integration."""
-        told = {
+        settings = {
             "client_id": f"{self._base}/",
             "name": "t",
             "username": "t",
             "password": "t",
             "language": "en",
         }
-        code = self._call("/api/onboarding/users", told)["auth_code"]
+        code = self._call("/api/onboarding/users", settings)["auth_code"]
         form = {"client_id": f"{self._base}/", "grant_type": "authorization_code", "code": code}
         self._token = self._call("/auth/token", form, as_form=True)["access_token"]
         flow = self._call("/api/config/config_entries/flow", {"handler": "mqtt"})["flow_id"]
@@ -145,8 +145,10 @@ class HomeAssistant:
 
     def rows(self, entity_id: str) -> list[str]:
         """The states of an entity that are in the database."""
-        found = self._call(f"/api/history/period?filter_entity_id={entity_id}&minimal_response&no_attributes")
-        return [row["state"] for row in found[0]] if found else []
+        history = self._call(
+            f"/api/history/period?filter_entity_id={entity_id}&minimal_response&no_attributes"
+        )
+        return [row["state"] for row in history[0]] if history else []
 
     def answers(self) -> bool:
         """Whether it has started."""
@@ -155,11 +157,11 @@ class HomeAssistant:
         except OSError:
             return False
 
-    def _call(self, path: str, told: dict[str, Any] | None = None, *, as_form: bool = False) -> Any:
+    def _call(self, path: str, content: dict[str, Any] | None = None, *, as_form: bool = False) -> Any:
         data = None
         headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
-        if told is not None:
-            data = (urllib.parse.urlencode(told) if as_form else json.dumps(told)).encode()
+        if content is not None:
+            data = (urllib.parse.urlencode(content) if as_form else json.dumps(content)).encode()
             headers["Content-Type"] = "application/x-www-form-urlencoded" if as_form else "application/json"
         request = urllib.request.Request(self._base + path, data=data, headers=headers)  # noqa: S310
         with urllib.request.urlopen(request, timeout=30) as answer:  # noqa: S310  http on loopback

@@ -28,8 +28,8 @@ def register(
     name: str, address: int, kind: RegisterType, order: str = "ABCD", **more: Any
 ) -> RegisterChannel:
     """A number at an address."""
-    given = {"name": name, "address": address, "type": kind, "order": order, **more}
-    return RegisterChannel.model_validate(given)
+    channel = {"name": name, "address": address, "type": kind, "order": order, **more}
+    return RegisterChannel.model_validate(channel)
 
 
 def in_sample(name: str, place: int, kind: RegisterType) -> SampleChannel:
@@ -46,8 +46,8 @@ def registers_layout(
     unit: int, table: Table, channels: Sequence[RegisterChannel], *, max_gap: int = 0, **more: Any
 ) -> RegistersLayout:
     """Numbers that are polled; neighbours share a request."""
-    given = {"way": "registers", "unit": unit, "table": table, "channels": channels, "max_gap": max_gap}
-    return RegistersLayout.model_validate(given | more)
+    layout = {"way": "registers", "unit": unit, "table": table, "channels": channels, "max_gap": max_gap}
+    return RegistersLayout.model_validate(layout | more)
 
 
 def fifo_layout(

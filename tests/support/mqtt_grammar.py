@@ -123,24 +123,24 @@ def _command(dice: random.Random) -> bytes:
         told[key] = dice.choice(VALUES)
     if dice.random() < 0.1:
         told.pop(dice.choice(list(told)))
-    said = json.dumps(told).encode()
+    payload = json.dumps(told).encode()
     if kind == 0:
-        at = dice.randrange(len(said))
-        return said[:at] + dice.randbytes(dice.randrange(4)) + said[at + dice.randrange(4) :]
+        at = dice.randrange(len(payload))
+        return payload[:at] + dice.randbytes(dice.randrange(4)) + payload[at + dice.randrange(4) :]
     if kind == 1:
-        return said + b"x" * dice.choice((1, 4096, 300_000))
-    return said
+        return payload + b"x" * dice.choice((1, 4096, 300_000))
+    return payload
 
 
 def varint(number: int, least: int = 1) -> bytes:
     """A variable byte integer of at least so many bytes, of more than are allowed too."""
-    found = bytearray()
+    digits = bytearray()
     while True:
         number, digit = number >> 7, number & 0x7F
-        more = number or len(found) + 1 < least
-        found.append(digit | (0x80 if more else 0))
+        more = number or len(digits) + 1 < least
+        digits.append(digit | (0x80 if more else 0))
         if not more:
-            return bytes(found)
+            return bytes(digits)
 
 
 @dataclass
@@ -185,20 +185,20 @@ class Grammar:
         dice = self.dice
         mid = dice.choice((1, under_way, dice.randrange(1, 65_536), 65_535))
         number = (0 if self._errs() else mid).to_bytes(2, "big")
-        told = self._properties(kind) if self.mqtt5 else b""
+        properties = self._properties(kind) if self.mqtt5 else b""
         code = bytes([dice.choice((0, 1, 0x80, 0x87, 0x97))])
         if self._errs():
             code = dice.choice((b"\x8e", b"\xff", b"", bytes([dice.randrange(256)])))
         if kind == 3:
             topic = dice.choice(ODD_TOPICS if self._errs() else TOPICS)
-            return self._text(topic) + (number if flags & 6 else b"") + told + payload(dice)
+            return self._text(topic) + (number if flags & 6 else b"") + properties + payload(dice)
         bodies = {
-            2: bytes([dice.choice((0, 1, 255))]) + code + told,
-            4: number + (dice.choice((b"", code, code + told)) if self.mqtt5 else b""),
-            9: number + told + code,
-            11: number + (told + code if self.mqtt5 else b""),
+            2: bytes([dice.choice((0, 1, 255))]) + code + properties,
+            4: number + (dice.choice((b"", code, code + properties)) if self.mqtt5 else b""),
+            9: number + properties + code,
+            11: number + (properties + code if self.mqtt5 else b""),
             13: b"",
-            14: dice.choice((b"", code, code + told)),
+            14: dice.choice((b"", code, code + properties)),
         }
         return bodies.get(kind, dice.randbytes(dice.randrange(30)))
 
@@ -214,15 +214,15 @@ class Grammar:
     def _properties(self, kind: int) -> bytes:
         """Properties of MQTT 5, with their length."""
         dice = self.dice
-        said = b""
+        content = b""
         if kind == 3 and dice.random() < 0.3:
-            said += b"\x08" + self._text(dice.choice(("operators/ada", *TOPICS[7:])))
+            content += b"\x08" + self._text(dice.choice(("operators/ada", *TOPICS[7:])))
         if kind == 3 and dice.random() < 0.3:
-            said += b"\x09" + self._text("x" * dice.choice((1, 300, 60_000)))
+            content += b"\x09" + self._text("x" * dice.choice((1, 300, 60_000)))
         if dice.random() < 0.2:
-            said += b"\x26" + self._text("name") + self._text("value")
+            content += b"\x26" + self._text("name") + self._text("value")
         if self._errs():
-            said += varint(dice.choice((1, 2, 11, 17, 22, 33, 34, 35, 39, 42, 99)), dice.choice((1, 2, 5)))
-            said += dice.randbytes(dice.choice((0, 1, 2, 4, 4, 5)))
-        length = dice.choice((0, len(said) + 1, 127, 268_435_455)) if self._errs() else len(said)
-        return varint(length, dice.choice((2, 4, 5)) if self._errs() else 1) + said
+            content += varint(dice.choice((1, 2, 11, 17, 22, 33, 34, 35, 39, 42, 99)), dice.choice((1, 2, 5)))
+            content += dice.randbytes(dice.choice((0, 1, 2, 4, 4, 5)))
+        length = dice.choice((0, len(content) + 1, 127, 268_435_455)) if self._errs() else len(content)
+        return varint(length, dice.choice((2, 4, 5)) if self._errs() else 1) + content

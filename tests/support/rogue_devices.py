@@ -112,8 +112,8 @@ class RogueFrames:
             counts = rng.choice(np.array(["-1", str(2**64), "1e9", "", "99999999999999999999999"]), n)
             return [f"{count},{value}\n".encode() for count, value in zip(counts, odd, strict=True)]
         level = LEVELS[phase.values]
-        found = self._encode(counters.astype(np.int64), level * rng.normal(size=(n, 1, 1)))
-        return [self._damaged(f) if rng.random() < phase.damage else f for f in found]
+        encoded = self._encode(counters.astype(np.int64), level * rng.normal(size=(n, 1, 1)))
+        return [self._damaged(f) if rng.random() < phase.damage else f for f in encoded]
 
     def _damaged(self, frame: bytes) -> bytes:
         data = bytearray(frame)
@@ -326,12 +326,12 @@ class RogueDevices(threading.Thread):
                         size for size in (64, 48, 32, 24, 20, 16, 12, *range(8, -1, -1)) if size <= len(frame)
                     )
                 ]
-                found = (
+                payloads = (
                     frame_id
                     if phase.values != "noise"
                     else int(rng.choice(np.array([frame_id, rng.integers(2048)])))
                 )
-                self._send("can", found, data)
+                self._send("can", payloads, data)
 
         return step
 

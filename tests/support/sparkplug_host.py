@@ -76,16 +76,16 @@ class Seen:
     metrics: list[SeenMetric] = field(default_factory=list)
 
     def metric(self, name: str) -> SeenMetric:
-        found = [metric for metric in self.metrics if metric.name == name]
-        assert len(found) == 1, f"{self.kind} has {len(found)} metrics {name!r}"
-        return found[0]
+        metrics = [metric for metric in self.metrics if metric.name == name]
+        assert len(metrics) == 1, f"{self.kind} has {len(metrics)} metrics {name!r}"
+        return metrics[0]
 
     def value(self, name: str) -> Any:
         return self.metric(name).value
 
 
 def metric_of(raw: bytes) -> SeenMetric:
-    told = dict(fields_of(raw))
+    fields = dict(fields_of(raw))
     readers: dict[int, Callable[[Any], Any]] = {
         10: lambda number: number,
         11: lambda number: number,
@@ -94,24 +94,24 @@ def metric_of(raw: bytes) -> SeenMetric:
         14: bool,
         15: lambda text: text.decode(),
     }
-    values = [readers[number](content) for number, content in told.items() if number in readers]
+    values = [readers[number](content) for number, content in fields.items() if number in readers]
     assert len(values) <= 1, "a metric has one value at most"
     properties: dict[str, str] = {}
-    if 9 in told:
-        pairs = list(fields_of(told[9]))
+    if 9 in fields:
+        pairs = list(fields_of(fields[9]))
         keys = [content.decode() for number, content in pairs if number == 1]
         texts = [dict(fields_of(content)) for number, content in pairs if number == 2]
         assert len(keys) == len(texts)
         assert all(text[1] == 12 for text in texts), "every property says that it is a string"
         properties = {key: text[8].decode() for key, text in zip(keys, texts, strict=True)}
-    name = told.get(1)
+    name = fields.get(1)
     return SeenMetric(
         name=None if name is None else name.decode(),
-        alias=told.get(2),
-        timestamp=told.get(3),
-        datatype=told.get(4),
-        historical=bool(told.get(5, 0)),
-        null=bool(told.get(7, 0)),
+        alias=fields.get(2),
+        timestamp=fields.get(3),
+        datatype=fields.get(4),
+        historical=bool(fields.get(5, 0)),
+        null=bool(fields.get(7, 0)),
         value=values[0] if values else None,
         properties=properties,
     )
@@ -119,9 +119,9 @@ def metric_of(raw: bytes) -> SeenMetric:
 
 def seen(topic: str, raw: bytes, qos: int, *, retain: bool) -> Seen:
     parts = topic.split("/")
-    told = list(fields_of(raw))
-    assert {number for number, _ in told} <= {1, 2, 3}
-    single = dict(told)
+    fields = list(fields_of(raw))
+    assert {number for number, _ in fields} <= {1, 2, 3}
+    single = dict(fields)
     return Seen(
         topic=topic,
         qos=qos,
@@ -131,7 +131,7 @@ def seen(topic: str, raw: bytes, qos: int, *, retain: bool) -> Seen:
         device=parts[4] if len(parts) > 4 else None,
         seq=single.get(3),
         timestamp=single.get(1),
-        metrics=[metric_of(content) for number, content in told if number == 2],
+        metrics=[metric_of(content) for number, content in fields if number == 2],
     )
 
 
@@ -190,8 +190,8 @@ class Host:
         ]
 
     def say_state(self, *, online: bool, timestamp: int) -> None:
-        told = json.dumps({"online": online, "timestamp": timestamp})
-        self._client.publish(f"spBv1.0/STATE/{self._host_id}", told, 1, retain=True).wait_for_publish(5.0)
+        state = json.dumps({"online": online, "timestamp": timestamp})
+        self._client.publish(f"spBv1.0/STATE/{self._host_id}", state, 1, retain=True).wait_for_publish(5.0)
 
     def say_word(self, word: str) -> None:
         """Its state as of Sparkplug 2.2."""

@@ -75,10 +75,10 @@ class _Link:
         for first, body in (self._up if up else self._down).feed(data):
             if up and first >> 4 == PUBLISH and first & 0x06:
                 topic_end = 2 + int.from_bytes(body[:2], "big")
-                found = _ID.search(body)
-                if found:
+                match = _ID.search(body)
+                if match:
                     number = int.from_bytes(body[topic_end : topic_end + 2], "big")
-                    self._in_flight[number] = (found[1].decode(), body[body.index(b'{"', topic_end) :])
+                    self._in_flight[number] = (match[1].decode(), body[body.index(b'{"', topic_end) :])
             elif not up and first >> 4 == PUBACK:
                 name, payload = self._in_flight.pop(int.from_bytes(body[:2], "big"), ("", b""))
                 refused = len(body) > 2 and body[2] >= 0x80
