@@ -9,8 +9,8 @@ import can
 import numpy as np
 import pytest
 from support.bus_tables import can_bus
+from support.can_standin import FaultyBus
 from support.clocks import QuickClock
-from support.fake_can import FaultyBus
 from support.running_drivers import begun
 from support.waiting import eventually
 

@@ -12,7 +12,7 @@ import paho.mqtt.client as paho
 import pytest
 from support.brokers import Consumer, TcpProxy, running_mosquitto
 from support.mqtt_publishing import CLOCK, publishing
-from support.picky_broker import PickyBroker, only_availability
+from support.rogue_broker import PickyBroker, only_availability
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.outbox.store import Outbox

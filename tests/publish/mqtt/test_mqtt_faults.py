@@ -7,7 +7,7 @@ import json
 
 import pytest
 from support.mqtt_publishing import publishing
-from support.picky_broker import PickyBroker, length_of
+from support.rogue_broker import PickyBroker, length_of
 from support.waiting import PATIENCE_S, eventually
 
 from daqsvc.publish.mqtt import session

@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 from support.brokers import Consumer, free_port, running_mosquitto
 from support.mqtt_publishing import CLOCK, mqtt, outputs, publishing
-from support.picky_broker import PickyBroker
+from support.rogue_broker import PickyBroker
 from support.waiting import eventually
 
 from daqsvc.alarm_service import AlarmService
