@@ -14,7 +14,7 @@ from daqsvc.acquisition.samples import SampleBlock
 from daqsvc.alarms.conditions import Condition
 from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.detector import Detector, Window
-from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.plugin import Detectability, DetectabilityOptions, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis, Severity
 from daqsvc.diagnosis.recorded import Evaluated, Recorded, RecordedDetector, RecordingOptions, statements_of
@@ -44,6 +44,8 @@ __all__ = [
     "CannotOpenError",
     "Clock",
     "Condition",
+    "Detectability",
+    "DetectabilityOptions",
     "Detector",
     "DetectorPlugin",
     "Device",
@@ -80,6 +82,7 @@ __all__ = [
     "StreamSpec",
     "StreamWords",
     "Text",
+    "UnfitOptionError",
     "Watched",
     "Window",
     "WindowDetector",

@@ -6,23 +6,20 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
-from daqsvc.commands.arguments import EXIT_OK, positive
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, positive
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from daqsvc.rotor.detectability.prediction import Detectability
+    from daqsvc.diagnosis.plugin import DetectorPlugin
     from daqsvc.settings import MachineFile
 
 LEAST_FALSE_ALARMS = 1e-9
 MOST_FALSE_ALARMS = 10.0
 """Per 1000 revolutions: what a machine file may say."""
-
-_FAILED = 1
-_BAD_FILE = 2
 
 
 class DetectabilityCommand:
@@ -85,48 +82,48 @@ class DetectabilityCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `Command.run`."""
-        from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
-
         machine = self._load(arguments.file)
         if machine is None:
-            return _BAD_FILE
-        if wrong := _misuse(machine, arguments):
-            _complain(f"{arguments.file}: {wrong}")
-            return _BAD_FILE
-        machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
-        if machine.pipeline.table(RotorBank) is None:
-            return _tell_vector(machine, arguments)
-        self._prepare_kernel_cache()
-        from daqsvc.commands.detectability_report import as_json, as_text  # noqa: PLC0415
-        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - it brings the kernels' compiler
+            return EXIT_USAGE
+        from daqsvc.diagnosis.plugin import DetectabilityOptions, UnfitOptionError  # noqa: PLC0415 - pydantic
+        from daqsvc.settings.plugins import configured  # noqa: PLC0415 - likewise
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - likewise
 
+        if wrong := _misuse(machine, arguments):
+            return _complain(arguments, wrong, EXIT_USAGE)
+        machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
+        plugin, given = next(
+            (table, given) for _, table, given in configured(machine.pipeline) if _is_predictable(table)
+        )
+        options = DetectabilityOptions(
+            process_noise=arguments.process_noise,
+            noise_um=arguments.noise_um,
+            eccentricity_um=arguments.eccentricity_um,
+        )
+        self._prepare_kernel_cache()
         try:
-            found = _foresee(machine, arguments.process_noise)
+            found = cast("DetectorPlugin[Any]", plugin).detectability(machine, given, options)
+        except UnfitOptionError as error:
+            return _complain(arguments, f"{error}", EXIT_USAGE)
         except (AssemblyError, ValueError) as error:
-            _complain(f"{arguments.file}: {error}")
-            return _FAILED
-        print(json.dumps(as_json(found, machine)) if arguments.json else as_text(found, machine))  # noqa: T201
+            return _complain(arguments, f"{error}", EXIT_FAILED)
+        print(json.dumps(found.json) if arguments.json else found.text)  # noqa: T201 - this is what the verb is for
         return EXIT_OK
+
+
+def _is_predictable(table: object) -> bool:
+    return cast("DetectorPlugin[Any]", table).predictable
 
 
 def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
     """What is wrong with the options for this machine; empty if nothing is."""
-    from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
-    from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous  # noqa: PLC0415 - brings pydantic
+    from daqsvc.settings.plugins import configured, detector_tables  # noqa: PLC0415 - brings pydantic
 
-    pipeline = machine.pipeline
-    if pipeline.table(RotorBank) is None and pipeline.table(RotorSynchronous) is None:
+    if not any(_is_predictable(table) for _, table, _ in configured(machine.pipeline)):
+        known = [f"[pipeline.{key}]" for key, table in detector_tables().items() if _is_predictable(table)]
         return (
-            "there is neither [pipeline.rotor_bank], whose modes could be told apart, nor "
-            "[pipeline.rotor_synchronous]; add one, with [machine.rotor] for the rotor that it watches"
-        )
-    if pipeline.table(RotorBank) is None:
-        if arguments.process_noise is not None:
-            return "--process-noise: there is no [pipeline.rotor_bank] that it belongs to; leave it out"
-    elif arguments.noise_um is not None or arguments.eccentricity_um is not None:
-        return (
-            "--noise-um, --eccentricity-um: pipeline.rotor_bank.noise_um and machine.rotor.eccentricity_um "
-            "say this; leave them out"
+            f"there is neither {' nor '.join(known)}, whose view of a fault could be computed; add one, with "
+            "[machine.rotor] for the rotor that it watches"
         )
     rate = arguments.false_alarms_per_1000_rev
     if rate is not None and not LEAST_FALSE_ALARMS <= rate <= MOST_FALSE_ALARMS:
@@ -137,51 +134,12 @@ def _misuse(machine: MachineFile, arguments: argparse.Namespace) -> str:
     return ""
 
 
-def _tell_vector(machine: MachineFile, arguments: argparse.Namespace) -> int:
-    """Print what the synchronous vector can see."""
-    from daqsvc.commands.detectability_vector import (  # noqa: PLC0415 - it brings NumPy
-        foresee_vector,
-        vector_json,
-        vector_text,
-    )
-
-    try:
-        found = foresee_vector(
-            machine, noise_um=arguments.noise_um, eccentricity_um=arguments.eccentricity_um
-        )
-    except ValueError as error:
-        _complain(f"{arguments.file}: {error}")
-        return _FAILED
-    print(json.dumps(vector_json(found, machine)) if arguments.json else vector_text(found, machine))  # noqa: T201
-    return EXIT_OK
-
-
-def _foresee(machine: MachineFile, process_noise: float | None) -> Detectability:
-    """Detectability of the bank that the service would run for this machine file."""
-    from daqsvc.detectors.make import detectors  # noqa: PLC0415
-    from daqsvc.detectors.rotor_bank.detector import RotorBankDetector  # noqa: PLC0415
-    from daqsvc.detectors.rotor_bank.settings import RotorBank  # noqa: PLC0415 - brings pydantic
-    from daqsvc.rotor.adaptation import VARIANCE_FACTOR  # noqa: PLC0415
-    from daqsvc.rotor.detectability.prediction import detectability  # noqa: PLC0415
-
-    (detector,) = (made for made in detectors(machine) if isinstance(made, RotorBankDetector))
-    bank = machine.pipeline.table(RotorBank)
-    calibrates = bank is not None and bank.calibrate_revolutions > 0
-    return detectability(
-        detector.bank_modes,
-        noise=detector.noise,
-        duration=detector.duration,
-        threshold_nats=detector.rules.thresholds(len(detector.bank_modes)),
-        variance_factor=VARIANCE_FACTOR if calibrates else 1.0,
-        process_noise=process_noise,
-        ac_coupled=machine.ac_coupled,
-    )
-
-
 def _varied(
     machine: MachineFile, speed_rpm: float | None, false_alarms_per_1000_rev: float | None
 ) -> MachineFile:
     """The machine file at another speed or rate of false alarms."""
+    from daqsvc.settings.plugins import configured  # noqa: PLC0415 - brings pydantic
+
     if speed_rpm is not None:
         signed_rpm = math.copysign(speed_rpm, machine.machine.speed_rpm)
         at_speed = machine.machine.model_copy(update={"speed_rpm": signed_rpm})
@@ -189,13 +147,14 @@ def _varied(
     if false_alarms_per_1000_rev is not None:
         update = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev}
         watching = {
-            name: getattr(machine.pipeline, name).model_copy(update=update)
-            for name in ("rotor_bank", "rotor_synchronous")
-            if getattr(machine.pipeline, name) is not None
+            key: given.model_copy(update=update)
+            for key, _, given in configured(machine.pipeline)
+            if update.keys() <= type(given).model_fields.keys()
         }
         machine = machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=watching)})
     return machine
 
 
-def _complain(message: str) -> None:
-    print(message, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+def _complain(arguments: argparse.Namespace, message: str, code: int) -> int:
+    print(f"{arguments.file}: {message}", file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
+    return code

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 from daqsvc.settings.plugins import PipelineTable
 from daqsvc.settings.section import Section
@@ -19,6 +19,36 @@ if TYPE_CHECKING:
 SettingsT = TypeVar("SettingsT", bound=Section)
 
 
+class DetectabilityOptions(NamedTuple):
+    """What ``daqsvc detectability`` is told beside the machine file; None: nothing.
+
+    Attributes:
+        process_noise: how much the machine itself shakes at random, as power spectral density, normalised.
+        noise_um: noise of one probe.
+        eccentricity_um: mass eccentricity.
+    """
+
+    process_noise: float | None = None
+    noise_um: float | None = None
+    eccentricity_um: float | None = None
+
+
+class Detectability(NamedTuple):
+    """What a detector can see of a machine.
+
+    Attributes:
+        json: the figures, as one JSON object.
+        text: the same for a person.
+    """
+
+    json: dict[str, Any]
+    text: str
+
+
+class UnfitOptionError(ValueError):
+    """An option has no meaning for this detector; the message says what to do."""
+
+
 class DetectorPlugin(PipelineTable[SettingsT]):
     """A kind of detector: its table in ``[pipeline]``, and what makes the detectors of it.
 
@@ -26,9 +56,11 @@ class DetectorPlugin(PipelineTable[SettingsT]):
 
     Attributes:
         calibrated: whether ``daqsvc calibrate`` makes a file that ``calibration`` of its table can name.
+        predictable: whether `detectability` is implemented.
     """
 
     calibrated: ClassVar[bool] = False
+    predictable: ClassVar[bool] = False
 
     def build(self, machine: MachineFile, given: SettingsT, store: Path | None) -> Iterable[Detector]:
         """The detectors that the table asks for.
@@ -69,6 +101,23 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         from daqsvc.diagnosis.recorded import RecordedLive  # noqa: PLC0415 - NumPy, which `check` need not
 
         return RecordedLive(machine, given, options, self.build)
+
+    def detectability(
+        self, machine: MachineFile, given: SettingsT, options: DetectabilityOptions
+    ) -> Detectability:
+        """What the detector can tell apart, how soon and from which change on: ``daqsvc detectability``.
+
+        Args:
+            machine: the machine file.
+            given: the table.
+            options: what is said beside it.
+
+        Raises:
+            UnfitOptionError: an option has no meaning here.
+            AssemblyError: no detector can be made of the table.
+            ValueError: something is not known, or cannot be used; the message says what to do.
+        """
+        raise NotImplementedError
 
     def readings(self, machine: MachineFile, given: SettingsT) -> Iterable[Reading]:
         """The figures that are shown by themselves."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated
 
@@ -10,9 +11,10 @@ import pytest
 from pydantic import Field
 from support.machine_files import MACHINES, problems_of
 
+from daqsvc.cli import main
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
-from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.window_detector import Judgement, WindowDetector
 from daqsvc.settings import describe, parse_machine_file, registry
 from daqsvc.settings.problems import AssemblyError, Finding
@@ -190,3 +192,37 @@ def test_sensors_that_are_not_sampled_together_are_refused():
         Peak(machine, "peak", names, 0.5)
     with pytest.raises(AssemblyError, match="detector peak: no sensor 'nosuch'; there are"):
         Peak(machine, "peak", ["nosuch"], 0.5)
+
+
+class Predictable(KurtosisPlugin):
+    predictable = True
+
+    def detectability(self, machine, given, options):
+        if options.process_noise is not None:
+            raise UnfitOptionError("--process-noise: knocks have none; leave it out")
+        if options.noise_um is not None:
+            raise ValueError("accelerometers measure no um")
+        return Detectability({"sensor": given.sensor, "most": given.most}, f"{given.sensor} sees all")
+
+
+def test_what_it_can_see_is_said_by_daqsvc_detectability(installed, tmp_path, capsys):
+    path = tmp_path / "m.toml"
+    path.write_text(text(TABLE))
+
+    def verb(*options):
+        code = main(["detectability", str(path), *options])
+        return code, "".join(capsys.readouterr()).removeprefix(f"{path}: ").rstrip()
+
+    installed(kurtosis=f"{__name__}:KurtosisPlugin")
+    assert verb()[0] == 2
+    installed(kurtosis=f"{__name__}:Predictable")
+    assert verb() == (0, "accel-de sees all")
+    assert json.loads(verb("--json")[1]) == {"sensor": "accel-de", "most": 6.0}
+    assert verb("--process-noise", "1") == (2, "--process-noise: knocks have none; leave it out")
+    assert verb("--noise-um", "1") == (1, "accelerometers measure no um")
+    path.write_text(text())
+    code, said = verb()
+    assert code == 2
+    assert said.startswith(
+        "there is neither [pipeline.rotor_bank] nor [pipeline.rotor_synchronous] nor [pipeline.k"
+    )

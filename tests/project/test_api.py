@@ -15,6 +15,7 @@ NAMES = {
     *("Output", "OutputPlugin", "OutputPort", "OutboxMessage", "Watched", "Condition", "Level"),
     *("MachineFile", "Section", "Bus", "Layout", "PackedLayout", "Stream", "Sensor", "Name", "Text"),
     *("RecordedDetector", "Recorded", "RecordingOptions", "Evaluated", "statements_of"),
+    *("Detectability", "DetectabilityOptions", "UnfitOptionError"),
     *("AssemblyError", "Finding", "StreamWords", "choice"),
 }
 TYPE_ALIASES = {"Name", "Text", "Sensor", "Severity"}

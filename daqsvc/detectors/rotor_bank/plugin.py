@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.detectors.rotor_bank.checks import bank_checks, check_bank_alarm
 from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK, RotorBank
-from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.settings.problems import AssemblyError
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
     from daqsvc.detectors.rotor_bank.recorded import RecordedBank
     from daqsvc.detectors.rotor_bank.settings import Mode
+    from daqsvc.diagnosis.plugin import DetectabilityOptions
     from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import Finding, KeyPath
@@ -29,6 +30,7 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
     about = "the rotor's model bank"
     detector = ROTOR_BANK
     states_speed = True
+    predictable = True
     place = 1
 
     def sampled_together(self, given: RotorBank) -> tuple[str, ...]:
@@ -84,6 +86,21 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         from daqsvc.detectors.rotor_bank.recorded import RecordedBank  # noqa: PLC0415 - brings SciPy
 
         return RecordedBank(machine, given, options)
+
+    def detectability(
+        self, machine: MachineFile, given: RotorBank, options: DetectabilityOptions
+    ) -> Detectability:
+        """See `DetectorPlugin.detectability`."""
+        if options.noise_um is not None or options.eccentricity_um is not None:
+            raise UnfitOptionError(
+                "--noise-um, --eccentricity-um: pipeline.rotor_bank.noise_um and "
+                "machine.rotor.eccentricity_um say this; leave them out"
+            )
+        from daqsvc.detectors.rotor_bank import detectability as bank  # noqa: PLC0415 - brings the compiler
+
+        (detector,) = self.build(machine, given, None)
+        found = bank.bank_detectability(machine, given, detector, options.process_noise)
+        return Detectability(bank.as_json(found, machine), bank.as_text(found, machine))
 
     def readings(self, machine: MachineFile, given: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, get_args
 
 from daqsvc.detectors.rotor_synchronous.checks import synchronous_checks
 from daqsvc.detectors.rotor_synchronous.settings import ROTOR_SYNCHRONOUS, RotorSynchronous
-from daqsvc.diagnosis.plugin import DetectorPlugin
+from daqsvc.diagnosis.plugin import Detectability, DetectorPlugin, UnfitOptionError
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.settings.problems import AssemblyError
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor
     from daqsvc.diagnosis.detector import Detector
+    from daqsvc.diagnosis.plugin import DetectabilityOptions
     from daqsvc.diagnosis.recorded import RecordingOptions
     from daqsvc.rotor.laval import LavalRotor
     from daqsvc.rotor.synchronous.baseline import Calibration
@@ -31,6 +32,7 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
     detector = ROTOR_SYNCHRONOUS
     states_speed = True
     calibrated = True
+    predictable = True
     place = 2
 
     def sampled_together(self, given: RotorSynchronous) -> tuple[str, ...]:
@@ -69,6 +71,21 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
         from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor  # noqa: PLC0415 - brings SciPy
 
         return RecordedRotor(machine, given, options)
+
+    def detectability(
+        self, machine: MachineFile, given: RotorSynchronous, options: DetectabilityOptions
+    ) -> Detectability:
+        """See `DetectorPlugin.detectability`."""
+        if options.process_noise is not None:
+            raise UnfitOptionError(
+                "--process-noise: there is no [pipeline.rotor_bank] that it belongs to; leave it out"
+            )
+        from daqsvc.detectors.rotor_synchronous import detectability as vector  # noqa: PLC0415 - brings NumPy
+
+        found = vector.synchronous_detectability(
+            machine, given, noise_um=options.noise_um, eccentricity_um=options.eccentricity_um
+        )
+        return Detectability(vector.as_json(found, machine, given), vector.as_text(found, machine))
 
     def readings(self, machine: MachineFile, given: RotorSynchronous) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""

@@ -1,4 +1,4 @@
-"""How detectability is told: as one JSON object, and as tables and sentences in the user's units."""
+"""What the rotor bank of a machine can tell apart, before anything breaks, in the machine file's units."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from daqsvc.rotor.adaptation import VARIANCE_FACTOR
+from daqsvc.rotor.detectability.prediction import detectability
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
+    from daqsvc.detectors.rotor_bank.settings import RotorBank
     from daqsvc.rotor.detectability.prediction import Ambiguity, Detectability, PairEvidence, SmallestChange
     from daqsvc.settings import MachineFile
 
@@ -18,6 +23,31 @@ _QUANTITIES = {
     "stiffness_loss": ("stiffness, of the healthy one", "%"),
     "static_load": ("static load, as further sag", "um"),
 }
+
+
+def bank_detectability(
+    machine: MachineFile, given: RotorBank, detector: RotorBankDetector, process_noise: float | None
+) -> Detectability:
+    """Detectability of the bank that the service would run for a machine file.
+
+    Args:
+        machine: the machine file.
+        given: its rotor bank.
+        detector: made of that.
+        process_noise: how much the machine itself shakes at random; None: what the bank says.
+
+    Raises:
+        ValueError: it cannot be computed of these figures.
+    """
+    return detectability(
+        detector.bank_modes,
+        noise=detector.noise,
+        duration=detector.duration,
+        threshold_nats=detector.rules.thresholds(len(detector.bank_modes)),
+        variance_factor=VARIANCE_FACTOR if given.calibrate_revolutions > 0 else 1.0,
+        process_noise=process_noise,
+        ac_coupled=machine.ac_coupled,
+    )
 
 
 def as_json(found: Detectability, machine: MachineFile) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``daqsvc detectability`` of a machine whose rotor is watched by its synchronous vector alone."""
+"""What the synchronous vector can see of a machine's rotor, before anything breaks."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.detectors.rotor_synchronous.build import healthy_rotor
-from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
 from daqsvc.rotor.detectability.vector import stated_calibration, vector_detectability
 from daqsvc.rotor.synchronous.departure import threshold_for
 from daqsvc.rotor.synchronous.vectors import HARMONICS
 
 if TYPE_CHECKING:
+    from daqsvc.detectors.rotor_synchronous.settings import RotorSynchronous
     from daqsvc.rotor.detectability.vector import VectorDetectability, VisibleFault
     from daqsvc.settings import MachineFile
 
@@ -24,21 +24,25 @@ _QUANTITIES = {
 }
 
 
-def foresee_vector(
-    machine: MachineFile, *, noise_um: float | None, eccentricity_um: float | None
+def synchronous_detectability(
+    machine: MachineFile,
+    given: RotorSynchronous,
+    *,
+    noise_um: float | None,
+    eccentricity_um: float | None,
 ) -> VectorDetectability:
     """Detectability of the calibrated rotor that the service would run for a machine file.
 
     Args:
-        machine: the machine file, with ``[pipeline.rotor_synchronous]``.
+        machine: the machine file.
+        given: the table of its calibrated rotor.
         noise_um: standard deviation of one probe's noise, where no calibration tells it.
         eccentricity_um: mass eccentricity, where neither calibration nor machine file tells it.
 
     Raises:
         ValueError: something is not known, or cannot be used; the message says which option tells it.
     """
-    given, rotor_table = machine.pipeline.table(RotorSynchronous), machine.machine.rotor
-    assert given is not None  # noqa: S101 - the command has looked
+    rotor_table = machine.machine.rotor
     assert rotor_table is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]
     threshold_nats = threshold_for(given.false_alarms_per_1000_rev)
     rotor, calibrations = healthy_rotor(machine, given)
@@ -71,15 +75,15 @@ def foresee_vector(
     )
 
 
-def vector_json(found: VectorDetectability, machine: MachineFile) -> dict[str, Any]:
+def as_json(found: VectorDetectability, machine: MachineFile, given: RotorSynchronous) -> dict[str, Any]:
     """The figures; what is never reached is null.
 
     Args:
         found: the figures.
         machine: the machine file that they are for.
+        given: the table of its calibrated rotor.
     """
-    was, given = found.calibration, machine.pipeline.table(RotorSynchronous)
-    assert given is not None  # noqa: S101 - see foresee_vector
+    was = found.calibration
     return {
         "machine": machine.machine.name,
         "speed_rpm": math.copysign(was.speed_rpm, machine.machine.speed_rpm),
@@ -118,7 +122,7 @@ def vector_json(found: VectorDetectability, machine: MachineFile) -> dict[str, A
     }
 
 
-def vector_text(found: VectorDetectability, machine: MachineFile) -> str:
+def as_text(found: VectorDetectability, machine: MachineFile) -> str:
     """Tables and sentences for a person.
 
     Args:
