@@ -70,14 +70,11 @@ class CheckCommand:
             return EXIT_USAGE
         kernel_cache.prepare()
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
+        from daqsvc.publish.make import check_outputs  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
-        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415
 
-        try:
-            check_files(machine)
-        except AssemblyError as error:
-            print(error, file=sys.stderr)  # noqa: T201 - errors of the command line go to stderr
-            return EXIT_USAGE
+        check_files(machine)
+        check_outputs(machine)
         print(describe(machine))  # noqa: T201 - this is what the verb is for
         return EXIT_OK
 
@@ -179,6 +176,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError):
             print(f"daqsvc: {error.strerror}: the output is not complete", file=sys.stderr)  # noqa: T201
         return EXIT_FAILED
+    except Exception as error:
+        from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - with all that reads machine files
+
+        if not isinstance(error, AssemblyError):
+            raise
+        print(error, file=sys.stderr)  # noqa: T201
+        return EXIT_USAGE
     return code
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.acquisition.standing import tell_nobody
-from daqsvc.settings.problems import AssemblyError, mend_or_remove, raised
+from daqsvc.settings.hooks import failing_in
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.registry import bus_tables, driver_of_layout
 from drivers.base import BusOptionError, BusPort, StreamSpec
-from drivers.frames import LayoutError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -75,14 +75,10 @@ def bus_driver(
     bus = machine.buses[name]
     plugin = cast("DriverPlugin[Any]", bus_tables()[bus.driver])
     try:
-        return plugin.build(plugin.absolute(machine, bus), bus_port(machine, name, clock, deliver, tell))
+        with failing_in(machine.path, f"buses.{name}"):
+            return plugin.build(plugin.absolute(machine, bus), bus_port(machine, name, clock, deliver, tell))
     except BusOptionError as error:
         raise AssemblyError(f"{machine.path}: buses.{name}: {error}") from error
-    except (AssemblyError, LayoutError):
-        raise
-    except Exception as error:
-        said = f"{raised(error, plugin, 'build')}; {mend_or_remove(f'buses.{name}')}"
-        raise AssemblyError(f"{machine.path}: buses.{name}: {said}") from error
 
 
 def bus_port(

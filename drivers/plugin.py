@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from daqsvc.settings.buses import Bus, Layout
+from daqsvc.settings.hooks import contract, may_raise
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.plugins import BusTable
 from daqsvc.settings.problems import AssemblyError
-from drivers.frames import FrameLayout
+from drivers.base import BusOptionError
+from drivers.frames import FrameLayout, LayoutError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,12 +25,14 @@ BusT = TypeVar("BusT", bound=Bus)
 LayoutT = TypeVar("LayoutT", bound=Layout)
 
 
+@contract
 class DriverPlugin(BusTable, Generic[BusT]):
     """A kind of driver: the models of its tables, and what makes the driver of a bus.
 
     Importing one must be cheap: what brings kernels is imported when a driver is made.
     """
 
+    @may_raise(AssemblyError, LayoutError)
     def stream_layout(self, machine: MachineFile, stream: str) -> Any:
         """The layout of a stream as the driver decodes it, straight to the physical units of its sensors.
 
@@ -45,11 +49,13 @@ class DriverPlugin(BusTable, Generic[BusT]):
             raise AssemblyError(f"{machine.path}: streams.{stream}.layout: no driver decodes {layout.kind}")
         return packed_layout(in_units(layout, machine, stream), layout.frame_bytes)
 
+    @may_raise(AssemblyError, BusOptionError, LayoutError)
     def absolute(self, machine: MachineFile, bus: BusT) -> BusT:
         """The table of a bus with its paths made absolute; they are relative to the machine file."""
         del machine
         return bus
 
+    @may_raise(AssemblyError, BusOptionError, LayoutError)
     def build(self, bus: BusT, port: BusPort) -> Driver:
         """The driver of a bus. Making it opens nothing.
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
+from daqsvc.settings.hooks import failing_in
 from daqsvc.settings.plugins import configured
-from daqsvc.settings.problems import AssemblyError, mend_or_remove, raised
+from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,7 +36,7 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
     """
     made: dict[str, Detector] = {}
     for plugin, given in plugins(machine):
-        with _naming(machine, plugin, "build"):
+        with failing_in(machine.path):
             built = list(plugin.build(machine, given, store))
         for detector in built:
             if detector.name in made:
@@ -57,19 +57,6 @@ def check_files(machine: MachineFile) -> None:
     Raises:
         AssemblyError: one cannot, or is not, or a plugin fails; the message names file, key and remedy.
     """
-    for plugin, given in plugins(machine):
-        with _naming(machine, plugin, "check_files"):
+    with failing_in(machine.path):
+        for plugin, given in plugins(machine):
             plugin.check_files(machine, given)
-
-
-@contextmanager
-def _naming(machine: MachineFile, plugin: DetectorPlugin[Any], part: str) -> Iterator[None]:
-    """Whatever a plugin raises becomes an `AssemblyError` that names its table."""
-    try:
-        yield
-    except AssemblyError:
-        raise
-    except Exception as error:
-        table = next(f"pipeline.{key}" for key, one, _ in configured(machine.pipeline) if one is plugin)
-        said = f"{raised(error, plugin, part)}; {mend_or_remove(table)}"
-        raise AssemblyError(f"{machine.path}: {table}: {said}") from error

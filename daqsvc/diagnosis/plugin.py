@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
+from daqsvc.settings.hooks import contract, may_raise
 from daqsvc.settings.plugins import PipelineTable
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ class UnfitOptionError(ValueError):
     """An option has no meaning for this detector; the message says what to do."""
 
 
+@contract
 class DetectorPlugin(PipelineTable[SettingsT]):
     """A kind of detector: its table in ``[pipeline]``, and what makes the detectors of it.
 
@@ -62,6 +65,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
     calibrated: ClassVar[bool] = False
     predictable: ClassVar[bool] = False
 
+    @may_raise(AssemblyError)
     def build(self, machine: MachineFile, given: SettingsT, store: Path | None) -> Iterable[Detector]:
         """The detectors that the table asks for.
 
@@ -75,6 +79,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         """
         raise NotImplementedError
 
+    @may_raise(AssemblyError)
     def check_files(self, machine: MachineFile, given: SettingsT) -> None:
         """See whether what the table names beside the machine file can be used.
 
@@ -82,6 +87,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
             AssemblyError: it cannot; the message names file, key, value and remedy.
         """
 
+    @may_raise(AssemblyError, ValueError)
     def recorded(
         self, machine: MachineFile, given: SettingsT, options: RecordingOptions
     ) -> RecordedDetector[Any]:

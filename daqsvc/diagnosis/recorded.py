@@ -12,7 +12,9 @@ import numpy as np
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.diagnosis.detector import Window
 from daqsvc.dsp.quality.unit import UM_PER_UNIT
+from daqsvc.settings.hooks import Hooks, contract, may_raise
 from daqsvc.settings.models import ProximityProbe
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
@@ -142,7 +144,8 @@ class Evaluated:
     draw: Callable[[str], object] | None = None
 
 
-class RecordedDetector(Generic[SettingsT]):
+@contract
+class RecordedDetector(Hooks, Generic[SettingsT]):
     """A detector of a machine file over recordings of its machine.
 
     Args:
@@ -199,6 +202,7 @@ class RecordedDetector(Generic[SettingsT]):
         del recording, why
         return None
 
+    @may_raise(AssemblyError, ValueError)
     def evaluate(self, recorded: Recorded, given: SettingsT, progress: Progress | None) -> Evaluated:
         """Process a recording.
 

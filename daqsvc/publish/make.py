@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 from daqsvc.alarms.expected import handling_conditions
@@ -10,8 +11,8 @@ from daqsvc.detectors.make import plugins
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.publish.output import OutputSet, Watched
 from daqsvc.settings.alarms import DiagnosisAlarm
+from daqsvc.settings.hooks import PluginFailedError, failing_in
 from daqsvc.settings.plugins import configured_outputs, output_tables
-from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -37,21 +38,19 @@ def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSe
         conditions: names of what the service may say of itself, outputs aside.
     """
     installed, given = output_plugins(), {path: given for path, _, given in configured_outputs(machine)}
-    own = tuple(name for path in given for name in installed[path].conditions(given[path]))
+    own: list[str] = []
+    for path, table in tuple(given.items()):
+        with _left_out(given, path):
+            own += installed[path].conditions(table)
     outdated = [plugin.outdated for path, plugin in installed.items() if path not in given]
 
     def make(port: OutputPort) -> dict[str, Output]:
         made: dict[str, Output] = {}
-        for path, table in given.items():
-            try:
+        for path, table in tuple(given.items()):
+            with _left_out(given, path):
                 output = installed[path].build(machine, table, port)
-            except AssemblyError:
-                raise
-            except Exception as error:  # noqa: BLE001  whatever a plugin does, the machine is watched
-                log.error("output %s cannot be made and is left out: %s", path, error)  # noqa: TRY400
-                continue
-            if output is not None:
-                made[path] = output
+                if output is not None:
+                    made[path] = output
         return made
 
     mqtt = machine.output(Mqtt)
@@ -59,9 +58,31 @@ def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSe
         watched=watched(machine, (*conditions, *own)),
         make=make,
         topic_root=Mqtt.model_fields["topic_root"].default if mqtt is None else mqtt.topic_root,
-        conditions=own,
+        conditions=tuple(own),
         outdated={prefix: words for each in outdated for prefix, words in each.items()},
     )
+
+
+@contextmanager
+def _left_out(given: dict[str, Any], path: str) -> Iterator[None]:
+    """Go on without an output that fails: whatever a plugin does, the machine is watched."""
+    try:
+        yield
+    except PluginFailedError as failed:
+        del given[path]
+        log.error("output %s cannot be made and is left out: %s", path, failed)  # noqa: TRY400
+
+
+def check_outputs(machine: MachineFile) -> None:
+    """Ask the plugins all that they are asked before an output is made.
+
+    Raises:
+        AssemblyError: one fails.
+    """
+    with failing_in(machine.path):
+        for path, _, given in configured_outputs(machine):
+            tuple(output_plugins()[path].conditions(given))
+        watched(machine)
 
 
 def watched(machine: MachineFile, conditions: Iterable[str] = ()) -> Watched:

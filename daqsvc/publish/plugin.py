@@ -5,7 +5,9 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
+from daqsvc.settings.hooks import contract, may_raise
 from daqsvc.settings.plugins import OutputTable
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
 SettingsT = TypeVar("SettingsT", bound=Section)
 
 
+@contract
 class OutputPlugin(OutputTable[SettingsT]):
     """A kind of output: its table in the machine file, and what makes the output of it.
 
@@ -36,6 +39,7 @@ class OutputPlugin(OutputTable[SettingsT]):
         del given
         return ()
 
+    @may_raise(AssemblyError)
     def build(self, machine: MachineFile, given: SettingsT, port: OutputPort) -> Output | None:
         """The output; None for one that another output takes with it. Making it opens nothing.
 

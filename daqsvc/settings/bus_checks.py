@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from daqsvc.settings.problems import Finding, choice, mend_or_remove, raised
+from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.registry import broken_drivers, bus_tables
 from daqsvc.settings.section import UnusableValueError
 
@@ -33,16 +33,11 @@ def check_devices(draft: MachineFile) -> Iterator[Finding]:
     """No device belongs to two buses."""
     owners: dict[object, str] = {}
     for name, bus in draft.buses.items():
-        try:
+        with suppress(UnusableValueError):
             device = bus.device
             owner = name if device is None else owners.setdefault(device.identity, name)
-        except UnusableValueError:
-            continue
-        except Exception as error:  # noqa: BLE001  whatever a plugin does, the rest is checked
-            yield Finding(("buses", name), raised(error, bus, "device"), mend_or_remove(f"buses.{name}"))
-            continue
-        if device is not None and owner != name:
-            yield Finding(("buses", name, device.key), f'belongs to bus "{owner}" already', device.remedy)
+            if device is not None and owner != name:
+                yield Finding(("buses", name, device.key), f'belongs to bus "{owner}" already', device.remedy)
 
 
 def check_unused(draft: MachineFile) -> Iterator[Finding]:

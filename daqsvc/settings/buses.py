@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
+from daqsvc.settings.hooks import Hooks, contract
 from daqsvc.settings.section import Name, Section, UnusableValueError
 
 StartPolicy = Literal["error", "retry", "ignore"]
@@ -30,7 +31,8 @@ class Device(NamedTuple):
     remedy: str
 
 
-class Bus(Section):
+@contract
+class Bus(Hooks, Section):
     """A bus; each driver has its own kind, or several, with its options as fields.
 
     `kind` says what it is called in messages, e.g. ``"a CAN bus"``.
@@ -94,7 +96,8 @@ class Block(NamedTuple):
     buffer_bytes: int
 
 
-class Layout(Section):
+@contract
+class Layout(Hooks, Section):
     """Where the samples of a stream lie in what comes over its bus; each driver has its own kinds."""
 
     mark: ClassVar[str] = ""

@@ -7,7 +7,6 @@ where it asks for a value that is not (`UnusableValueError`): one mistake never 
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
@@ -23,7 +22,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
-from daqsvc.settings.problems import Finding, mend_or_remove, raised
+from daqsvc.settings.problems import Finding, mend_or_remove
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
@@ -35,8 +34,9 @@ from daqsvc.settings.sensor_checks import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
+    from daqsvc.settings.hooks import PluginFailedError
     from daqsvc.settings.models import MachineFile, Stream
     from daqsvc.settings.plugins import BusTable
     from daqsvc.settings.problems import KeyPath
@@ -62,6 +62,33 @@ def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
     return findings
 
 
+def failure(draft: MachineFile, failed: PluginFailedError) -> Finding:
+    """A hook that fails, at the table that it was asked about; a warning where the file has no such table."""
+    at = next(_places(draft, failed), ())
+    table = at[:2] if at[:1] in {("buses",), ("streams",)} else at
+    remedy = mend_or_remove(type(failed.by), dotted(table))
+    return Finding(at, failed.said, remedy, fatal=bool(at))
+
+
+def _places(draft: MachineFile, failed: PluginFailedError) -> Iterator[KeyPath]:
+    """Where a plugin stands, or one of its tables."""
+    by = failed.by
+    if by.__table__:
+        yield tuple(by.__table__.split("."))
+    if failed.at is not None:
+        yield failed.at
+    with suppress(UnusableValueError):
+        for name, bus in draft.buses.items():
+            with suppress(UnusableValueError):
+                if bus is by or bus_tables().get(bus.driver) is by:
+                    yield "buses", name
+    with suppress(UnusableValueError):
+        for name, stream in draft.streams.items():
+            with suppress(UnusableValueError):
+                if stream.layout is by or driver_of_layout(stream.layout) is by:
+                    yield "streams", name, "layout"
+
+
 def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[Finding]]:
     """Every check with what it is about."""
     with suppress(UnusableValueError):
@@ -69,52 +96,29 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
             at: KeyPath = ("streams", name)
             yield check_stream_bus(draft, stream, at)
             for plugin in _drivers_of(draft, stream):
-                checks = partial(plugin.stream_checks, draft, stream, facts.get(name), at)
-                yield from _of_plugin(plugin, "stream_checks", checks, at)
+                with suppress(UnusableValueError):
+                    yield from plugin.stream_checks(draft, stream, facts.get(name), at)
             with suppress(UnusableValueError):
                 yield check_channels(stream.layout, (*at, "layout"))
     yield check_unused(draft)
     yield check_drivers(draft)
     yield check_devices(draft)
     for plugin in _drivers(draft):
-        bus = _bus_of(draft, plugin)
-        yield from _of_plugin(plugin, "checks", partial(plugin.checks, draft, facts), bus)
+        with suppress(UnusableValueError):
+            yield from plugin.checks(draft, facts)
     yield from _sensor_checks(draft, facts)
     yield check_memory(draft)
     yield _names(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
-        for key, detector, given in configured(draft.pipeline, valid_only=True):
-            checks = partial(detector.checks, draft, given)
-            yield from _of_plugin(detector, "checks", checks, ("pipeline", key))
+        for _, detector, given in configured(draft.pipeline, valid_only=True):
+            with suppress(UnusableValueError):
+                yield from detector.checks(draft, given)
     yield from alignment_checks(draft)
     yield from alarm_checks(draft)
-    for path, output, given in configured_outputs(draft, valid_only=True):
-        checks = partial(output.checks, draft, given)
-        yield from _of_plugin(output, "checks", checks, tuple(path.split(".")))
-
-
-def _of_plugin(
-    plugin: object, part: str, checks: Callable[[], Iterator[Iterator[Finding]]], at: KeyPath
-) -> Iterator[Iterator[Finding]]:
-    """The checks of a plugin; one that fails is a finding about its table, and costs no other."""
-    remedy = mend_or_remove(dotted(at))
-
-    def each(found: Iterator[Finding]) -> Iterator[Finding]:
-        try:
-            yield from found
-        except UnusableValueError:
-            return
-        except Exception as error:  # noqa: BLE001  whatever a plugin does, the rest is checked
-            yield Finding(at, raised(error, plugin, part), remedy)
-
-    try:
-        for found in checks():
-            yield each(found)
-    except UnusableValueError:
-        return
-    except Exception as error:  # noqa: BLE001  see above
-        yield iter([Finding(at, raised(error, plugin, part), remedy)])
+    for _, output, given in configured_outputs(draft, valid_only=True):
+        with suppress(UnusableValueError):
+            yield from output.checks(draft, given)
 
 
 def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
@@ -127,13 +131,6 @@ def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:
         if not any(plugin is not None and type(stream.layout) in plugin.layouts for plugin in used):
             used.add(driver_of_layout(stream.layout))
     return [plugin for plugin in bus_tables().values() if plugin in used]
-
-
-def _bus_of(draft: MachineFile, plugin: BusTable) -> KeyPath:
-    """Where the first bus of a driver stands."""
-    with suppress(UnusableValueError):
-        return next((("buses", name) for name, bus in draft.buses.items() if type(bus) in plugin.buses), ())
-    return ()
 
 
 def _drivers(draft: MachineFile) -> list[BusTable]:

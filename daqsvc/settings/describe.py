@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from daqsvc.settings.alarms import LevelAlarm, SetpointAlarm
+from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.plugins import (
     StreamWords,
     bus_tables,
@@ -16,7 +17,6 @@ from daqsvc.settings.plugins import (
     driver_of_layout,
     output_tables,
 )
-from daqsvc.settings.problems import raised
 from daqsvc.settings.sensors import Accelerometer, Keyphasor, ProximityProbe, TrendValue
 
 if TYPE_CHECKING:
@@ -82,16 +82,16 @@ def _identity(machine: MachineFile) -> Iterator[tuple[str, str]]:
 def _bus(machine: MachineFile, name: str) -> str:
     bus = machine.buses[name]
     plugin = bus_tables()[bus.driver]
-    words = _words(plugin, "describe_bus", partial(plugin.describe_bus, machine, name))
+    words = _words(partial(plugin.describe_bus, machine, name))
     return f"{words}; if absent at start: {bus.start}"
 
 
-def _words(plugin: object, part: str, say: Callable[[], str]) -> str:
+def _words(say: Callable[[], str]) -> str:
     """What a plugin says of its table; if that fails, why."""
     try:
         return str(say())
-    except Exception as error:  # noqa: BLE001  whatever a plugin does, the rest is shown
-        return raised(error, plugin, part)
+    except PluginFailedError as failed:
+        return failed.said
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
@@ -108,8 +108,8 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
     plugin = driver_of_layout(stream.layout)
     try:
         words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
-    except Exception as error:  # noqa: BLE001  see `_words`
-        words = StreamWords(frame=raised(error, plugin, "describe_stream"))
+    except PluginFailedError as failed:
+        words = StreamWords(frame=failed.said)
     rate = f"{stream.rate_hz:g} Hz"
     return name, stream.bus, words.frame_id, rate, words.frames, words.frame, words.counter, words.share
 
@@ -157,7 +157,7 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
         yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
     for key, plugin, given in configured(pipeline):
-        yield plugin.detector or key, _words(plugin, "describe", partial(plugin.describe, machine, given))
+        yield plugin.detector or key, _words(partial(plugin.describe, machine, given))
 
 
 _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband and delays")
@@ -197,7 +197,7 @@ def _limits(low: float | None, high: float | None, unit: str) -> str:
 
 def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
     told = [
-        (path, _words(plugin, "describe", partial(plugin.describe, machine, given)))
+        (path, _words(partial(plugin.describe, machine, given)))
         for path, plugin, given in configured_outputs(machine)
     ]
     for path, plugin in output_tables().items():

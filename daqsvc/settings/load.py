@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from daqsvc.settings.checks import check
+from daqsvc.settings.checks import check, failure
 from daqsvc.settings.error_messages import ErrorFormatter, dotted, is_secret, suggested_key
 from daqsvc.settings.files import UnreadableFileError, read_bounded
+from daqsvc.settings.hooks import collecting
 from daqsvc.settings.locate import Spot
 from daqsvc.settings.models import MachineFile, Origin, machine_file_model
 from daqsvc.settings.problems import Finding, MachineFileError, Problem
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from pydantic_core import ErrorDetails
 
+    from daqsvc.settings.hooks import PluginFailedError
     from daqsvc.settings.problems import KeyPath
 
 _MASK = '"***"'
@@ -82,9 +84,11 @@ def parse_machine_file(text: str, path: Path) -> MachineFile:
         raise MachineFileError([Problem(path, error.line, "", "", str(error), error.remedy)]) from None
     reading = _Reading(document, spots, path)
     reading.leave_out_broken()
-    draft = reading.validate()
-    facts = _read_files(draft, path, reading.findings)
-    reading.findings += check(draft, facts)
+    with collecting() as failures:
+        draft = reading.validate()
+        facts = _read_files(draft, path, reading.findings)
+        reading.findings += check(draft, facts)
+    reading.take(draft, failures)
     problems, warnings = reading.problems()
     if problems:
         raise MachineFileError(problems)
@@ -100,6 +104,7 @@ class _Reading:
         self._path = path
         self._written_as: dict[KeyPath, str] = {}
         self._lacks_detector = False
+        self._undecided: set[str] = set()
         self.findings: list[Finding] = []
 
     def leave_out_broken(self) -> None:
@@ -114,6 +119,13 @@ class _Reading:
                     remedy = f"install the package that brings it again, or remove [{name}]"
                     self.findings.append(Finding(path, why, remedy))
                     self._lacks_detector |= path[0] == "pipeline"
+
+    def take(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:
+        """Take in what plugins have failed at, of the file or what is valid of it."""
+        for failed in failures:
+            self.findings.append(failure(draft, failed))
+            if failed.hook == "layout_of":
+                self._undecided |= {name for name, plugin in bus_tables().items() if plugin is failed.by}
 
     def validate(self) -> MachineFile:
         """Check every value for itself; returns the file, or what is valid of it."""
@@ -172,8 +184,9 @@ class _Reading:
             match path:
                 case ("streams", stream, "layout", *_):
                     bus = value_at(self._document, ("streams", stream, "bus"))
-                    if value_at(self._document, ("buses", bus, "driver")) not in broken_drivers():
-                        return False
+                    driver = value_at(self._document, ("buses", bus, "driver"))
+                    if driver not in broken_drivers():
+                        return driver in self._undecided
                     layout = value_at(self._document, path[:3])
                     kinds = {kind for plugin in bus_tables().values() for kind in plugin.layouts}
                     return not any(kind.mark and kind.mark in layout for kind in kinds)

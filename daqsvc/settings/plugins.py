@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 
 from daqsvc.settings import registry
 from daqsvc.settings.buses import UnknownBus
+from daqsvc.settings.hooks import contract
 from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
 from daqsvc.settings.packing import PackedLayout
 from daqsvc.settings.problems import Finding
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 SettingsT = TypeVar("SettingsT", bound=Section)
 
 
+@contract
 class PipelineTable(DetectorKind[SettingsT]):
     """What a detector says of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector."""
 
@@ -57,6 +59,7 @@ class PipelineTable(DetectorKind[SettingsT]):
         return ", ".join(f"{key} {value}" for key, value in given)
 
 
+@contract
 class OutputTable(OutputKind[SettingsT]):
     """What an output says of its table; `daqsvc.publish.plugin` adds the output.
 
@@ -102,6 +105,7 @@ class StreamWords(NamedTuple):
     share: str = ""
 
 
+@contract
 class BusTable(DriverKind):
     """What a driver says of its buses and layouts; `drivers.plugin` adds the driver."""
 

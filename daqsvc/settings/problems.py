@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -84,15 +84,18 @@ class AssemblyError(Exception):
     """A machine file that is sound by itself asks for something that is not there, or cannot be made."""
 
 
-def raised(error: Exception, by: object, part: str) -> str:
+packages: dict[str, str] = {}
+"""By the top-level module of a plugin, the distribution that brings it, with its version."""
+
+
+def raised(error: Exception, kind: type[Any], part: str) -> str:
     """What code of a plugin has raised, in words for its author, with the line of the plugin's file.
 
     Args:
         error: as it was caught.
-        by: the plugin, or one of its tables.
-        part: the method or property that was asked.
+        kind: class of the plugin, or of one of its tables.
+        part: what of it was asked.
     """
-    kind = type(by)
     home = getattr(sys.modules.get(kind.__module__), "__file__", None)
     frames = traceback.extract_tb(error.__traceback__)
     place = next((frame for frame in reversed(frames) if frame.filename == home), frames[-1])
@@ -101,9 +104,16 @@ def raised(error: Exception, by: object, part: str) -> str:
     return f"{part} of {kind.__module__}.{kind.__qualname__} has failed: {said} ({where})"
 
 
-def mend_or_remove(table: str) -> str:
-    """A remedy for a plugin that fails: the table of it; empty if none is known."""
-    return "have the package that brings it mended" + (f", or remove [{table}]" if table else "")
+def mend_or_remove(kind: type[Any], table: str = "") -> str:
+    """Who can put right a plugin that fails, and how to do without it.
+
+    Args:
+        kind: class of the plugin, or of one of its tables.
+        table: what to remove, as people write it; empty if that is not known.
+    """
+    home = kind.__module__.partition(".")[0]
+    remedy = f"have the authors of {packages.get(home, f'the package of {home}')} mend it"
+    return f"{remedy}, or remove [{table}]" if table else remedy
 
 
 def choice(wanted: str, known: Iterable[str]) -> str:

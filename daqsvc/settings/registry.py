@@ -7,22 +7,24 @@ The plugins are looked for when a file is read, not when the models are imported
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from pydantic import Field, create_model
 
 from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
+from daqsvc.settings.hooks import Hooks, PluginFailedError, brought_by, contract
 from daqsvc.settings.pipeline import Pipeline
 from daqsvc.settings.schema import forget_homes
 from daqsvc.settings.section import Kinds, Section, UnusableValueError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from importlib.metadata import EntryPoint
     from pathlib import Path
 
@@ -42,8 +44,21 @@ _with_outputs: dict[type[Section], type[Any]] = {}
 
 SettingsT = TypeVar("SettingsT", bound=Section)
 
+_ALLOWED: Final[Mapping[type[Any], Any]] = MappingProxyType(
+    {
+        int: int | float,
+        str: str,
+        bool: bool,
+        tuple: tuple | list,
+        MappingProxyType: Mapping,
+        NoneType: str | None,
+    }
+)
+"""What an attribute of a plugin may be, by what it is in its contract."""
 
-class DetectorKind(Generic[SettingsT]):
+
+@contract
+class DetectorKind(Hooks, Generic[SettingsT]):
     """What a detector says of its table in ``[pipeline]`` to have it read; `PipelineTable` adds to it.
 
     Attributes:
@@ -71,7 +86,8 @@ class DetectorKind(Generic[SettingsT]):
         return ()
 
 
-class OutputKind(Generic[SettingsT]):
+@contract
+class OutputKind(Hooks, Generic[SettingsT]):
     """What an output says of its table in the machine file to have it read; `OutputTable` adds to it.
 
     Attributes:
@@ -85,7 +101,8 @@ class OutputKind(Generic[SettingsT]):
     place: ClassVar[int] = 100
 
 
-class DriverKind:
+@contract
+class DriverKind(Hooks):
     """What a driver says of its buses and layouts to have them read; `BusTable` adds to it.
 
     Attributes:
@@ -146,7 +163,7 @@ def _installed(group: str, what: str, contract: type[Any]) -> _Installed:
     for point in entry_points(group=group):
         try:
             found[point.name] = _made(point, what, contract)
-        except Exception as error:  # noqa: BLE001  whatever a plugin does when it is imported
+        except (Exception, SystemExit) as error:  # noqa: BLE001  whatever a plugin does when it is imported
             broken[point.name] = f"the {what} cannot be loaded from {point.value}: {error}"
     ordered = sorted(found.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
@@ -159,7 +176,32 @@ def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
     needed = "buses" if contract is DriverKind else "settings"
     if not getattr(plugin, needed, None):
         raise TypeError(f"{plugin.__name__} does not say its {needed}")
-    return plugin()
+    _fits(plugin)
+    made = plugin()
+    home = "the package that brings it"
+    package = home if point.dist is None else f"{point.dist.name} {point.dist.version}"
+    table = {DetectorKind: f"pipeline.{point.name}", OutputKind: point.name}.get(contract, "")
+    brought_by(made, package, table)
+    return made
+
+
+def _fits(plugin: type[Any]) -> None:
+    """See that what a plugin says in attributes is of the kind that its contract says it in.
+
+    Raises:
+        TypeError: it is not.
+    """
+    tables = [(kind, one) for kind in ("buses", "layouts") for one in getattr(plugin, kind, ())]
+    tables += [("settings", plugin.settings)] if hasattr(plugin, "settings") else []
+    for name, table in tables:
+        kind = {"buses": Bus, "layouts": Layout, "settings": Section}[name]
+        if not (isinstance(table, type) and issubclass(table, kind)):
+            raise TypeError(f"{name} of {plugin.__name__} holds {table!r}, which is no {kind.__name__}")
+    for declared in (one for one in plugin.__mro__ if "__hooks__" in vars(one)):
+        for name, usual in vars(declared).items():
+            given, allowed = getattr(plugin, name, usual), _ALLOWED.get(type(usual))
+            if allowed is not None and not name.startswith("_") and not isinstance(given, allowed):
+                raise TypeError(f"{name} of {plugin.__name__} is {given!r}: write what {name} = {usual!r} is")
 
 
 def forget() -> None:
@@ -207,10 +249,12 @@ def driver_of_layout(layout: Layout) -> DriverKind | None:
 
 def _bus_kind(table: Mapping[str, Any]) -> type[Bus]:
     drivers = bus_tables()
-    driver = table.get("driver")
-    if isinstance(driver, str):
-        return drivers[driver].bus_of(table) if driver in drivers else UnknownBus
-    return next(iter(drivers.values())).bus_of(table) if drivers else UnknownBus
+    given = table.get("driver")
+    name = given if isinstance(given, str) else next(iter(drivers), "")
+    with suppress(PluginFailedError):  # it is a finding, and nobody knows what the table may hold
+        if name in drivers:
+            return drivers[name].bus_of(table)
+    return UnknownBus
 
 
 def _bus_kinds() -> tuple[type[Bus], ...]:
@@ -220,9 +264,10 @@ def _bus_kinds() -> tuple[type[Bus], ...]:
 def _layout_kind(table: Mapping[str, Any]) -> type[Layout]:
     # The first driver comes last: it takes what no mark is in.
     for plugin in reversed(tuple(bus_tables().values())):
-        layout = plugin.layout_of(table)
-        if layout is not None:
-            return layout
+        with suppress(PluginFailedError):  # it is a finding, and others are asked
+            layout = plugin.layout_of(table)
+            if layout is not None:
+                return layout
     kinds = _layout_kinds()
     return kinds[0] if kinds else UnknownLayout
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError, core_schema
+
+from daqsvc.settings.problems import mend_or_remove, raised
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -73,6 +75,20 @@ class Section(BaseModel):
 
     kind: ClassVar[str] = ""
     """What this table is called in messages, where one key can hold tables of several kinds."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _whatever_validators_do(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """Have validators of a plugin's table that fail say so of the table, and cost no other."""
+        try:
+            return validate(value)
+        except (ValueError, AssertionError):  # it is not valid, which validators say so
+            raise
+        except Exception as error:
+            said, remedy = raised(error, cls, "a validator"), mend_or_remove(cls)
+            raise PydanticCustomError(
+                "validator_failed", "{said}", {"said": said, "remedy": remedy}
+            ) from error
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist
 

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Never
+from unittest.mock import MagicMock
 
 import pytest
 from pydantic import field_validator
 from support.example_packages import DETECTOR, DRIVER, OUTPUT, installed
 from support.machine_files import MOTOR, problems_of
 
+import daqsvc
 from daqsvc.acquisition.clock import SystemClock
+from daqsvc.api import Bus, DetectorPlugin, DriverPlugin, OutputPlugin
+from daqsvc.cli import main
 from daqsvc.detectors.make import check_files, detectors
-from daqsvc.settings import describe, parse_machine_file, registry
+from daqsvc.publish.make import output_set, watched
+from daqsvc.service import Service
+from daqsvc.settings import describe, hooks, parse_machine_file, registry
 from daqsvc.settings.problems import AssemblyError
 from drivers.make import bus_drivers
 
@@ -37,44 +45,214 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
     ]
     for site in sites:
         next(site)
+    states_speed = {"crest": ("speed",)}
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "start_up_signals", lambda *_: states_speed)
     yield
     for site in reversed(sites):
         next(site, None)
 
 
-def break_(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Have ``module.Class.method`` raise, or a property of that name."""
+BROUGHT = {
+    "tcp_frames.LoggerPlugin": "daqsvc-tcp-frames 1.0",
+    "tcp_frames.LoggerBus": "daqsvc-tcp-frames 1.0",
+    "daqsvc.settings.packing.PackedLayout": f"daqsvc {daqsvc.__version__}",
+    "crest.CrestPlugin": "daqsvc-crest 1.0",
+    "daqsvc.diagnosis.recorded.RecordedLive": f"daqsvc {daqsvc.__version__}",
+    "event_file.EventFilePlugin": "daqsvc-event-file 1.0",
+    "daqsvc.publish.home_assistant.plugin.HomeAssistantPlugin": f"daqsvc {daqsvc.__version__}",
+}
+"""For every contract of plugins something that keeps it, and the distribution that brings this."""
+NOT_ASKED = {
+    ("daqsvc.settings.packing.PackedLayout", "polled"): "where a trend is taken of it",
+    ("daqsvc.diagnosis.recorded.RecordedLive", "sensors"): "where it gives a verdict",
+    ("daqsvc.diagnosis.recorded.RecordedLive", "not_judged"): "likewise",
+    ("daqsvc.publish.home_assistant.plugin.HomeAssistantPlugin", "build"): "by nobody: it is a link",
+}
+"""What this machine file has no use for."""
+WHOLE = f"""
+{TABLES}
+[mqtt]
+url = "mqtt://127.0.0.1"
+insecure = true
+[mqtt.home_assistant]
+[[alarms]]
+name = "knocks"
+detector = "crest"
+[alarm_handling.start_up]
+detector = "crest"
+measure = "speed"
+between = [100.0, 1000.0]
+"""
 
-    def failing(*_: Any) -> Never:
-        raise KeyError("no such thing")
 
-    module, kind, part = name.split(".")
-    owner = getattr(importlib.import_module(module), kind)
-    monkeypatch.setattr(owner, part, property(failing) if kind.endswith("Bus") else failing)
+def contracts(kind: type[hooks.Hooks] = hooks.Hooks) -> Iterator[type[hooks.Hooks]]:
+    for derived in kind.__subclasses__():
+        if "__hooks__" in vars(derived):
+            yield derived
+        yield from contracts(derived)
+
+
+def class_at(name: str) -> type[Any]:
+    module, _, kind = name.rpartition(".")
+    found: type[Any] = getattr(importlib.import_module(module), kind)
+    return found
+
+
+def hooks_of(name: str) -> Iterator[tuple[str, str]]:
+    """The hooks of a class of `BROUGHT`, without importing the examples, which are not installed yet."""
+    kinds: dict[str, type[hooks.Hooks]] = {
+        "tcp_frames.LoggerPlugin": DriverPlugin,
+        "tcp_frames.LoggerBus": Bus,
+        "crest.CrestPlugin": DetectorPlugin,
+        "event_file.EventFilePlugin": OutputPlugin,
+    }
+    kind = kinds[name] if name in kinds else class_at(name)
+    return ((name, hook) for hook in sorted(kind.__hooks__))
+
+
+EVERY_HOOK = [pair for name in BROUGHT for pair in hooks_of(name)]
+
+
+def test_every_contract_has_something_that_keeps_it() -> None:
+    kept = {kind for name in BROUGHT for kind in class_at(name).__mro__}
+    assert set(contracts()) <= kept
+
+
+def failing(*_: Any, **__: Any) -> Never:
+    raise KeyError("no such thing")
+
+
+def break_(monkeypatch: pytest.MonkeyPatch, owner: str, hook: str) -> str:
+    """Have a hook raise; returns how that is said."""
+    kind = class_at(owner)
+    is_property = isinstance(inspect.getattr_static(kind, hook), property)
+    monkeypatch.setattr(kind, hook, property(failing) if is_property else failing)
+    return f"{hook} of {owner} has failed: KeyError: 'no such thing' ("
+
+
+def all_said(
+    file: Path, folder: Path, capsys: pytest.CaptureFixture[str], log: pytest.LogCaptureFixture
+) -> str:
+    """All that is said of a machine file: by ``check``, by the start of the service, and by ``analyze``."""
+    assert main(["check", str(file)]) in {0, 2}
+    said = capsys.readouterr()
+    if not said.err:
+        machine = parse_machine_file(file.read_text("utf-8"), file)
+        try:
+            Service(machine, folder)
+            output_set(machine).make(MagicMock(watched=watched(machine)))
+        except AssemblyError as error:
+            return f"{error}"
+        recording = folder / "casing.csv"
+        rows = "\n".join(f"{0.001 * row:g},{row % 7}" for row in range(3000))
+        recording.write_text(f"time,casing-x\n{rows}\n")
+        with suppress(SystemExit):
+            main(["analyze", str(file), str(recording)])
+            main(["analyze", str(file), str(file)])
+    more = capsys.readouterr()
+    return f"{said.out}\n{said.err}\n{more.out}\n{more.err}\n{log.text}"
+
+
+@pytest.mark.parametrize(("owner", "hook"), EVERY_HOOK)
+def test_a_hook_that_fails_is_named_with_who_can_mend_it(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    owner: str,
+    hook: str,
+) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(WHOLE)
+    failed = break_(monkeypatch, owner, hook)
+    said = " ".join(all_said(file, tmp_path, capsys, caplog).split())
+    if (owner, hook) not in NOT_ASKED:
+        assert failed in said
+        in_its_place = hook.startswith("describe") or hook == "summary"
+        assert in_its_place or f"have the authors of {BROUGHT[owner]} mend it" in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(("owner", "hook"), EVERY_HOOK)
+def test_a_hook_that_fails_takes_no_other_table_down(
+    monkeypatch: pytest.MonkeyPatch, owner: str, hook: str
+) -> None:
+    failed = break_(monkeypatch, owner, hook)
+    again = '[[alarms]]\nname = "knocks"\ndetector = "crest"\n[alarm_handling'
+    wrong = WHOLE.replace("[alarm_handling", again)
+    others = [one for one in problems_of(wrong, MACHINE) if failed not in one.message]
+    assert [one.key for one in others] == ["alarms[1].name"]
 
 
 @pytest.mark.parametrize(
-    ("broken", "table"),
+    ("owner", "hook", "table"),
     [
-        ("tcp_frames.LoggerPlugin.checks", "buses.logger"),
-        ("tcp_frames.LoggerPlugin.stream_checks", "streams.casing"),
-        ("tcp_frames.LoggerBus.device", "buses.logger"),
-        ("crest.CrestPlugin.checks", "pipeline.crest"),
-        ("event_file.EventFilePlugin.checks", "event_file"),
+        ("tcp_frames.LoggerPlugin", "checks", "buses.logger"),
+        ("tcp_frames.LoggerPlugin", "stream_checks", "streams.casing"),
+        ("tcp_frames.LoggerPlugin", "bus_of", "buses.logger"),
+        ("tcp_frames.LoggerPlugin", "read_files", "streams.casing.layout"),
+        ("tcp_frames.LoggerBus", "device", "buses.logger"),
+        ("daqsvc.settings.packing.PackedLayout", "channel_names", "streams.casing.layout"),
+        ("crest.CrestPlugin", "checks", "pipeline.crest"),
+        ("crest.CrestPlugin", "sampled_together", "pipeline.crest"),
+        ("event_file.EventFilePlugin", "checks", "event_file"),
     ],
 )
-def test_a_check_that_fails_is_one_finding_and_the_others_go_on(
-    monkeypatch: pytest.MonkeyPatch, broken: str, table: str
+def test_a_hook_that_fails_is_one_finding_with_its_line(
+    monkeypatch: pytest.MonkeyPatch, owner: str, hook: str, table: str
 ) -> None:
-    break_(monkeypatch, broken)
+    failed = break_(monkeypatch, owner, hook)
+    [problem] = problems_of(TABLES, MACHINE)
+    assert problem.message.startswith(failed)
+    assert problem.key == table
+    assert problem.line is not None
+    removed = table.removesuffix(".layout")
+    assert problem.remedy == f"have the authors of {BROUGHT[owner]} mend it, or remove [{removed}]"
+
+
+def test_a_validator_that_fails_is_one_finding_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: Any, sensor: str) -> Never:
+        raise KeyError(sensor)
+
+    module = importlib.import_module("crest")
+    picky = type(
+        "Picky",
+        (module.Crest,),
+        {"__module__": "crest", "picky": field_validator("sensor")(classmethod(fail))},
+    )
+    monkeypatch.setattr(module.CrestPlugin, "settings", picky)
+    registry.forget()
     wrong = TABLES.replace('channel = "x"', 'channel = "z"')
-    [first, other] = sorted(problems_of(wrong, MACHINE), key=lambda problem: problem.key != table)
-    owner, _, part = broken.rpartition(".")
-    assert first.key == table
-    assert first.line is not None
-    assert f"{part} of {owner} has failed: KeyError: 'no such thing' (" in first.message
-    assert first.remedy == f"have the package that brings it mended, or remove [{table}]"
-    assert other.key == "sensors[0].channel"
+    problems = {problem.key: problem for problem in problems_of(wrong, MACHINE)}
+    assert problems.keys() == {"pipeline.crest", "sensors[0].channel"}
+    assert (
+        "a validator of crest.Picky has failed: KeyError: 'casing-x' (" in problems["pipeline.crest"].message
+    )
+    assert problems["pipeline.crest"].remedy == "have the authors of daqsvc-crest 1.0 mend it"
+
+
+def test_a_hook_that_forgets_to_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", lambda *_: None)
+    [problem] = problems_of(TABLES, MACHINE)
+    assert "checks of crest.CrestPlugin has failed: TypeError: it returns None (" in problem.message
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "said"),
+    [
+        ("place", "first", "place of CrestPlugin is 'first': write what place = 100 is"),
+        ("detector", 7, "detector of CrestPlugin is 7: write what detector = None is"),
+        ("settings", dict, "settings of CrestPlugin holds <class 'dict'>, which is no Section"),
+    ],
+)
+def test_a_plugin_with_odd_attributes_is_one_finding(
+    monkeypatch: pytest.MonkeyPatch, attribute: str, value: object, said: str
+) -> None:
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), attribute, value)
+    registry.forget()
+    [problem] = problems_of(TABLES, MACHINE)
+    assert problem.key == "pipeline.crest"
+    assert problem.message == f"the detector cannot be loaded from crest:CrestPlugin: {said}"
 
 
 def test_a_check_that_fails_later_is_one_finding_with_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,25 +267,25 @@ def test_a_check_that_fails_later_is_one_finding_with_its_line(monkeypatch: pyte
 
 
 @pytest.mark.parametrize(
-    ("broken", "said_of"),
+    ("owner", "hook"),
     [
-        ("tcp_frames.LoggerPlugin.describe_bus", "LoggerPlugin"),
-        ("tcp_frames.LoggerBus.summary", "describe_bus of tcp_frames.LoggerPlugin"),
-        ("crest.CrestPlugin.describe", "crest.CrestPlugin"),
-        ("event_file.EventFilePlugin.describe", "event_file.EventFilePlugin"),
+        ("tcp_frames.LoggerPlugin", "describe_bus"),
+        ("tcp_frames.LoggerBus", "summary"),
+        ("crest.CrestPlugin", "describe"),
+        ("event_file.EventFilePlugin", "describe"),
     ],
 )
 def test_words_that_fail_are_named_in_their_place(
-    monkeypatch: pytest.MonkeyPatch, broken: str, said_of: str
+    monkeypatch: pytest.MonkeyPatch, owner: str, hook: str
 ) -> None:
-    break_(monkeypatch, broken)
+    failed = break_(monkeypatch, owner, hook)
     text = " ".join(describe(parse_machine_file(TABLES, MACHINE)).split())
-    assert f"{said_of} has failed: KeyError: 'no such thing' (" in text
+    assert failed in text
     assert "128 bytes, 30 x 2 samples, 32 bit count" in text
 
 
 def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.MonkeyPatch) -> None:
-    break_(monkeypatch, "tcp_frames.LoggerDriver.__init__")
+    monkeypatch.setattr(class_at("tcp_frames.LoggerDriver"), "__init__", failing)
     machine = parse_machine_file(MACHINE.read_text(), MACHINE)
     with pytest.raises(AssemblyError) as caught:
         bus_drivers(machine, SystemClock(), lambda _: None)
@@ -121,7 +299,7 @@ def test_a_driver_that_cannot_be_made_is_named_with_its_bus(monkeypatch: pytest.
 def test_a_detector_that_cannot_be_made_is_named_with_its_table(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = parse_machine_file(TABLES, MACHINE)
     for part, ask in (("build", detectors), ("check_files", check_files)):
-        break_(monkeypatch, f"crest.CrestPlugin.{part}")
+        break_(monkeypatch, "crest.CrestPlugin", part)
         said = (
             f"{MACHINE}: pipeline.crest: {part} of crest.CrestPlugin has failed: KeyError: 'no such thing' ("
         )

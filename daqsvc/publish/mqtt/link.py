@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 from daqsvc.publish.plugin import OutputPlugin
+from daqsvc.settings.hooks import contract, may_raise
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import Section
 
 if TYPE_CHECKING:
@@ -49,9 +51,11 @@ class MqttLink:
         return False
 
 
+@contract
 class MqttLinkPlugin(OutputPlugin[SettingsT]):
     """An output whose table stands below ``[mqtt]`` and that speaks over that connection."""
 
+    @may_raise(AssemblyError)
     def link(self, given: SettingsT | None, mqtt: Mqtt, port: OutputPort) -> MqttLink | None:
         """What speaks; None for nothing.
 

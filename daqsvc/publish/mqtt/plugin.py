@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from daqsvc.publish.mqtt.conditions import BROKER, CERTIFICATE, REFUSED, UNUSED
 from daqsvc.publish.mqtt.link import MqttLinkPlugin
 from daqsvc.publish.mqtt.settings import Mqtt
 from daqsvc.publish.plugin import OutputPlugin
+from daqsvc.settings.hooks import PluginFailedError
 from daqsvc.settings.registry import output_tables, table_at
 
 if TYPE_CHECKING:
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from daqsvc.publish.output import Output, OutputPort
     from daqsvc.settings.models import MachineFile
     from daqsvc.settings.problems import Finding
+
+log = logging.getLogger(__name__)
 
 
 class MqttPlugin(OutputPlugin[Mqtt]):
@@ -51,11 +55,13 @@ class MqttPlugin(OutputPlugin[Mqtt]):
         from daqsvc.publish.mqtt.publisher import MqttPublisher  # noqa: PLC0415 - paho and cryptography
 
         mqtt = given.on(machine)
-        links = [
-            plugin.link(table_at(machine, path), mqtt, port)
-            for path, plugin in output_tables().items()
-            if isinstance(plugin, MqttLinkPlugin)
-        ]
+        links = []
+        for path, plugin in output_tables().items():
+            if isinstance(plugin, MqttLinkPlugin):
+                try:
+                    links.append(plugin.link(table_at(machine, path), mqtt, port))
+                except PluginFailedError as failed:
+                    log.error("output %s cannot be made and is left out: %s", path, failed)  # noqa: TRY400
         return MqttPublisher(mqtt, port, [link for link in links if link is not None])
 
 
