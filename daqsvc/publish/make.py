@@ -70,7 +70,7 @@ def _left_out(given: dict[str, Any], path: str) -> Iterator[None]:
         yield
     except PluginFailedError as failed:
         del given[path]
-        log.error("output %s cannot be made and is left out: %s", path, failed)  # noqa: TRY400
+        log.error("output %s cannot be made and is left out: %s", path, failed.words)  # noqa: TRY400
 
 
 def check_outputs(machine: MachineFile) -> None:

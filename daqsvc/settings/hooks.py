@@ -87,7 +87,12 @@ class PluginFailedError(AssemblyError, UnusableValueError):
 
     def __str__(self) -> str:
         places = "".join(f"{place}: " for place in (self.file, self.table) if place)
-        return f"{places}{self.said}; {mend_or_remove(type(self.by), self.table)}"
+        return f"{places}{self.words}"
+
+    @property
+    def words(self) -> str:
+        """What has failed, and who can put it right."""
+        return f"{self.said}; {mend_or_remove(type(self.by), self.table)}"
 
 
 def contract(kind: ClassT) -> ClassT:

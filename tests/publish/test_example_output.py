@@ -150,7 +150,10 @@ async def test_one_that_fails_in_everything_ends_nothing(
         assert {"run", "report", "status", "figures", "conditions", "stop"} <= counted.keys()
         assert service.supervisor.failures["event_file"] > 0
     else:
-        assert "output event_file cannot be made and is left out: build is broken" in caplog.text
+        said = (
+            "output event_file cannot be made and is left out: build of event_file.EventFilePlugin has failed"
+        )
+        assert f"{said}: RuntimeError: build is broken (" in caplog.text
 
 
 def test_what_an_output_has_said_is_over_once_its_table_is_gone(tmp_path: Path) -> None:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FILE: Final = "home-assistant.json"
+AGAIN_S = 60.0
+"""How long a disk that took nothing is left alone."""
 _MOST_BYTES = 65_536
 
 
@@ -40,6 +42,9 @@ class LeftOver(MqttLink):
     def __init__(self, directory: Path, now: Iterable[str] = ()) -> None:
         self.now = frozenset(now)
         self._path = directory / FILE
+        self._refused: list[str] = []
+        self._is_remembered = False
+        self._is_unwritable = False
 
     async def run(self, connection: Connection) -> None:
         """Take it away, and remember what is told from now on.
@@ -47,39 +52,65 @@ class LeftOver(MqttLink):
         Raises:
             MqttError: the connection is lost.
         """
-        refused = []
+        await self.take_away(connection)
+        await self.until_remembered()
+
+    async def take_away(self, connection: Connection) -> None:
+        """Take away what is not told any more, and try to remember what is told from now on.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        self._refused = []
         for topic in await asyncio.to_thread(self.left_over):
             try:
                 await connection.deliver(topic, b"", retain=True)
                 log.info("taken away from Home Assistant, as the machine file no longer has it: %s", topic)
             except PublishRefusedError as error:
-                refused.append(topic)
+                self._refused.append(topic)
                 log.warning(
                     "Home Assistant keeps showing what the machine file no longer has: %s; take the retained "
                     "message away from %s at the broker, or allow this client to",
                     error,
                     topic,
                 )
-        await asyncio.to_thread(self.remember, refused)
+        self._is_remembered = await asyncio.to_thread(self.remember, self._refused)
+
+    async def until_remembered(self) -> None:
+        """Try again, as long as the disk does not take what is to be remembered."""
+        while not self._is_remembered:
+            await asyncio.sleep(AGAIN_S)
+            self._is_remembered = await asyncio.to_thread(self.remember, self._refused)
 
     def left_over(self) -> list[str]:
         """Those that were told by an earlier start and are not any more; blocks."""
         return sorted(self._read() - self.now)
 
-    def remember(self, left_over: Iterable[str] = ()) -> None:
-        """Write down what is told from now on, and what could not be taken away; blocks."""
+    def remember(self, left_over: Iterable[str] = ()) -> bool:
+        """Write down what is told from now on, and what could not be taken away; blocks.
+
+        Returns:
+            Whether it is written; that it is not is said once.
+        """
         topics = self.now | set(left_over)
         if topics == self._read():
-            return
+            return True
         try:
             replace_durably(self._path, json.dumps({"topics": sorted(topics)}).encode())
         except OSError as error:
-            log.warning(
-                "%s cannot be written: %s; what Home Assistant is told now may stay there when the machine "
-                "file no longer has it",
-                self._path,
-                error,
-            )
+            if not self._is_unwritable:
+                log.warning(
+                    "%s cannot be written: %s; what Home Assistant is told now may stay there when the "
+                    "machine file no longer has it",
+                    self._path,
+                    error,
+                )
+            self._is_unwritable = True
+            return False
+        if self._is_unwritable:
+            log.info("%s is written again", self._path)
+        self._is_unwritable = False
+        return True
 
     def _read(self) -> frozenset[str]:
         try:

@@ -113,7 +113,15 @@ class HomeAssistantLink(MqttLink):
         Raises:
             MqttError: the connection is lost.
         """
-        await self._left_over.run(connection)
+        await self._left_over.take_away(connection)
+        remembered = asyncio.create_task(self._left_over.until_remembered())
+        try:
+            await self._run_unless_refused(connection)
+            await remembered
+        finally:
+            remembered.cancel()
+
+    async def _run_unless_refused(self, connection: Connection) -> None:
         try:
             await self._run(connection)
         except PublishRefusedError as error:

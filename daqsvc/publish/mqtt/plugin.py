@@ -61,7 +61,7 @@ class MqttPlugin(OutputPlugin[Mqtt]):
                 try:
                     links.append(plugin.link(table_at(machine, path), mqtt, port))
                 except PluginFailedError as failed:
-                    log.error("output %s cannot be made and is left out: %s", path, failed)  # noqa: TRY400
+                    log.error("output %s cannot be made and is left out: %s", path, failed.words)  # noqa: TRY400
         return MqttPublisher(mqtt, port, [link for link in links if link is not None])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 from dataclasses import replace
 
@@ -15,6 +16,8 @@ from support.waiting import eventually
 from daqsvc.alarms.commands import Verb
 from daqsvc.diagnosis.reading import Reading
 from daqsvc.diagnosis.record import Diagnosis
+from daqsvc.outbox.files import replace_durably
+from daqsvc.publish.home_assistant import left_over
 from daqsvc.publish.home_assistant.settings import HomeAssistant
 from daqsvc.publish.output import Watched
 
@@ -227,3 +230,29 @@ async def test_a_broker_that_forbids_discovery_still_gets_the_alarms(tmp_path, o
             await outbox.append("daqsvc/lab/edge-1/rig/alarms/a", lambda n: b"{}", retain=True)
             await eventually(lambda: outbox.counters.sent == 1, "alarms pass")
             assert publisher.counters.connections == 1
+
+
+@pytest.mark.parametrize("told", [RIG, {}], ids=["told", "no longer told"])
+async def test_what_a_full_disk_did_not_take_is_remembered_once_it_has_room(
+    told, mosquitto, outbox, monkeypatch, caplog
+):
+    caplog.set_level("INFO")
+    file = outbox.directory / left_over.FILE
+    file.write_text('{"topics": ["homeassistant/device/earlier/config"]}')
+    room = asyncio.Event()
+
+    def write(path, data):
+        if not room.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace_durably(path, data)
+
+    monkeypatch.setattr(left_over, "replace_durably", write)
+    monkeypatch.setattr(left_over, "AGAIN_S", 0.02)
+    async with publishing(outbox, mosquitto.port, **told):
+        await eventually(lambda: "home-assistant.json cannot be written: " in caplog.text, "it is said")
+        await asyncio.sleep(0.1)
+        assert caplog.text.count("cannot be written") == 1
+        assert "earlier" in file.read_text()
+        room.set()
+        await eventually(lambda: "home-assistant.json is written again" in caplog.text, "it is written")
+    assert json.loads(file.read_text()) == {"topics": sorted([CONFIG, SUMMARY] if told else [])}
