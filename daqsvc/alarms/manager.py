@@ -20,7 +20,7 @@ from daqsvc.alarms.conditions import (
     statement,
     unjudged,
 )
-from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, EventKind, Identity
+from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.expected import Expected
 from daqsvc.alarms.first_out import FirstOut
 from daqsvc.alarms.flood import FloodWatch
@@ -432,21 +432,22 @@ class AlarmManager:
         """Take back that a sensor was not OK where later events show that this was over.
 
         Whoever says good while others have not spoken since a restart changes nothing that a person could
-        tell, so the last event of the quality alarm still has its doubt; the alarms that it had suppressed
-        know better, unless they rest on other sensors by now.
+        tell, and neither does whoever then says "not OK" again: the last event of the quality alarm still has
+        the first doubt. The alarms that it bears on know better; the last of them to speak counts.
         """
         ours = [event for event in told if event.identity == self._identity]
         place = {event.alarm: number for number, event in enumerate(ours)}
-        for name, doubt in self._doubts.not_ok():
-            since = place.get(name, len(ours))
-            blamed = set(doubt.sensors) if len(doubt.sensors) == 1 else set()
-            for event in ours[since + 1 :]:
+        not_ok = self._doubts.not_ok()
+        for name, doubt in not_ok:
+            others = [other for _, other in not_ok if other is not doubt]
+            for event in reversed(ours[place.get(name, len(ours)) + 1 :]):
                 ruled = self._ruled.named(event.alarm)
-                if ruled is None or ruled.rule.spare or ruled.alarm.is_held(Hold.SUPPRESSED):
+                if ruled is None or not _bears_on(doubt, ruled, event):
                     continue
-                rested_on = ruled.rule.sensors or event.cause.sensors or ruled.sensors
-                if doubt.detector in ruled.rule.detectors or not blamed.isdisjoint(rested_on):
+                if not ruled.alarm.is_held(Hold.SUPPRESSED):
                     self._doubts.excuse(doubt.detector)
+                    break
+                if not any(_bears_on(other, ruled, event) for other in others):
                     break
 
     def _resume_ruled(self, ruled: Ruled, event: AlarmEvent) -> None:
@@ -490,6 +491,15 @@ class AlarmManager:
     def _instant(self, t_ns: int) -> ClockReading:
         """The wall-clock label of a monotonic time."""
         return ClockReading(t_ns, self._clock.wall_ns() - self._clock.monotonic_ns() + t_ns)
+
+
+def _bears_on(doubt: Doubt, ruled: Ruled, event: AlarmEvent) -> bool:
+    """Whether an alarm could not speak while a doubt stood, by the sensors that its last event rests on."""
+    rested_on = ruled.rule.sensors or event.cause.sensors or ruled.sensors
+    blamed = doubt.sensors if len(doubt.sensors) == 1 else ()
+    return ruled.rule.spare == 0 and (
+        doubt.detector in ruled.rule.detectors or not set(blamed).isdisjoint(rested_on)
+    )
 
 
 class _Statuses(Mapping[str, "AlarmStatus"]):

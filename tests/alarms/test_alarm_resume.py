@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+from typing import Any
 
 import pytest
 
@@ -230,6 +231,18 @@ def test_a_payload_whose_covers_contradict_each_other_is_refused(forged):
         alarm_event(json.dumps(payload).encode())
 
 
+class Journal(dict[str, Any]):
+    """The last event of each alarm, in the order of the events."""
+
+    def take(self, subject, diagnosis, lost=()):
+        events = subject.take(diagnosis)
+        for event in events:
+            if event.alarm not in lost:
+                self.pop(event.alarm, None)
+                self[event.alarm] = event
+        return kinds(events)
+
+
 def test_missing_data_after_two_restarts_suppress_nothing_that_was_good_between_them():
     """Who says good while another has not spoken yet makes no event of the sensor; those it lifts say so."""
     speakers = {"levels/probe-x": ("probe-x",), "bearing": ("probe-x",), "bearing-fe": ("probe-x",)}
@@ -237,15 +250,8 @@ def test_missing_data_after_two_restarts_suppress_nothing_that_was_good_between_
     def bearing(quality):
         return dataclasses.replace(rms(1.0, quality), detector="bearing")
 
-    journal = {}
-
-    def take(subject, diagnosis):
-        events = subject.take(diagnosis)
-        for event in events:
-            journal.pop(event.alarm, None)
-            journal[event.alarm] = event
-        return kinds(events)
-
+    journal = Journal()
+    take = journal.take
     first = manager(LEVEL)
     assert first.resume([], speakers) == []
     assert ("vibration-x", K.SUPPRESSED) in take(first, bearing("not_ok"))
@@ -256,3 +262,35 @@ def test_missing_data_after_two_restarts_suppress_nothing_that_was_good_between_
     third.resume(list(journal.values()), speakers)
     assert take(third, bearing("missing")) == []
     assert ("vibration-x", K.SUPPRESSED) in take(third, bearing("not_ok"))
+
+
+@pytest.mark.parametrize("other", ["has turned to another sensor", "was cut off by a crash"])
+def test_a_sensor_that_is_not_ok_again_in_the_same_words_stays_so_over_a_restart(other):
+    """That is no event of the sensor while another has not spoken yet; who is suppressed again says so."""
+    second_rule = dataclasses.replace(LEVEL, alarm="vibration-x-2")
+    speakers = {"levels/probe-x": ("probe-x",), "bearing": ("probe-x",), "bearing-fe": ("probe-x",)}
+    turns = other == "has turned to another sensor"
+    rules = [LEVEL, DiagnosisRule("fault", "bearing-fe")] if turns else [LEVEL, second_rule]
+
+    def bearing(quality):
+        return dataclasses.replace(rms(1.0, quality), detector="bearing", reason="clipped")
+
+    def fault(sensor):
+        said = mode("F1", "alert")
+        return dataclasses.replace(said, detector="bearing-fe", sensors=(sensor,))
+
+    journal = Journal()
+    journal.take(manager(*rules), bearing("not_ok"))
+    second = manager(*rules)
+    second.resume(list(journal.values()), speakers)
+    assert ("vibration-x", K.UNSUPPRESSED) in journal.take(second, bearing("good"))
+    if turns:
+        assert journal.take(second, fault("probe-x")) == [("fault", K.RAISED)]
+        assert journal.take(second, fault("probe-y")) == []
+    again = journal.take(second, bearing("not_ok"), lost=["vibration-x-2"])
+    assert again[0] == ("vibration-x", K.SUPPRESSED)
+    assert not any(name.startswith("sensor-ok") for name, _ in again)
+    third = manager(*rules)
+    third.resume(list(journal.values()), speakers)
+    assert ("vibration-x", K.UNSUPPRESSED) not in journal.take(third, rms(1.0)), "the other one has clipped"
+    assert ("vibration-x", K.UNSUPPRESSED) in journal.take(third, bearing("good"))
