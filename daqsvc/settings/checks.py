@@ -13,6 +13,7 @@ from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.alignment_checks import alignment_checks
 from daqsvc.settings.bus_checks import check_devices, check_drivers, check_unused
 from daqsvc.settings.error_messages import dotted
+from daqsvc.settings.failures import mend_or_remove
 from daqsvc.settings.layout_checks import (
     check_channel_use,
     check_channels,
@@ -22,7 +23,7 @@ from daqsvc.settings.layout_checks import (
 )
 from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
-from daqsvc.settings.problems import Finding, mend_or_remove
+from daqsvc.settings.problems import Finding
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (

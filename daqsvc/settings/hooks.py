@@ -13,7 +13,8 @@ from functools import cache, partial
 from inspect import isfunction, signature
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
-from daqsvc.settings.problems import AssemblyError, mend_or_remove, packages, raised
+from daqsvc.settings.failures import mend_or_remove, packages, raised
+from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import UnusableValueError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 
-from daqsvc.settings.problems import mend_or_remove, raised
+from daqsvc.settings.failures import mend_or_remove, raised
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
