@@ -108,6 +108,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
 
         return RecordedLive(machine, given, options, self.build)
 
+    @may_raise(AssemblyError, ValueError)
     def detectability(
         self, machine: MachineFile, given: SettingsT, options: DetectabilityOptions
     ) -> Detectability:
