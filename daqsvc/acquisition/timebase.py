@@ -23,10 +23,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from daqsvc.acquisition.arrivals import ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.clock_line import PARTS, Bucket, ClockLine, clock_line
-from daqsvc.acquisition.counter import CounterUnwrapper
+from daqsvc.acquisition.counter import ArrivalCount, CounterUnwrapper
 from daqsvc.dsp.quality.rate import AS_BEFORE, FITS, PLAUSIBLE
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ class TimeBase:
     Args:
         rate_hz: nominal sampling rate.
         counter_bits: width of the counter, see `daqsvc.acquisition.counter`; None if there is none: frames
-            are then counted by their times (`daqsvc.acquisition.arrivals`), one count a frame.
+            are then counted by their times (`daqsvc.acquisition.counter`), one count a frame.
         samples_per_frame: samples of each channel in a frame.
         counts_per_frame: by how much the counter grows from frame to frame.
         reorder_window_ns: how long a frame may be overtaken on its way.

@@ -15,8 +15,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.acquisition.ring import SampleRing
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.diagnosis import pipeline as pipeline_module
-from daqsvc.diagnosis.kernel_threads import KernelThreads
-from daqsvc.diagnosis.pipeline import Pipeline
+from daqsvc.diagnosis.pipeline import KernelThreads, Pipeline
 from daqsvc.dsp.quality import missing
 from daqsvc.supervision import Supervisor
 

@@ -199,6 +199,8 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
                     await asyncio.sleep(0.1)  # whoever reads may come before the devices
                 for device in devices.values():
                     device.go_away()
+                while any(driver.link.losses == outage for driver in service.drivers):
+                    await sample(0.02)  # who comes back unseen has not been away
                 await sample(rng.uniform(0.0, 0.3))
                 for device in devices.values():
                     device.come_back()

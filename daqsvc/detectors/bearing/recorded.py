@@ -18,8 +18,7 @@ from daqsvc.bearing.identify import ChangeRules, NotIdentifiableError, compare_r
 from daqsvc.bearing.race.judge import race_test
 from daqsvc.detectors.bearing.build import bearing_detector, healthy_machine, orders_of
 from daqsvc.detectors.bearing.calibrating import HealthyRun
-from daqsvc.detectors.bearing.finding import BearingFinding, find
-from daqsvc.detectors.bearing.persistence import UNDETERMINED
+from daqsvc.detectors.bearing.finding import UNDETERMINED, BearingFinding, find
 from daqsvc.detectors.bearing.recorded_checks import (
     ball_order_problem,
     meant_in_hz,
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.race.verdict import RaceVerdict, RaceWord
     from daqsvc.detectors.bearing.detector import BearingDetector
     from daqsvc.detectors.bearing.evaluation import Evaluation
-    from daqsvc.detectors.bearing.persistence import ConfirmedState
+    from daqsvc.detectors.bearing.finding import ConfirmedState
     from daqsvc.diagnosis.record import Diagnosis
     from daqsvc.diagnosis.recorded import Progress, Recorded, RecordingOptions
     from daqsvc.dsp.quality.unit import AccelerationUnit

@@ -8,8 +8,7 @@ import pytest
 from daqsvc.bearing.identify import BANDS, ResidualChange
 from daqsvc.bearing.race.verdict import PARTS, PartEvidence, RaceVerdict
 from daqsvc.detectors.bearing.direction import Direction
-from daqsvc.detectors.bearing.finding import WORDS, find
-from daqsvc.detectors.bearing.persistence import CLEAR_LOOKS, CONFIRM_LOOKS, PersistenceFilter
+from daqsvc.detectors.bearing.finding import CLEAR_LOOKS, CONFIRM_LOOKS, WORDS, PersistenceFilter, find
 
 
 def evidence(severity: float) -> PartEvidence:
