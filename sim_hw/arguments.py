@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daqsvc.recording.channels import add_max_memory, channel_map, sampling_rate_hz
+from daqsvc.commands.arguments import add_max_memory, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,7 +11,13 @@ import re
 import signal
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from daqsvc.confined.limits import GIGABYTE
+from daqsvc.recording.rate import LEAST_RATE_HZ, MOST_RATE_HZ
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -51,6 +57,9 @@ _ORBIT = "orbit:"
 _UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _PART = re.compile(r"([0-9]{1,9})([smhd])")
 _DURATION = re.compile(r"([0-9]{1,9}d)?([0-9]{1,9}h)?([0-9]{1,9}m)?([0-9]{1,9}s)?")
+
+LEAST_MEMORY_GB = 0.05
+MOST_MEMORY_GB = 1000.0
 
 LONGEST_S = 366 * 86_400
 """Longest time that a duration can say."""
@@ -157,6 +166,62 @@ def alarm_id(text: str) -> str:
     return text
 
 
+def channel_names(text: str) -> tuple[str, ...]:
+    """``NAME,...``: one or more channels."""
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names) or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"{text!r} does not name channels; write NAME,NAME, each once")
+    return names
+
+
+def channel_map(text: str) -> dict[str, str]:
+    """``NAME=VARIABLE,...``: what each channel is called from now on, and in the file."""
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    found: dict[str, str] = {}
+    for name, _, variable in pairs:
+        if not (name.strip() and variable.strip()):
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not a map; write NAME=VARIABLE, several with commas between"
+            )
+        if name.strip() in found:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} names {name.strip()!r} twice; give each channel a name of its own"
+            )
+        found[name.strip()] = variable.strip()
+    return found
+
+
+def sampling_rate_hz(text: str) -> float:
+    """A sampling rate that a recording may have."""
+    what = f"a sampling rate from {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:,.0f} Hz"
+    return _between(text, LEAST_RATE_HZ, MOST_RATE_HZ, what)
+
+
+def probability(text: str) -> float:
+    """A false-alarm probability."""
+    return _between(text, 1e-9, 0.5, "a probability from 1e-9 to 0.5")
+
+
+def memory_limit(text: str) -> int:
+    """Memory in GB that reading a recording may take, in bytes."""
+    what = f"a number of GB from {LEAST_MEMORY_GB:g} to {MOST_MEMORY_GB:g}"
+    return round(_between(text, LEAST_MEMORY_GB, MOST_MEMORY_GB, what) * GIGABYTE)
+
+
+def add_max_memory(add: Callable[..., argparse.Action]) -> None:
+    """The option ``--max-memory``; what it says goes to `daqsvc.recording.recording.set_memory`.
+
+    Args:
+        add: ``add_argument`` of the group that takes it.
+    """
+    add(
+        "--max-memory",
+        type=memory_limit,
+        metavar="GB",
+        help="memory that reading one recording may take (default: half of the machine's, at most 4)",
+    )
+
+
 def calibration_length(text: str) -> int:
     """Revolutions that make a baseline."""
     from daqsvc.rotor.synchronous.baseline import LEAST_REVOLUTIONS  # noqa: PLC0415 - brings NumPy
@@ -167,6 +232,13 @@ def calibration_length(text: str) -> int:
             f"{text!r} revolutions do not make a baseline; "
             f"give a whole number from {LEAST_REVOLUTIONS} to 100000"
         )
+    return value
+
+
+def _between(text: str, least: float, most: float, what: str) -> float:
+    value = _float(text)
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
     return value
 
 

@@ -12,17 +12,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daqsvc.commands.arguments import (
+    add_max_memory,
     calibration_length,
+    channel_map,
+    channel_names,
     count,
     not_negative,
     number,
     percent,
     positive,
+    probability,
     probe_pair,
+    sampling_rate_hz,
     speed,
 )
 from daqsvc.dsp.quality.unit import ACCELERATION_UNITS, LENGTH_UNITS
-from daqsvc.recording.channels import add_max_memory, channel_map, sampling_rate_hz
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -50,14 +54,13 @@ _PROBES_ONLY = (
     *("--ac-coupled", "--natural-frequency-tolerance", "--damping-tolerance"),
 )
 """Options of `analyze` that accelerometers have not."""
+_SAID_TWICE = "--bearing and --orders both say what the bearing is; leave out one of them"
 _ORDER_KEYS = ("BPFI", "BPFO", "BSF", "FTF")
 
 
 def add_analyze_options(parser: argparse.ArgumentParser) -> None:
     """All of ``daqsvc analyze``."""
-    parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
-    )
+    _add_files(parser)
     _add_rotor_of_analyze(parser)
     _add_orders(parser)
     _add_bearings(parser)
@@ -67,9 +70,7 @@ def add_analyze_options(parser: argparse.ArgumentParser) -> None:
 
 def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
     """All of ``daqsvc calibrate``."""
-    parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
-    )
+    _add_files(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="where the calibration is written (.toml)")
     parser.add_argument("--json", action="store_true", help="say what was found as one JSON object")
     parser.add_argument(
@@ -100,6 +101,12 @@ def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
         told="; a run-up tells it",
     )
     _add_bearing_of_calibrate(parser)
+
+
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", help="a machine file (.toml) if there is one, then recordings"
+    )
 
 
 def split_files(arguments: argparse.Namespace) -> tuple[Path | None, list[str]]:
@@ -177,33 +184,6 @@ def bearing_recording_misuse(arguments: argparse.Namespace, recordings: Sequence
     return ""
 
 
-def channel_names(text: str) -> tuple[str, ...]:
-    """``NAME,...``: one or more channels.
-
-    Raises:
-        argparse.ArgumentTypeError: one is empty or named twice.
-    """
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names) or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"{text!r} does not name channels; write NAME,NAME, each once")
-    return names
-
-
-def probability(text: str) -> float:
-    """A false-alarm probability.
-
-    Raises:
-        argparse.ArgumentTypeError: it is not from 1e-9 to 0.5.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1e-9 <= value <= 0.5:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a probability from 1e-9 to 0.5")
-    return value
-
-
 def fault_orders(text: str) -> dict[str, float]:
     """``BPFI=F,BPFO=F,BSF=F,FTF=F``, in any order: positive numbers per revolution of the shaft.
 
@@ -276,13 +256,7 @@ def _add_orders(parser: argparse.ArgumentParser) -> None:
 def _add_bearings(parser: argparse.ArgumentParser) -> None:
     """Options of bearings, beside those of accelerometers."""
     bearings = parser.add_argument_group("bearings, with --channels and --speed-rpm")
-    bearings.add_argument("--bearing", metavar="NAME", help="designation in the catalogue, e.g. 6205-2RS")
-    bearings.add_argument(
-        "--orders",
-        type=fault_orders,
-        metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
-        help="fault orders per revolution of the shaft, in place of --bearing",
-    )
+    _add_bearing(bearings.add_argument)
     bearings.add_argument(
         "--baseline-map",
         type=channel_map,
@@ -355,13 +329,7 @@ def _add_bearing_of_calibrate(parser: argparse.ArgumentParser) -> None:
         metavar="NAME[,NAME]",
         help="accelerometers on the housings; name them as the sensors of the machine file are",
     )
-    bearings.add_argument("--bearing", metavar="NAME", help="designation in the catalogue, e.g. 6205-2RS")
-    bearings.add_argument(
-        "--orders",
-        type=fault_orders,
-        metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
-        help="fault orders per revolution of the shaft, in place of --bearing",
-    )
+    _add_bearing(bearings.add_argument)
 
 
 class _MergedMap(argparse.Action):
@@ -399,6 +367,21 @@ def _add_channel_map(add: Callable[..., argparse.Action]) -> None:
     )
     add("--fs", type=sampling_rate_hz, metavar="HZ", help="sampling rate, if the files do not state it")
     add_max_memory(add)
+
+
+def _add_bearing(add: Callable[..., argparse.Action]) -> None:
+    """What the bearing is.
+
+    Args:
+        add: ``add_argument`` of the group that takes the options.
+    """
+    add("--bearing", metavar="NAME", help="designation in the catalogue, e.g. 6205-2RS")
+    add(
+        "--orders",
+        type=fault_orders,
+        metavar="BPFI=F,BPFO=F,BSF=F,FTF=F",
+        help="fault orders per revolution of the shaft, in place of --bearing",
+    )
 
 
 def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: str = "") -> None:
@@ -490,12 +473,13 @@ def _order_misuse(arguments: argparse.Namespace, machine: Path | None) -> str:
         return f"{bearing}to compare accelerometers with a healthy run, {missing} must be given too"
     if arguments.speed_rpm.orbit:
         return "--speed-rpm orbit:N needs two probes; with --channels give the nominal speed alone"
+    return next(_misuse_of_accelerometers(arguments), "")
+
+
+def _misuse_of_accelerometers(arguments: argparse.Namespace) -> Iterator[str]:
+    """What is wrong with unit and healthy run, against which accelerometers are compared."""
     if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
-        return f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
-    return next(_baseline_misuse(arguments), "")
-
-
-def _baseline_misuse(arguments: argparse.Namespace) -> Iterator[str]:
+        yield f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
     if arguments.baseline is not None and arguments.baseline.lower().endswith(".toml"):
         yield (
             f"--baseline {arguments.baseline}: takes a recording; a file that daqsvc calibrate wrote of "
@@ -508,10 +492,9 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
     if machine is not None:
         yield "--bearing, --orders: the machine file says which bearings there are; leave them out"
     if arguments.bearing is not None and arguments.orders is not None:
-        yield "--bearing and --orders both say what the bearing is; leave out one of them"
+        yield _SAID_TWICE
     if arguments.calibration is not None and arguments.baseline is not None:
         yield "--calibration and --baseline both say what the healthy machine is; leave out one of them"
-    yield from _baseline_misuse(arguments)
     if extra := _given(arguments, _PROBES_ONLY):
         yield f"{', '.join(extra)}: not with --bearing or --orders; leave it out"
     if missing := _missing(arguments, ("--channels", "--speed-rpm")):
@@ -520,8 +503,7 @@ def _bearing_misuse(arguments: argparse.Namespace, machine: Path | None) -> Iter
         yield f"--channels names {len(arguments.channels)} accelerometers; a bearing is judged by one or two"
     elif arguments.speed_rpm.orbit:
         yield "--speed-rpm orbit:N needs two probes; with --bearing give the speed alone"
-    if arguments.unit is not None and arguments.unit not in ACCELERATION_UNITS:
-        yield f"--unit {arguments.unit}: accelerometers measure in {', '.join(ACCELERATION_UNITS)}"
+    yield from _misuse_of_accelerometers(arguments)
     if arguments.baseline is None and (arguments.baseline_map or arguments.baseline_fs is not None):
         yield "--baseline-map, --baseline-fs: there is no --baseline that they could be about"
 
@@ -541,7 +523,7 @@ def _healthy_bearing_misuse(
     if missing:
         return f"to calibrate a bearing, {', '.join(missing)} must be given too"
     if arguments.bearing is not None and arguments.orders is not None:
-        return "--bearing and --orders both say what the bearing is; leave out one of them"
+        return _SAID_TWICE
     if len(arguments.channels) > MOST_CHANNELS:
         return f"--channels names {len(arguments.channels)} accelerometers; give one or two"
     return bearing_recording_misuse(arguments, recordings)

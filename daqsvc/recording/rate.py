@@ -10,7 +10,6 @@ import numpy as np
 
 from daqsvc.dsp.quality.rate import SAME_RATE, StampedRate, rate_of_stamps
 from daqsvc.recording import RecordingError
-from daqsvc.recording.channels import LEAST_RATE_HZ, MOST_RATE_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,6 +20,10 @@ if TYPE_CHECKING:
     from daqsvc.recording.contents import Contents
 
     Floats: TypeAlias = NDArray[np.float64]
+
+LEAST_RATE_HZ = 1.0
+MOST_RATE_HZ = 10e6
+"""Sampling rates outside of these are mistakes: a rate in kHz, or a period in its place."""
 
 RATE_NAMES = frozenset(
     {"fs", "fs_hz", "sr", "rate_hz", "samplerate", "sample_rate", "sample_rate_hz", "sampling_rate"}

@@ -107,7 +107,7 @@ def load_recording(
     Raises:
         RecordingError: the file cannot be read within the limits, a channel is not there, not numeric, empty
             or holds what no sensor measures, the channels have different lengths, or the rate is not known,
-            contradicted, or outside of `channels.LEAST_RATE_HZ` to `channels.MOST_RATE_HZ`.
+            contradicted, or outside of `rate.LEAST_RATE_HZ` to `rate.MOST_RATE_HZ`.
     """
     path = Path(path)
     about, (samples,) = _there(

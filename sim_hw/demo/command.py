@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from daqsvc.commands.arguments import EXIT_FAILED
-from daqsvc.recording.channels import channel_map, sampling_rate_hz
+from daqsvc.commands.arguments import EXIT_FAILED, channel_map, sampling_rate_hz
 from sim_hw.arguments import add_random, add_recording, add_speed, first_option, misplaced, positive
 from sim_hw.demo.machines import DemoError
 

@@ -22,6 +22,7 @@ from daqsvc.dsp.quality.clipped import clipped_at, ends_cut_off, refuse_clipped
 from daqsvc.dsp.quality.missing import ACCELEROMETER_SHARE, lacking
 from daqsvc.dsp.quality.probes import RevolutionJudge
 from daqsvc.dsp.quality.rate import SAME_RATE, ArrivalRate, rate_of_stamps
+from daqsvc.dsp.quality.unit import LENGTH_UNITS, to_um
 from daqsvc.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -148,3 +149,15 @@ def test_a_wrong_rate_is_seen_by_stamps_and_by_arrivals() -> None:
     arrivals.add(np.rint(np.arange(20_000) * 1e6 / rate_hz).astype(np.int64))
     assert arrivals.rate_hz == pytest.approx(1000.0 * rate_hz, rel=1e-3)
     assert not arrivals.fits
+
+
+def test_lengths():
+    assert LENGTH_UNITS == ("m", "mm", "um", "mil")
+    lengths = np.array([[1.0, np.nan], [-2.0, 0.0]])
+    for unit, um in {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}.items():
+        assert np.array_equal(to_um(lengths, unit), lengths * um, equal_nan=True)
+
+
+def test_other_units_of_length_are_refused():
+    with pytest.raises(ValueError, match="'inch' is not a unit of length; use m, mm, um, mil"):
+        to_um(np.ones(2), "inch")

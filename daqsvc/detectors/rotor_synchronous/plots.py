@@ -16,7 +16,7 @@ from matplotlib.projections.polar import PolarAxes
 
 from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import shortened
-from daqsvc.recording.channels import to_um
+from daqsvc.dsp.quality.unit import to_um
 from daqsvc.rotor.synchronous.baseline import compensated
 
 if TYPE_CHECKING:

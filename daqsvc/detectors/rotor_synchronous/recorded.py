@@ -33,8 +33,7 @@ from daqsvc.dsp.probes import Probe
 from daqsvc.dsp.quality import RefusedError
 from daqsvc.dsp.quality import recorded as checks
 from daqsvc.dsp.quality.recorded import ClippedProbeError, Complaint, DataQuality
-from daqsvc.dsp.quality.unit import doubt_size, refuse_size
-from daqsvc.recording.channels import to_um
+from daqsvc.dsp.quality.unit import doubt_size, refuse_size, to_um
 from daqsvc.rotor.calibration.file import baseline_at
 from daqsvc.rotor.synchronous.baseline import Calibration, compensated
 from daqsvc.rotor.synchronous.departure import threshold_for

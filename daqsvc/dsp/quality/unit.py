@@ -55,6 +55,17 @@ _MOST_CLEARANCES = 20.0
 _LEAST_OF_CLEARANCE = 1e-3
 
 
+def to_um(lengths: Floats, unit: str) -> Floats:
+    """Lengths in ``unit`` as lengths in um, float64 of the same shape.
+
+    Raises:
+        ValueError: the unit is none of `LENGTH_UNITS`.
+    """
+    if unit not in UM_PER_UNIT:
+        raise ValueError(f"{unit!r} is not a unit of length; use {', '.join(LENGTH_UNITS)}")
+    return lengths * UM_PER_UNIT[unit]
+
+
 def beyond_any_unit(signal: NDArray[np.floating]) -> str:
     """What of a signal no sensor can have measured, whatever its unit; empty if nothing.
 

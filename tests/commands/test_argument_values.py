@@ -1,13 +1,12 @@
+"""What the values of options can be, and what is said of others."""
+
 from __future__ import annotations
 
 import argparse
 
-import numpy as np
 import pytest
 
-from daqsvc.dsp.quality.unit import LENGTH_UNITS
-from daqsvc.recording import RecordingError
-from daqsvc.recording.channels import channel_map, metres_per_unit, sampling_rate_hz, to_um
+from daqsvc.commands.arguments import channel_map, sampling_rate_hz
 
 
 def test_channel_map():
@@ -37,17 +36,3 @@ def test_what_is_no_sampling_rate(text):
 
 def test_sampling_rate():
     assert sampling_rate_hz("25.6e3") == 25_600
-
-
-def test_lengths():
-    assert LENGTH_UNITS == ("m", "mm", "um", "mil")
-    lengths = np.array([[1.0, np.nan], [-2.0, 0.0]])
-    for unit, um in {"m": 1e6, "mm": 1e3, "um": 1.0, "mil": 25.4}.items():
-        assert np.array_equal(to_um(lengths, unit), lengths * um, equal_nan=True)
-        assert metres_per_unit(unit) == pytest.approx(um * 1e-6, rel=1e-15)
-
-
-@pytest.mark.parametrize("convert", [metres_per_unit, lambda unit: to_um(np.ones(2), unit)])
-def test_other_units_are_refused(convert):
-    with pytest.raises(RecordingError, match="'inch' is not a unit of length; use m, mm, um, mil"):
-        convert("inch")
