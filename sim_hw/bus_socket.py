@@ -6,7 +6,7 @@ Needs no kernel support, no privileges and no network. The bus lives in a hub; w
 one in its own process, unless one runs already (``python -m sim_hw.bus_socket /tmp/can0``). When the hub
 ends the bus is lost for all, as when an interface goes down, and whoever opens it next starts it anew.
 
-Like Linux' vcan it has no bit rate and no arbitration. Unlike vcan it tells of every frame that a slow reader
+Like Linux' vcan it has no bit rate and no arbitration. Unlike vcan it reports every frame that a slow reader
 loses: by an error frame where they are missing, and by their number in `UnixBus.frames_lost`.
 """
 

@@ -201,7 +201,7 @@ class _HubClient:
         self._limit = limit
         self._untold = 0
 
-    def hears(self, sender: _HubClient, packet: bytes) -> bool:
+    def accepts(self, sender: _HubClient, packet: bytes) -> bool:
         """Whether a frame of that sender is for this end."""
         if not self.joined or ClientOption.DEAF in self.wish:
             return False
@@ -233,7 +233,7 @@ class _HubClient:
         while self.backlog and self._sent(self.backlog[0]):
             self.backlog.popleft()
         if not self.backlog:
-            # Whoever has caught up hears of its loss at once, not with the next frame.
+            # A client that has caught up is told its loss at once, not with the next frame.
             self._queue_notice()
             while self.backlog and self._sent(self.backlog[0]):
                 self.backlog.popleft()
@@ -386,7 +386,7 @@ class Hub:
             client.offer(pack_greeting(wish))
         elif is_frame(packet):
             for other in list(self._clients.values()):
-                if other.hears(client, packet):
+                if other.accepts(client, packet):
                     self._deliver(other, packet)
             self.counters.frames += 1
         else:

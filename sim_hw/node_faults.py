@@ -383,13 +383,13 @@ def _on_the_link(faults: NodeFaults, schedule: Schedule, length: int) -> _Events
     # Frames of the same session in the same window of the link share a plan of their own.
     for begin, end in _runs(session * (len(faults.link) + 1) + window):
         inside = np.arange(begin, end)
-        heard, unheard = inside[~silent[begin:end]], inside[silent[begin:end]]
-        parts.append(_Events.all_alike(unheard, schedule.t_ns[unheard], Fault.SILENCED, length))
+        sent, kept = inside[~silent[begin:end]], inside[silent[begin:end]]
+        parts.append(_Events.all_alike(kept, schedule.t_ns[kept], Fault.SILENCED, length))
         if window[begin] < 0:
-            parts.append(_Events.all_alike(heard, schedule.t_ns[heard], Fault.NONE, length))
+            parts.append(_Events.all_alike(sent, schedule.t_ns[sent], Fault.NONE, length))
         else:
             link = faults.link[int(window[begin])][1]
-            parts.append(_Events.of_link(link, heard, schedule.t_ns[heard], length, salt=begin))
+            parts.append(_Events.of_link(link, sent, schedule.t_ns[sent], length, salt=begin))
     return _Events.joined(parts, length)
 
 

@@ -37,7 +37,7 @@ class DecisionRules:
         back_threshold_nats: evidence that changes it to a healthier mode (one before it in the list).
         identity_nats: lead over the other candidates that a change of the decision takes: odds of 20 to 1.
         settle_revolutions: time since the onset of its evidence that a change of the decision waits for; the
-            departure is told at once. The transient after a severe fault passes by the orbits of milder
+            departure is reported at once. The transient after a severe fault passes by the orbits of milder
             ones of other kinds, so that a bank of many kinds of faults needs some four revolutions.
         group_nats: lead below which two modes are not told apart: odds of 150 to 1.
         alike_nats_per_rev: steady evidence a revolution, by the models, below which two modes never are.

@@ -297,7 +297,7 @@ def _coast(observers: Observers, batch: Batch, cos: float, sin: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _decide(batch: Batch, pairs: Pairs, header: Header) -> int:
-    """What the CUSUM makes of evidence that is enough; the mode that it changes its decision to, or -1."""
+    """The mode that the CUSUM changes its decision to, with evidence that is enough; or -1."""
     if header.decision == UNDETERMINED:
         header.departed = 0
         return first_verdict(batch, pairs, header)

@@ -249,6 +249,7 @@ def _from_scenario(arguments: argparse.Namespace) -> Script:
 def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Script:
     import numpy as np  # noqa: PLC0415
 
+    from daqsvc.detectors.bearing.settings import BEARING  # noqa: PLC0415
     from daqsvc.recording.recording import Recording  # noqa: PLC0415
     from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
@@ -273,7 +274,7 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
         samples_per_rev=per_rev,
         faults=scenario.node_faults(arguments.seed),
         seed=scenario.seed if arguments.seed is None else arguments.seed,
-        detector="bearing",
+        detector=BEARING,
     )
 
 

@@ -1,6 +1,6 @@
 """One run of the demo: a simulated device, the whole service, a broker, and a consumer behind it.
 
-The consumer (`Listener`) knows nothing of the service but its broker. What a run comes to is in `summarise`.
+The consumer (`Listener`) knows nothing of the service but its broker. The result of a run is in `summarise`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import aiomqtt
 import can
 
 from daqsvc.acquisition.clock import DrivenClock, SystemClock
+from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK
 from daqsvc.service import Service
 from drivers.can.plugin import frame_layout
 from drivers.fields import LayoutError
@@ -130,7 +131,6 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-ROTOR_BANK = "rotor-bank"
 LINK_UP_S = 20.0
 KERNELS_S = 300.0
 """What a slow box may take to compile the kernels, at the first run."""
@@ -183,7 +183,7 @@ class DemoOutcome:
         frames_sent: frames that went onto the bus.
         samples_sent: samples that were played.
         messages: messages that the consumer got from the broker.
-        complete: whether the consumer heard the service say goodbye.
+        complete: whether the consumer received the last message of the service.
         alarms: alarm events that it got.
         real_s: how long the playing took.
     """
@@ -382,7 +382,7 @@ async def _unless_ended(task: asyncio.Task[None], work: Coroutine[Any, Any, T]) 
 
 @contextlib.asynccontextmanager
 async def _task(work: Coroutine[Any, Any, T]) -> AsyncIterator[asyncio.Task[T]]:
-    """A task that is cancelled at the end, if it still runs; whoever awaits it hears of its failure."""
+    """A task that is cancelled at the end, if it still runs; its failure is raised where it is awaited."""
     task = asyncio.create_task(work)
     try:
         yield task

@@ -11,7 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from sim_hw.demo.session import ROTOR_BANK
+from daqsvc.detectors.rotor_bank.settings import ROTOR_BANK
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -96,7 +96,7 @@ class View:
                 played_s = payload["window"]["end_index"] / self._script.rate_hz
                 self._start_ns = payload["monotonic_ns"] - round(1e9 * played_s)
         elif message.kind == "alarm":
-            # When it was heard: samples that show it end sooner, and windows of detectors differ.
+            # When it was received: samples that show it end sooner, and windows of detectors differ.
             self._alarms.appendleft((self._now_ns, payload))
             if not self._console.is_terminal:
                 self._console.print(self._alarm_line(self._now_ns, payload), soft_wrap=True)

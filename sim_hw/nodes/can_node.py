@@ -240,7 +240,7 @@ class CanNode(PlannedNode):
         self._lost = True
 
     async def _open_again(self, reopen: Callable[[], can.BusABC]) -> None:
-        while not await asyncio.to_thread(self._opened, reopen):  # noqa: ASYNC110 - nothing tells of it
+        while not await asyncio.to_thread(self._opened, reopen):  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(REOPEN_S)
 
     def _opened(self, reopen: Callable[[], can.BusABC]) -> bool:

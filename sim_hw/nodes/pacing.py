@@ -170,7 +170,7 @@ class LinkLostError(Exception):
 
 
 class PlannedNode(ABC):
-    """Plays a plan, event by event, and keeps the books.
+    """Plays a plan, event by event, and counts what was done.
 
     Args:
         plan: of its frames.

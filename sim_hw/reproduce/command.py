@@ -1,4 +1,4 @@
-"""``daqsvc reproduce``: the paper's experiments from scratch, and what they came to."""
+"""``daqsvc reproduce``: the paper's experiments from scratch, and their results."""
 
 from __future__ import annotations
 

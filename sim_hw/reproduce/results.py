@@ -48,7 +48,7 @@ class ResultRow:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What a study came to.
+    """The results of a study.
 
     Attributes:
         rows: its part of the table.

@@ -200,7 +200,7 @@ def _why_not(order: float, gap: float, rules: RaceRules) -> str:
 def refuse_rivals(
     evidence: Mapping[Part, PartEvidence], bearing: BearingOrders, shaft: ShaftRate, slip: float
 ) -> None:
-    """Refuse to name a part that only a doubtful speed makes of these lines.
+    """Refuse to name a part that has these lines only at a doubtful speed.
 
     Harmonics may be too few to confirm the stated speed, and yet more of them may speak for the speed at
     which the same lines are those of another part.

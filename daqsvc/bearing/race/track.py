@@ -1,7 +1,7 @@
 """A shaft that does not turn evenly: its speed over the record, followed by its own harmonics.
 
 A ramp or a hunt of half a percent smears the tenth harmonic over many bins. It hides a bearing's lines, and
-what it makes of harmonics of the shaft lies beside them, where a bearing's are looked for. Where 1X to 4X, in
+smeared harmonics of the shaft lie beside them, where a bearing's are looked for. Where 1X to 4X, in
 the signal or in the envelope, become sharper on an even angle of the shaft, that angle is taken (order
 tracking).
 """
@@ -40,7 +40,7 @@ CLEAR = 10.0
 END_SHARE = 0.06
 SMOOTH_REVOLUTIONS = 12.0
 """Over as many the phase is averaged."""
-HEARD = 2.0
+AUDIBLE = 2.0
 """The same from which on a harmonic votes."""
 CAP_NATS = 16.0
 """Most that one harmonic counts."""
@@ -160,14 +160,14 @@ class _HarmonicSeries:
                 power = np.abs(lines[row, about]) ** 2
                 floor[row] = max(float(np.median(power)) / EXP_MEDIAN, LEAST_POWER)
                 clear[row] = float(power.sum()) / (floor[row] * len(about)) - 1.0
-        heard = clear > HEARD
-        harmonic = np.tile(HARMONICS, len(series))[heard]
+        audible = clear > AUDIBLE
+        harmonic = np.tile(HARMONICS, len(series))[audible]
         return cls(
-            waves=scipy.fft.ifft(lines[heard], axis=1),
+            waves=scipy.fft.ifft(lines[audible], axis=1),
             harmonic=harmonic,
             shift=harmonic * revolutions - np.rint(harmonic * revolutions),
-            floor=floor[heard],
-            clear=clear[heard],
+            floor=floor[audible],
+            clear=clear[audible],
             revolutions=revolutions,
         )
 

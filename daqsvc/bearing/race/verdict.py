@@ -110,7 +110,7 @@ class RaceVerdict:
         probability: share of belief per word, summing to one, of the words that were weighed.
         lines: kinematic lines found, strongest first.
         margin: how far the decision is from another, as a factor of severity: 1 is on the fence, 10 the most
-            that is told.
+            that is stated.
         speed_rpm: of the shaft, as the harmonics show it.
         speed_seen: whether harmonics of the shaft stood out at all.
         revolutions: of the shaft in the evidence.

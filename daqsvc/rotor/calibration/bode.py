@@ -1,6 +1,6 @@
 """A rotor from the Bode plot of one probe: 1X vectors against speed.
 
-Each mode of natural frequency omega_i and damping ratio zeta_i contributes what unbalance makes of it, times
+Each mode of natural frequency omega_i and damping ratio zeta_i contributes its response to unbalance, times
 a complex gain (eccentricity by modal participation); a constant vector is what does not follow the speed, the
 shaft's runout and the response of modes far above:
 
@@ -54,7 +54,7 @@ class BodeFit:
         damping_ratios: of the same modes.
         gains: complex gain of each, in the unit of the vectors.
         runout: complex vector that does not follow the speed.
-        fitted: complex128 ``[n]``, what the model makes of the vectors.
+        fitted: complex128 ``[n]``, the vectors of the model.
         vector_error: rms of what is left over that of the vectors.
         amplitude_error: rms of the relative error of the amplitude.
         phase_error_deg: rms error of the phase.

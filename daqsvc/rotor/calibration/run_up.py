@@ -286,10 +286,10 @@ class RunUpFit:
         centre_um: where the shaft runs at standstill of the whirl, c; sag and the probes' zero are in it.
         covariance: float64 ``[4, 4]`` of ln f, ln zeta, and real and imaginary part of ln e.
         centre_uncertainty_um: of each coordinate of ``centre_um``.
-        ellipticity: backward over forward whirl, rms over the record, beyond what noise can make of it.
+        ellipticity: backward over forward whirl, rms over the record, beyond what noise explains.
         noise_um: standard deviation of the noise of one probe's sample.
-        fit_error: rms of what repeats with the shaft and no Laval rotor does, beyond what noise can make of
-            it, over that of the whirl.
+        fit_error: rms of what repeats with the shaft and no Laval rotor does, beyond what noise
+            explains, over that of the whirl.
         speed_range_rpm: lowest and highest speed seen.
         revolutions: in the record.
     """

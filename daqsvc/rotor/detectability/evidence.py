@@ -423,7 +423,7 @@ def _log_likelihood_ratios(observers: NDArray[np.void], z: Complexes, angle: Flo
     llr = np.empty((runs, n))
     for run in range(runs):
         xy = np.column_stack((z[:, run].real, z[:, run].imag))
-        # A rub observer that is told nothing starts on the healthy orbit, as in the bank.
+        # A rub observer without a state starts on the healthy orbit, as in the bank.
         states = np.where(observers["substeps"][:, np.newaxis] > 0, np.nan, np.zeros((3, 4)))
         scores = np.empty((3, n))
         cos, sin = np.cos(angle[:, run]), np.sin(angle[:, run])

@@ -352,7 +352,7 @@ def _refuse_nonstationary(values: Floats, samples: float, jitter_um: float) -> N
     Args:
         values: float64 ``[R]``, nonstationarity of every revolution, um^2.
         samples: samples in a revolution.
-        jitter_um: what half a sample of doubt about the marks makes of the whirl.
+        jitter_um: error of the whirl if the keyphasor edges are off by half a sample.
     """
     stretch = least_stationary_stretch(values, samples)
     usual = math.sqrt(float(np.median(values)) / 2.0)

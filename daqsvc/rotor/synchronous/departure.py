@@ -73,7 +73,7 @@ class Spread:
         amplitude_um: modulus of Z_1 that the slope belongs to.
         drift: um^2, variance of the mean position that is the probes', not the shaft's.
         turn_rad: standard deviation of what the angle turns against the shaft in a revolution, where a
-            stated speed stands in for a keyphasor.
+            stated speed replaces a keyphasor.
     """
 
     variance: Floats

@@ -130,7 +130,7 @@ class WatchRules:
         energy_threshold_nats: threshold of the non-harmonic energy.
         naming: how a change gets its name.
         probe_drift_um: standard deviation of the mean position that is drift of the probes.
-        speed_uncertainty: relative standard deviation of a stated speed that stands in for a keyphasor.
+        speed_uncertainty: relative standard deviation of a stated speed that replaces a keyphasor.
         angle_assumed: whether the angle rests on a stated speed at all.
         retry: whether to try again after data that cannot be the baseline.
     """

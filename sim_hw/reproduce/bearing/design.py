@@ -136,7 +136,7 @@ class FixedEigenvalues:
 
 
 def fixed_eigenvalues(model: BearingModel) -> FixedEigenvalues:
-    """What the paper's "check the stability" comes to, in closed form.
+    """The result of the paper's "check the stability", in closed form.
 
     M = m_r + m_b; [M (c_c + c_h) + m_h c_c] s^3 + [M (k_c + k_h) + m_h k_c + c_h c_c] s^2
     + [c_h k_c + k_h c_c] s + k_h k_c.

@@ -276,7 +276,7 @@ def run(seed: int, snr_db: float) -> BearingExperiment:
 
 
 def literal_residual(model: BearingModel, race: str, time: Floats) -> Floats:
-    """What the paper's error equation makes of a row of pulses on one race, float64 ``[n, 2]``."""
+    """Residual of the paper's error equation under a row of pulses on one race, float64 ``[n, 2]``."""
     column = ("inner", "outer").index(race)
     phase = np.mod(time * PULSES_PER_TIME, 1.0) / (PULSE * PULSES_PER_TIME)
     u = np.where(phase < 1.0, np.sin(np.pi * np.minimum(phase, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""The paper's statements about the bearing, each beside what the experiment came to."""
+"""The paper's statements about the bearing, each beside the result of the experiment."""
 
 from __future__ import annotations
 

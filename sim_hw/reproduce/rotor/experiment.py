@@ -302,7 +302,7 @@ _FINER = 8
 
 @dataclass(frozen=True)
 class RotorExperiment:
-    """What the plant did, and what observers and bank made of it.
+    """What the plant did, and the estimates of observers and bank.
 
     Attributes:
         snr_db: signal-to-noise ratio of the run that is shown.
