@@ -1,4 +1,7 @@
-"""The paper's experiments, run as a person runs them; its numbers against others than the program's own."""
+"""The paper's experiments, run as a person runs them; its numbers against others than the program's own.
+
+The last tests are of what figures 8 to 10 rest on: the unit of the faulty race stays, the other one leaves.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,14 @@ from scipy.linalg import expm
 
 from daqsvc import cli
 from sim_hw.reproduce import command, results
+from sim_hw.reproduce.bearing.experiment import RACES, BearingExperiment, run
 from sim_hw.reproduce.command import Study
 from sim_hw.reproduce.results import Findings, ResultRow
 from sim_hw.reproduce.rotor.experiment import delays_rev, wrong_changes
 
 if TYPE_CHECKING:
     from pathlib import Path
+
 
 pytestmark = pytest.mark.integration
 FIGURES = sorted(f"fig{number}.png" for number in range(4, 11))
@@ -297,3 +302,21 @@ def test_help_reads_well(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("usage: daqsvc reproduce")
     assert max(map(len, lines)) <= 100
+
+
+@pytest.fixture(scope="module")
+def experiment() -> BearingExperiment:
+    return run(seed=1, snr_db=20.0)
+
+
+@pytest.mark.parametrize("fault", RACES)
+def test_the_other_unit_is_a_hundred_times_as_far_off(experiment, fault) -> None:
+    other = RACES[1 - RACES.index(fault)]
+    stays, leaves = experiment.leaving(fault, fault), experiment.leaving(fault, other)
+    assert leaves / stays >= 100.0
+    assert leaves > 0.1
+
+
+@pytest.mark.parametrize("race", RACES)
+def test_the_implicit_unit_of_the_faulty_race_does_not_leave_at_all(experiment, race) -> None:
+    assert experiment.still[race, race] < 1e-12
