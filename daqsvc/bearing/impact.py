@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from daqsvc.bearing.model import BearingParameters
 
 
+LOWEST_HZ = 250.0
 DIP_HZ = 2_500.0
 """Bandwidth of the displacement as a rolling element passes a spall."""
 INDEPENDENT = 1.0 / ((1.0 + 2.0 / 36.0) * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)))
@@ -55,6 +56,20 @@ def power(frequency_hz: Floats, corner_hz: float) -> Floats:
     s = 1j * frequency_hz
     high_pass = np.abs(s / (s + corner_hz)) ** (2 * ORDER)
     return np.asarray(high_pass / (1.0 + (frequency_hz / DIP_HZ) ** 2) ** 3, dtype=np.float64)
+
+
+def frame_lines(rate_hz: float, frame_s: float, highest_per_nyquist: float) -> tuple[int, Floats, Mask]:
+    """Samples of a frame, frequencies of the lines of its spectrum that are used, and which of all these are.
+
+    Args:
+        rate_hz: sampling rate.
+        frame_s: length of a frame.
+        highest_per_nyquist: where the lines end, as a part of half the sampling rate.
+    """
+    frame = 2 * round(frame_s * rate_hz / 2.0)
+    frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
+    kept = (frequency_hz > LOWEST_HZ) & (frequency_hz < highest_per_nyquist * rate_hz / 2.0)
+    return frame, frequency_hz[kept], kept
 
 
 def spectra(residual: Floats, frame: int) -> Complexes:

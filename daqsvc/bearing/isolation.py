@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 FRAME_S = 128 / 48_000
 """Length of a frame: a hit, and little of the next."""
-LOWEST_HZ = 250.0
 LOWEST_PER_BALL_MODE, LOWEST_TELLING_HZ = 0.2, 600.0
 """Lines below this share of the rolling elements' mode cannot tell the races apart."""
 HIGHEST_PER_NYQUIST = 2.0 / 3.0
@@ -197,11 +196,8 @@ class IsolationRule:
 
 
 def short_lines(rate_hz: float) -> tuple[int, Floats, impact.Mask]:
-    """Samples of a frame as long as a hit, frequencies of the lines that are looked at, and which these."""
-    frame = 2 * round(FRAME_S * rate_hz / 2.0)
-    frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
-    kept = (frequency_hz > LOWEST_HZ) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0)
-    return frame, frequency_hz[kept], kept
+    """See `impact.frame_lines`, of frames as long as a hit."""
+    return impact.frame_lines(rate_hz, FRAME_S, HIGHEST_PER_NYQUIST)
 
 
 def _lowest_hz(model: BearingModel) -> float:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FRAME_S = 384 / 48_000
 """Length of a frame: the ringing that is left in the residual, and the lines fine enough for it."""
-LOWEST_HZ, HIGHEST_PER_NYQUIST = 250.0, 0.85
+HIGHEST_PER_NYQUIST = 0.85
 LEAST_FRAMES = 24
 STRUCK = 0.3
 """Share of the frames that hold a hit, if there are any."""
@@ -84,7 +84,7 @@ def detection_spectrum(residual: Floats, rate_hz: float) -> HealthySpectrum:
     Raises:
         ValueError: the residual is too short.
     """
-    frame, _, kept = _lines(rate_hz)
+    frame, _, kept = impact.frame_lines(rate_hz, FRAME_S, HIGHEST_PER_NYQUIST)
     return impact.healthy_spectrum(residual, rate_hz, frame, kept, LEAST_FRAMES, "detection")
 
 
@@ -117,7 +117,7 @@ class WhittleDetector:
                 f"bearing detection: a false-alarm rate of {false_alarm_rate:g}; it must be between 0 and 0.5"
             )
         self.false_alarm_rate = false_alarm_rate
-        self._frame, frequency_hz, self._kept = _lines(rate_hz)
+        self._frame, frequency_hz, self._kept = impact.frame_lines(rate_hz, FRAME_S, HIGHEST_PER_NYQUIST)
         self._learnt = healthy.frames
         noise = healthy.covariance
         if len(noise) != self._kept.sum():
@@ -131,7 +131,7 @@ class WhittleDetector:
                 "that both accelerometers are alive and not the same"
             )
         along, best = impact.best_direction(noise, np.diag(BearingModel(parameters).D))
-        ratio = impact.power(frequency_hz[self._kept], CORNER_HZ) * best
+        ratio = impact.power(frequency_hz, CORNER_HZ) * best
         shows = ratio >= _COUNTS * ratio.max()
         self._kept[self._kept] = shows
         # A direction that was learnt from k frames finds 2 / k more in others than in its own.
@@ -202,14 +202,3 @@ class WhittleDetector:
                 nats += self._nats(np.square(seen).sum(axis=0) / learnt)
             drawn.append(float(nats.max()))
         return drawn
-
-
-def _lines(rate_hz: float) -> tuple[int, Floats, impact.Mask]:
-    """Samples of a frame, frequencies of its lines, and which of them are looked at."""
-    frame = 2 * round(FRAME_S * rate_hz / 2.0)
-    frequency_hz = np.asarray(np.fft.rfftfreq(frame, 1.0 / rate_hz), dtype=np.float64)
-    return (
-        frame,
-        frequency_hz,
-        (frequency_hz > LOWEST_HZ) & (frequency_hz < HIGHEST_PER_NYQUIST * rate_hz / 2.0),
-    )
