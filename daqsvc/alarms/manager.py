@@ -22,8 +22,7 @@ from daqsvc.alarms.conditions import (
 )
 from daqsvc.alarms.events import ANNUNCIATIONS, AlarmEvent, Doubt, EventKind, Identity
 from daqsvc.alarms.expected import Expected
-from daqsvc.alarms.first_out import FirstOut
-from daqsvc.alarms.flood import FloodWatch
+from daqsvc.alarms.flood import FirstOut, FloodWatch
 from daqsvc.alarms.handling import CALM, AlarmCounters, ShelvingEnds, shelving_ns
 from daqsvc.alarms.quality import PREFIXES, SensorHealth, in_words
 from daqsvc.alarms.ruled import Ruled, RuledAlarms

@@ -28,6 +28,9 @@ class Limit(NamedTuple):
 class Setpoint:
     """Limits of one measure, in the unit of the measure.
 
+    No copy of an alarm's table: delays are in ns of the samples' time, and limits are sure to be in order,
+    which the table alone is not.
+
     Attributes:
         alert: at or above this the level is alert; None for no such limit.
         danger: at or above this the level is danger; None for no such limit.

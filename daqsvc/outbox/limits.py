@@ -18,6 +18,9 @@ NS_PER_DAY = 86_400 * NS_PER_S
 class OutboxLimits:
     """Bounds of the two classes of messages. What is not sent of the alarms has none but the disk.
 
+    No copy of the table ``[store]``: in bytes and ns, with bounds that no machine file sets, and there even
+    without the table.
+
     Attributes:
         alarms_max_bytes: size of the alarms' file from which on the oldest messages that the broker has are
             deleted. The latest retained message of each topic, and what is not sent, is always kept.

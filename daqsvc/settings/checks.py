@@ -6,24 +6,17 @@ where it asks for a value that is not (`UnusableValueError`): one mistake never 
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
-from daqsvc.settings.alignment_checks import alignment_checks
-from daqsvc.settings.bus_checks import check_devices, check_drivers, check_unused
 from daqsvc.settings.error_messages import dotted
 from daqsvc.settings.failures import mend_or_remove
-from daqsvc.settings.layout_checks import (
-    check_channel_use,
-    check_channels,
-    check_sensor_channel,
-    check_stream_bus,
-    unique,
-)
-from daqsvc.settings.memory_checks import check_memory
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
-from daqsvc.settings.problems import Finding
+from daqsvc.settings.problems import Finding, choice, unique
+from daqsvc.settings.registry import broken_drivers
 from daqsvc.settings.rotor_physics import physics_checks
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.sensor_checks import (
@@ -37,10 +30,12 @@ from daqsvc.settings.sensor_checks import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from daqsvc.settings.buses import Layout
     from daqsvc.settings.hooks import PluginFailedError
-    from daqsvc.settings.models import MachineFile, Stream
+    from daqsvc.settings.models import MachineFile, Sensor, Stream
     from daqsvc.settings.plugins import BusTable
     from daqsvc.settings.problems import KeyPath
+
 
 _MOST_FINDINGS = 200
 """Whoever has mended these may ask again."""
@@ -95,27 +90,27 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     with suppress(UnusableValueError):
         for name, stream in draft.streams.items():
             at: KeyPath = ("streams", name)
-            yield check_stream_bus(draft, stream, at)
+            yield _check_stream_bus(draft, stream, at)
             for plugin in _drivers_of(draft, stream):
                 with suppress(UnusableValueError):
                     yield from plugin.stream_checks(draft, stream, facts.get(name), at)
             with suppress(UnusableValueError):
-                yield check_channels(stream.layout, (*at, "layout"))
-    yield check_unused(draft)
-    yield check_drivers(draft)
-    yield check_devices(draft)
+                yield _check_channels(stream.layout, (*at, "layout"))
+    yield _check_unused(draft)
+    yield _check_drivers(draft)
+    yield _check_devices(draft)
     for plugin in _drivers(draft):
         with suppress(UnusableValueError):
             yield from plugin.checks(draft, facts)
     yield from _sensor_checks(draft, facts)
-    yield check_memory(draft)
+    yield _check_memory(draft)
     yield _names(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
         for _, detector, given in configured(draft.pipeline, valid_only=True):
             with suppress(UnusableValueError):
                 yield from detector.checks(draft, given)
-    yield from alignment_checks(draft)
+    yield from _alignment_checks(draft)
     yield from alarm_checks(draft)
     for _, output, given in configured_outputs(draft, valid_only=True):
         with suppress(UnusableValueError):
@@ -152,11 +147,11 @@ def _sensor_checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Ite
     with suppress(UnusableValueError):
         for index, sensor in enumerate(draft.sensors):
             at: KeyPath = ("sensors", index)
-            yield check_sensor_channel(draft, sensor, at)
+            yield _check_sensor_channel(draft, sensor, at)
             yield check_voltages(draft, sensor, at)
             yield check_sensitivity(sensor, at)
             yield check_reach(draft, sensor, facts, at)
-    yield check_channel_use(draft)
+    yield _check_channel_use(draft)
     yield check_probe_angles(draft)
     yield check_alarm_reach(draft, facts)
 
@@ -165,3 +160,173 @@ def _names(draft: MachineFile) -> Iterator[Finding]:
     with suppress(UnusableValueError):
         yield from unique([sensor.name for sensor in draft.sensors], ("sensors",), "sensor")
     yield from unique([alarm.name for alarm in draft.alarms], ("alarms",), "alarm")
+
+
+def _check_drivers(draft: MachineFile) -> Iterator[Finding]:
+    """The drivers of the buses are installed, and can be loaded."""
+    installed, broken = bus_tables(), broken_drivers()
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            at = ("buses", name, "driver")
+            if bus.driver in broken:
+                remedy = f"install the package that brings it again, or remove [buses.{name}]"
+                yield Finding(at, broken[bus.driver], remedy)
+            elif bus.driver not in installed:
+                remedy = f"{choice(bus.driver, installed)}; or install the package that brings it"
+                yield Finding(at, "no such driver is installed", remedy)
+
+
+def _check_devices(draft: MachineFile) -> Iterator[Finding]:
+    """No device belongs to two buses."""
+    owners: dict[object, str] = {}
+    for name, bus in draft.buses.items():
+        with suppress(UnusableValueError):
+            device = bus.device
+            owner = name if device is None else owners.setdefault(device.identity, name)
+            if device is not None and owner != name:
+                yield Finding(("buses", name, device.key), f'belongs to bus "{owner}" already', device.remedy)
+
+
+def _check_unused(draft: MachineFile) -> Iterator[Finding]:
+    """Streams come over every bus."""
+    used = {stream.bus for stream in draft.streams.values()}
+    for name in draft.buses:
+        if name not in used:
+            yield Finding(
+                ("buses", name), "no stream comes over this bus", "remove it, or add its streams", fatal=False
+            )
+
+
+def _check_channels(layout: Layout, at: KeyPath) -> Iterator[Finding]:
+    """Channel names are unique."""
+    yield from unique(list(layout.channel_names), (*at, layout.channels_key), "channel")
+
+
+def _check_stream_bus(draft: MachineFile, stream: Stream, at: KeyPath) -> Iterator[Finding]:
+    """The stream's bus exists."""
+    if stream.bus not in draft.buses:
+        yield Finding((*at, "bus"), "there is no such bus", choice(stream.bus, draft.buses))
+
+
+def _check_sensor_channel(draft: MachineFile, sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
+    """The sensor's stream and channel exist."""
+    if sensor.stream not in draft.streams:
+        yield Finding((*at, "stream"), "there is no such stream", choice(sensor.stream, draft.streams))
+        return
+    channels = draft.streams[sensor.stream].layout.channel_names
+    if sensor.channel not in channels:
+        yield Finding(
+            (*at, "channel"),
+            f'stream "{sensor.stream}" has no such channel',
+            choice(sensor.channel, channels),
+        )
+
+
+def _check_channel_use(draft: MachineFile) -> Iterator[Finding]:
+    """No channel is claimed by two sensors."""
+    owners: dict[tuple[str, str], int] = {}
+    for index, sensor in enumerate(draft.sensors):
+        with suppress(UnusableValueError):
+            owner = owners.setdefault((sensor.stream, sensor.channel), index)
+            if owner != index:
+                yield Finding(
+                    ("sensors", index, "channel"),
+                    f'channel "{sensor.channel}" of stream "{sensor.stream}" belongs to '
+                    f'sensor "{draft.sensors[owner].name}" already',
+                    "give each sensor a channel of its own",
+                )
+
+
+_ALIGNMENT: KeyPath = ("pipeline", "alignment")
+_COARSE_DEG = 10.0
+"""An error of the phase that a detector of the rotor takes for a change of the machine."""
+
+
+def _alignment_checks(draft: MachineFile) -> Iterator[Iterator[Finding]]:
+    """Every check of the alignment.
+
+    Args:
+        draft: the machine file, or what is valid of it.
+    """
+    with suppress(UnusableValueError):
+        if draft.pipeline.alignment is not None:
+            yield _used(draft)
+            yield _fine_enough(draft, draft.pipeline.alignment.max_error_us)
+
+
+def _used(draft: MachineFile) -> Iterator[Finding]:
+    """Some detector has its sensors in several streams."""
+    named = {sensor.name: sensor.stream for sensor in draft.sensors}
+    if any(len({named.get(name) for name in together}) > 1 for together in draft.sampled_together):
+        return
+    yield Finding(
+        _ALIGNMENT,
+        "has no effect: no detector of the rotor has its sensors in several streams",
+        "remove it",
+        fatal=False,
+    )
+
+
+def _fine_enough(draft: MachineFile, max_error_us: float) -> Iterator[Finding]:
+    """The error is a small part of a revolution."""
+    speed_rpm = abs(draft.machine.speed_rpm)
+    error_deg = 360.0 * speed_rpm / 60.0 * max_error_us / 1e6
+    if error_deg > _COARSE_DEG:
+        yield Finding(
+            (*_ALIGNMENT, "max_error_us"),
+            f"{max_error_us:g} us are {error_deg:.3g} deg of a revolution at {speed_rpm:g} rpm: as much as a "
+            "fault moves the phase",
+            f"write max_error_us = {_COARSE_DEG / 6.0 / speed_rpm * 1e6:.3g} or less, or bring the sensors "
+            "together in one stream",
+            fatal=False,
+        )
+
+
+SAMPLE_BYTES = 4
+_MOST_SHARE = 0.5
+"""Of the memory: the rest is for detectors, outbox, operating system and whoever else there is."""
+_CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+
+
+def memory_bytes() -> int:
+    """The memory that this process may have: that of the computer, or less if its control group has less."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for file in _CGROUP_LIMITS:
+        with suppress(OSError, ValueError):
+            there = min(there, int(file.read_text(encoding="ascii")))
+    return there
+
+
+def needed_bytes(draft: MachineFile) -> dict[str, float]:
+    """What each stream takes: its ring and those of grids that it is in, late frames, blocks on their way."""
+    pipeline = draft.pipeline
+    needed: dict[str, float] = {}
+    rings = dict.fromkeys(draft.streams, 1)
+    for together in draft.sampled_together:
+        joined = {sensor.stream for sensor in draft.sensors if sensor.name in together}
+        for name in joined & rings.keys() if len(joined) > 1 else ():
+            rings[name] += 1
+    for name, stream in draft.streams.items():
+        with suppress(UnusableValueError):
+            row_bytes = SAMPLE_BYTES * len(stream.layout.channel_names)
+            kept_s = pipeline.ring_s * rings[name] + stream.reorder_window_ms / 1e3
+            needed[name] = stream.rate_hz * kept_s * row_bytes
+            if (block := stream.layout.block) is not None:
+                needed[name] += block.buffer_bytes
+    return needed
+
+
+def _check_memory(draft: MachineFile) -> Iterator[Finding]:
+    """The rings of all streams fit the memory together."""
+    needed = needed_bytes(draft)
+    together, there = sum(needed.values()), memory_bytes()
+    if together <= _MOST_SHARE * there:
+        return
+    most = max(needed, key=lambda name: needed[name])
+    fitting_s = draft.pipeline.ring_s * _MOST_SHARE * there / together
+    yield Finding(
+        ("pipeline", "ring_s"),
+        f"the rings of {draft.pipeline.ring_s:g} s would take {together / 1e9:.3g} GB, most of it for stream "
+        f'"{most}" at {draft.streams[most].rate_hz:g} Hz, and this computer has {there / 1e9:.3g} GB',
+        f"write ring_s = {fitting_s:.2g} or less in [pipeline], or correct rate_hz of the stream",
+    )

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, cast
 from daqsvc.settings import registry
 from daqsvc.settings.buses import UnknownBus
 from daqsvc.settings.hooks import contract
-from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
-from daqsvc.settings.packing import PackedLayout
+from daqsvc.settings.packing import PackedLayout, counted, packed_room, valid_raw
 from daqsvc.settings.problems import Finding
 from daqsvc.settings.registry import DetectorKind, DriverKind, OutputKind
 from daqsvc.settings.section import Section

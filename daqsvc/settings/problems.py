@@ -8,7 +8,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
 KeyPath: TypeAlias = tuple[str | int, ...]
@@ -90,3 +90,15 @@ def choice(wanted: str, known: Iterable[str]) -> str:
     close = get_close_matches(wanted, islice(names, _MOST_COMPARED), n=1)
     listed = ", ".join(names[:_MOST_LISTED]) + (", ..." if len(names) > _MOST_LISTED else "")
     return f'did you mean "{close[0]}"? There are: {listed}' if close else f"take one of: {listed}"
+
+
+def unique(names: list[str], at: KeyPath, what: str) -> Iterator[Finding]:
+    """Findings for every name that has been given before in the same array."""
+    seen: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if seen.setdefault(name, index) != index:
+            yield Finding(
+                (*at, index, "name"),
+                f"is the name of an earlier {what} already",
+                f"give each {what} a name of its own",
+            )

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 from daqsvc.settings.buses import BUSY
-from daqsvc.settings.packed_checks import counted, packed_room, valid_raw
+from daqsvc.settings.packing import counted, packed_room, valid_raw
 from daqsvc.settings.problems import Finding, choice
 from daqsvc.settings.section import UnusableValueError
 from daqsvc.settings.units import factor_between, same_unit, unit_of

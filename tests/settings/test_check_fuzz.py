@@ -64,7 +64,7 @@ def checked(folder, name, data):
 
 
 def fuzzed(folder, monkeypatch, seeds):
-    monkeypatch.setattr("daqsvc.settings.memory_checks.memory_bytes", lambda: 2 * RING_BYTES)
+    monkeypatch.setattr("daqsvc.settings.checks.memory_bytes", lambda: 2 * RING_BYTES)
     (folder / "devices").mkdir()
     (folder / "devices" / DEVICE.name).write_bytes(DEVICE.read_bytes())
     (folder / "machines").mkdir()

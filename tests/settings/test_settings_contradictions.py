@@ -508,9 +508,9 @@ def test_rings_that_this_computer_has_no_memory_for(monkeypatch):
 
 def test_the_rings_of_all_streams_are_added_up(monkeypatch):
     # 640 Hz for 30 s, 3 channels of 4 bytes: 230 kB.
-    monkeypatch.setattr("daqsvc.settings.memory_checks.memory_bytes", lambda: 500_000)
+    monkeypatch.setattr("daqsvc.settings.checks.memory_bytes", lambda: 500_000)
     assert outcome(LAVAL.read_text())[0] == {}
-    monkeypatch.setattr("daqsvc.settings.memory_checks.memory_bytes", lambda: 400_000)
+    monkeypatch.setattr("daqsvc.settings.checks.memory_bytes", lambda: 400_000)
     assert "0.00023 GB" in outcome(LAVAL.read_text())[0]["pipeline.ring_s"].message
 
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from daqsvc.detectors.bearing.settings import WINDOW_S
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, named
-from daqsvc.settings.layout_checks import unique
-from daqsvc.settings.problems import Finding, choice
+from daqsvc.settings.problems import Finding, choice, unique
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

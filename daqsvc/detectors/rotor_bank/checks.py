@@ -10,8 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from daqsvc.detectors.shaft.checks import LEAST_FOR_PULSES, check_geometry, check_rotor, check_sensors, named
-from daqsvc.settings.layout_checks import unique
-from daqsvc.settings.problems import Finding
+from daqsvc.settings.problems import Finding, unique
 from daqsvc.settings.rotor_physics import rest_um, whirl_um
 from daqsvc.settings.section import UnusableValueError
 

@@ -73,6 +73,8 @@ class KeyphasorChannel:
 class RotorSetup:
     """What `daqsvc.detectors.rotor_synchronous.recorded.analyse` needs to know.
 
+    No copy of a table: made of several, of calibration files, and of options beside the machine file.
+
     Attributes:
         probes: names of the two channels.
         rotor: what is known about the rotor.
