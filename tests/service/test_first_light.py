@@ -73,7 +73,7 @@ async def play(
     broker_url: str | None = None,
     hear: Callable[[Received], None] = lambda _: None,
 ) -> tuple[DemoSession, DemoOutcome]:
-    session = DemoSession(script, speed=speed, broker_url=broker_url, hear=hear)
+    session = DemoSession(script, speed=speed, broker_url=broker_url, on_message=hear)
     return session, await session.run()
 
 

@@ -76,7 +76,7 @@ async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -
         rate_hz=machine.rate_hz,
         samples_per_rev=64,
     )
-    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=heard.append).run()
     assert outcome.complete
     alarms = [(m.payload["alarm"], m.payload["kind"]) for m in heard if m.kind == "alarm"]
     assert ("sensor-ok/probe-x", "raised") in alarms

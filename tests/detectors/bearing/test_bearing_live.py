@@ -311,7 +311,7 @@ async def test_damage_reaches_the_alarm_over_the_bus() -> None:
         rate_hz=RATE_HZ,
         faults=LinkFaults(drop=0.0003, seed=1),
     )
-    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=heard.append).run()
     assert outcome.complete
     alarms = [m.payload for m in heard if m.kind == "alarm" and m.payload["alarm"] == "bearing-damage"]
     assert [(p["kind"], p["cause"]["decision"]) for p in alarms] == [("raised", "outer")]

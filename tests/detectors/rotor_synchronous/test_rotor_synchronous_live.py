@@ -73,7 +73,7 @@ async def test_a_change_is_one_alarm_refined_from_departure_to_name(rebalanced) 
         rate_hz=rebalanced.rate_hz,
         faults=LinkFaults(drop=0.01, seed=1),
     )
-    outcome = await DemoSession(script, speed=1000, broker_url=None, hear=heard.append).run()
+    outcome = await DemoSession(script, speed=1000, broker_url=None, on_message=heard.append).run()
     assert outcome.complete
     alarms = [m.payload for m in heard if m.kind == "alarm" and m.payload["alarm"] == "rotor-changed"]
     assert [(p["kind"], p["cause"]["decision"]) for p in alarms] == [
