@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import daqsvc
 from daqsvc import kernel_cache
-from daqsvc.commands.alarm_commands import alarm_verbs
-from daqsvc.commands.alarms import AlarmsCommand
+from daqsvc.commands.alarms import AlarmsCommand, alarm_verbs
 from daqsvc.commands.analyze import AnalyzeCommand
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, ArgumentParser
 from daqsvc.commands.calibrate import CalibrateCommand

@@ -1,24 +1,31 @@
-"""``daqsvc alarms``: how the alarms stand and what has happened, from the journal."""
+"""The verbs about alarms.
+
+``daqsvc alarms`` says from the journal how they stand and what has happened. What people do with them goes to
+the service that runs: ``ack``, ``reset``, ``shelve``, ``bypass``, and their undoing.
+"""
 
 from __future__ import annotations
 
 import json
+import os
+import pwd
 import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, count
+from daqsvc.commands.arguments import EXIT_FAILED, EXIT_OK, EXIT_USAGE, alarm_id, count, duration, one_line
 from daqsvc.commands.store_argument import BadFileError, StoreNotFoundError, add_store, chosen_store
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from daqsvc.commands.store_argument import Load
 
 HISTORY = 20
-SLOW_DISK_S = 0.5
 """Events that ``--history`` shows if nobody says how many."""
+SLOW_DISK_S = 0.5
 
 
 class AlarmsCommand:
@@ -119,3 +126,188 @@ def _doubt(store: Path) -> str:
         f"{events} in the service's memory for a disk that cannot be written: this is not how the alarms "
         f"stand by now; {remedy(store)}"
     )
+
+
+LEAST_ID = 4
+"""Letters that the beginning of an occurrence's id must have to be one."""
+
+
+class NoSuchAlarmError(Exception):
+    """What was named is not exactly one alarm; the text says what there is."""
+
+
+class AlarmVerb:
+    """One verb for one alarm, carried out by the service that runs.
+
+    Args:
+        verb: the `daqsvc.alarms.commands.Verb` by its value.
+        help_line: one line for the list of verbs.
+        description: what ``--help`` says first.
+        load: reads a machine file; None after its errors have been printed.
+    """
+
+    def __init__(self, verb: str, help_line: str, description: str, load: Load) -> None:
+        self.help = help_line
+        self.description = (
+            f"{description} The service that runs on the store carries it out and writes it to its audit "
+            "log; the exit code is 0 once that is on disk, and 1 if it is refused or no service runs."
+        )
+        self._verb = verb
+        self._load = load
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """See `daqsvc.cli.Command.add_arguments`."""
+        parser.add_argument(
+            "alarm",
+            type=alarm_id,
+            metavar="ID",
+            help="name of the alarm, or how its id begins in daqsvc alarms",
+        )
+        if self._verb == "shelve":
+            parser.add_argument(
+                "--for",
+                dest="duration_s",
+                type=duration,
+                required=True,
+                metavar="TIME",
+                help="how long, e.g. 90s, 30m, 8h, 2d or 1h30m",
+            )
+        parser.add_argument(
+            "--by", type=one_line, metavar="NAME", help="who asks (default: the user who is logged in)"
+        )
+        parser.add_argument("--reason", type=one_line, default="", metavar="TEXT", help="why")
+        parser.add_argument("--json", action="store_true", help="one JSON object instead of text")
+        add_store(parser)
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """See `daqsvc.cli.Command.run`."""
+        from daqsvc.alarms.commands import AlarmCommand, Verb  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.control import ControlError, ask, request_of  # noqa: PLC0415
+        from daqsvc.outbox.messages import OutboxError  # noqa: PLC0415
+
+        name = arguments.verb
+        try:
+            store = chosen_store(arguments, self._load)
+            alarm, occurrence, machine = _meant(store, arguments.alarm)
+            request = request_of(
+                AlarmCommand(
+                    verb=Verb(self._verb),
+                    alarm=alarm,
+                    by=arguments.by or user_name(),
+                    occurrence=occurrence,
+                    duration_s=getattr(arguments, "duration_s", None),
+                    reason=arguments.reason,
+                ),
+                machine,
+            )
+            outcome = ask(store, request)
+        except BadFileError:
+            return EXIT_USAGE
+        except (StoreNotFoundError, NoSuchAlarmError, OutboxError, ControlError) as error:
+            print(f"daqsvc {name}: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
+            return EXIT_FAILED
+        if arguments.json:
+            told = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
+            came = {"accepted": outcome.accepted, "reason": outcome.reason, "events": list(outcome.events)}
+            print(json.dumps(told | came))  # noqa: T201 - this is what the verb is for
+        elif outcome.accepted:
+            print(f"{alarm}: {outcome.reason or _DONE[self._verb]}")  # noqa: T201
+        else:
+            print(f"daqsvc {name}: refused: {outcome.reason}", file=sys.stderr)  # noqa: T201
+        # Accepted with a reason: the disk has not got it yet.
+        return EXIT_OK if outcome.accepted and not outcome.reason else EXIT_FAILED
+
+
+def alarm_verbs(load: Load) -> dict[str, AlarmVerb]:
+    """The verbs by the name that they have on the command line."""
+    return {
+        name: AlarmVerb(verb, help_line, description, load)
+        for name, verb, help_line, description in (
+            (
+                "ack",
+                "acknowledge",
+                "acknowledge an alarm: somebody has seen it",
+                "Acknowledge an alarm: somebody has seen it.",
+            ),
+            (
+                "reset",
+                "reset",
+                "let go of a latched alarm whose condition has gone",
+                "Let go of a latched alarm. It is refused while the condition stands.",
+            ),
+            (
+                "shelve",
+                "shelve",
+                "put an alarm aside for a stated time",
+                "Put an alarm aside for a stated time, after which it shows again how it stands.",
+            ),
+            (
+                "unshelve",
+                "unshelve",
+                "take a shelved alarm back at once",
+                "Take a shelved alarm back at once.",
+            ),
+            (
+                "bypass",
+                "bypass",
+                "take an alarm out of service",
+                "Take an alarm out of service until it is put back with daqsvc unbypass.",
+            ),
+            (
+                "unbypass",
+                "unbypass",
+                "put an alarm back into service",
+                "Put an alarm back into service.",
+            ),
+        )
+    }
+
+
+def user_name() -> str:
+    """Who is logged in: behind sudo, the person rather than root."""
+    if os.geteuid() == 0 and (person := os.environ.get("SUDO_USER")):
+        return person
+    try:
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return f"uid {os.getuid()}"
+
+
+_DONE = {
+    "acknowledge": "acknowledged",
+    "reset": "reset",
+    "shelve": "shelved",
+    "unshelve": "no longer shelved",
+    "bypass": "out of service",
+    "unbypass": "back in service",
+}
+
+
+def _meant(store: Path, words: str) -> tuple[str, str | None, str | None]:
+    """Alarm, occurrence and machine that a person means; the latter two None if the alarm is named.
+
+    Raises:
+        NoSuchAlarmError: it begins the ids of several occurrences.
+        OutboxError: there is no journal, or it cannot be read.
+    """
+    from daqsvc.commands.alarm_journal import current  # noqa: PLC0415
+
+    events = current(store)
+    if any(told["alarm"] == words for told in events):
+        return words, None, None
+    meant = _begun_by(events, words)
+    if len(meant) > 1:
+        raise NoSuchAlarmError(
+            f"{words!r} begins the ids of {', '.join(told['alarm'] for told in meant)}: "
+            "write more of the id, or the alarm's name"
+        )
+    if meant:
+        return meant[0]["alarm"], meant[0]["occurrence"], meant[0]["machine"]
+    # An alarm that was never raised has no event yet: the service knows whether there is one.
+    return words, None, None
+
+
+def _begun_by(events: Sequence[Mapping[str, Any]], words: str) -> list[Mapping[str, Any]]:
+    if len(words) < LEAST_ID:
+        return []
+    return [told for told in events if (told["occurrence"] or "").startswith(words)]

@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.commands.alarm_commands import user_name
 from daqsvc.commands.alarm_journal import AlarmView, ago, current_table
+from daqsvc.commands.alarms import user_name
 from daqsvc.commands.arguments import duration
 
 
