@@ -502,6 +502,10 @@ class Scenario(ScenarioTable):
         return planned_faults(self.fault, self.link_faults, self.seed if seed is None else seed)
 
 
+_BY_PLANT: dict[str, type[Scenario | BearingScenario]] = {"rotor": Scenario, "bearing": BearingScenario}
+"""What a file is by its plant; one that is neither is refused as a rotor's."""
+
+
 def builtin_scenarios() -> list[str]:
     """Names of the scenarios that come with the package."""
     return sorted(_builtin_files())
@@ -523,9 +527,8 @@ def load_any_scenario(name_or_path: str | Path) -> Scenario | BearingScenario:
     """As `load_scenario`, whatever the plant is."""
     table = _table(name_or_path)
     plant = table.get("plant")
-    if isinstance(plant, dict) and plant.get("kind") == "bearing":
-        return _understood(BearingScenario, table, name_or_path)
-    return _understood(Scenario, table, name_or_path)
+    kind = plant.get("kind") if isinstance(plant, dict) else None
+    return _understood(_BY_PLANT.get(str(kind), Scenario), table, name_or_path)
 
 
 def _table(name_or_path: str | Path) -> dict[str, Any]:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from daqsvc.recording.recording import Recording
+    from sim_hw.demo.machines import AlarmLimits
     from sim_hw.demo.session import DemoOutcome, Received, Script
     from sim_hw.scenario import BearingScenario
 
@@ -251,7 +252,7 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
 
     from daqsvc.detectors.bearing.settings import BEARING  # noqa: PLC0415
     from daqsvc.recording.recording import Recording  # noqa: PLC0415
-    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording  # noqa: PLC0415
+    from sim_hw.demo.machines import PlayedBearing, for_recording  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
     from sim_hw.scenario import Onset  # noqa: PLC0415
 
@@ -263,7 +264,7 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
     begins = [("healthy", 0.0), *((damage.part, damage.at_s) for damage in scenario.damage)]
     return Script(
         title=scenario.title,
-        machine=lambda url: for_recording(recording, "m/s2", Setpoints(), url, bearing),
+        machine=lambda url: for_recording(recording, "m/s2", {}, url, bearing),
         stream="recording",
         samples=samples,
         rate_hz=BEARING_RATE_HZ,
@@ -280,12 +281,12 @@ def _of_bearing(scenario: BearingScenario, arguments: argparse.Namespace) -> Scr
 
 def _from_recording(arguments: argparse.Namespace) -> Script:
     from daqsvc.recording.recording import set_memory, stop_reading  # noqa: PLC0415
-    from sim_hw.demo.machines import PlayedBearing, Setpoints, for_recording, playable, setpoints  # noqa: PLC0415  # noqa: PLC0415
+    from sim_hw.demo.machines import PlayedBearing, for_recording, playable, setpoints  # noqa: PLC0415
     from sim_hw.demo.session import Script  # noqa: PLC0415
 
     set_memory(arguments.max_memory)
     recording = playable(_load(arguments.recording, arguments.map, arguments.fs, "--map"))
-    limits = Setpoints()
+    limits: AlarmLimits = {}
     if arguments.baseline is not None:
         rate_hz = arguments.baseline_fs or arguments.fs
         healthy = _load(

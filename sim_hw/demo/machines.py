@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -54,8 +54,8 @@ SENSOR_TYPES: Mapping[str, str] = {
 }
 
 
-class Setpoints(dict[str, tuple[float, float]]):
-    """Alert and danger limit of the RMS, by channel."""
+AlarmLimits: TypeAlias = dict[str, tuple[float, float]]
+"""Alert and danger limit of the RMS, by channel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ def laval_rig(scenario: Scenario, noise_um: float, url: str) -> MachineFile:
 def for_recording(
     recording: Recording,
     unit: str,
-    setpoints: Setpoints,
+    setpoints: AlarmLimits,
     url: str,
     bearing: PlayedBearing | None = None,
 ) -> MachineFile:
@@ -268,7 +268,7 @@ DANGER = 3.0
 MOST_RATIO = 1000
 
 
-def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
+def setpoints(healthy: Recording, rate_hz: float) -> AlarmLimits:
     """Alert and danger limits of the RMS of each channel.
 
     The healthy recording is first brought to the rate of the one it is compared with: at a higher rate
@@ -285,7 +285,7 @@ def setpoints(healthy: Recording, rate_hz: float) -> Setpoints:
     from scipy.signal import resample_poly  # noqa: PLC0415
 
     ratio = Fraction(rate_hz / healthy.rate_hz).limit_denominator(MOST_RATIO)
-    levels = Setpoints()
+    levels: AlarmLimits = {}
     for column, name in enumerate(healthy.names):
         samples: NDArray[np.float64] = healthy.samples[:, column]
         if np.ptp(samples) == 0.0:

@@ -22,7 +22,7 @@ from daqsvc.outbox import journal, reading, writer
 from daqsvc.outbox.limits import MIB, OutboxLimits
 from daqsvc.outbox.messages import OutboxError
 from daqsvc.recording.recording import Recording
-from sim_hw.demo.machines import Setpoints, for_recording
+from sim_hw.demo.machines import for_recording
 
 pytestmark = pytest.mark.integration
 CLOCK = SystemClock()
@@ -197,7 +197,7 @@ async def test_the_whole_service_watches_on_a_full_disk(disk):
     machine = for_recording(
         Recording(("accel",), samples[:, None], 2000.0, "test", 0),
         "g",
-        Setpoints(accel=(0.5, 3.0)),
+        {"accel": (0.5, 3.0)},
         "mqtt://127.0.0.1:1",
     )
     disk.fill()

@@ -16,7 +16,7 @@ from daqsvc.publish.payloads import AlarmPayload, AvailabilityPayload, Diagnosis
 from daqsvc.recording.recording import Recording, load_recording
 from drivers.can.plugin import frame_layout
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.machines import Setpoints, for_recording, laval_rig, setpoints
+from sim_hw.demo.machines import for_recording, laval_rig, setpoints
 from sim_hw.demo.session import DemoOutcome, DemoSession, Script, summarise
 from sim_hw.link_faults import LinkFaults
 from sim_hw.nodes.can_node import quantised
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from sim_hw.demo.machines import AlarmLimits
     from sim_hw.demo.session import Received
 
 pytestmark = pytest.mark.integration
@@ -54,11 +55,11 @@ def paper(seed: int) -> Script:
 
 
 def recorded(
-    recording: Recording, limits: Setpoints | None = None, faults: LinkFaults | None = None
+    recording: Recording, limits: AlarmLimits | None = None, faults: LinkFaults | None = None
 ) -> Script:
     return Script(
         title="recording",
-        machine=lambda url: for_recording(recording, "g", limits or Setpoints(), url),
+        machine=lambda url: for_recording(recording, "g", limits or {}, url),
         stream="recording",
         samples=recording.samples,
         rate_hz=recording.rate_hz,

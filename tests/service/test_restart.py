@@ -16,7 +16,7 @@ from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.store import Outbox
 from daqsvc.recording.recording import Recording
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.machines import Setpoints, for_recording
+from sim_hw.demo.machines import for_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +36,7 @@ def noise(rms: float) -> np.ndarray[Any, Any]:
 
 def machine(port: int, **alarm: Any) -> MachineFile:
     recording = Recording(("accel",), noise(LOUD), RATE_HZ, __file__, 0)  # type: ignore[arg-type]
-    made = for_recording(recording, "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{port}")
+    made = for_recording(recording, "g", {"accel": (0.5, 5.0)}, f"mqtt://127.0.0.1:{port}")
     return made.model_copy(update={"alarms": [made.alarms[0].model_copy(update=alarm)]})
 
 

@@ -15,7 +15,7 @@ from support.waiting import eventually
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.machines import Setpoints, for_recording, laval_rig
+from sim_hw.demo.machines import for_recording, laval_rig
 from sim_hw.demo.session import DemoSession, Script
 from sim_hw.scenario import load_scenario
 
@@ -40,7 +40,7 @@ async def shake(service: Service, seconds: float) -> None:
 
 async def test_alarms_raised_without_a_broker_go_out_after_a_restart(tmp_path: Path) -> None:
     port = free_port()
-    machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{port}")
+    machine = for_recording(shaking(1), "g", {"accel": (0.5, 5.0)}, f"mqtt://127.0.0.1:{port}")
     async with running(machine, tmp_path) as service:
         await shake(service, 1.0)
         await eventually(lambda: service.alarms.outbox.counters.appended == 1, "the alarm is on disk")
@@ -93,7 +93,7 @@ async def test_a_probe_out_of_its_ok_limits_suppresses_its_alarm_and_is_told() -
 @pytest.mark.long
 async def test_a_bus_that_falls_silent_holds_the_alarm_and_is_told(tmp_path: Path) -> None:
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
-        machine = for_recording(shaking(1), "g", Setpoints(accel=(0.5, 5.0)), broker.url)
+        machine = for_recording(shaking(1), "g", {"accel": (0.5, 5.0)}, broker.url)
         async with running(machine, tmp_path) as service:
             await eventually(lambda: consumer.on("/availability"), "the box is online")
             await shake(service, 1.0)
@@ -120,7 +120,7 @@ async def test_a_stop_does_not_wait_for_kernels_that_compile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = threading.Event()
-    machine = for_recording(shaking(1), "g", Setpoints(), f"mqtt://127.0.0.1:{free_port()}")
+    machine = for_recording(shaking(1), "g", {}, f"mqtt://127.0.0.1:{free_port()}")
     service = Service(machine, tmp_path)
     monkeypatch.setattr(service.pipeline.detectors[0], "warm", lambda: compiled.wait(120))
     stop = asyncio.Event()

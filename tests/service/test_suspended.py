@@ -25,7 +25,7 @@ from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
 from sim_hw.demo.broker import EmbeddedBroker
-from sim_hw.demo.machines import Setpoints, for_recording
+from sim_hw.demo.machines import for_recording
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -73,7 +73,7 @@ async def test_a_wall_clock_that_steps_moves_no_alarm(step_ns: int, tmp_path: Pa
     recording = Recording(("accel",), noise(1.0), RATE_HZ, __file__, 0)  # type: ignore[arg-type]
     clock = SteppedClock()
     async with EmbeddedBroker() as broker, Consumer(broker.port) as consumer:
-        machine = for_recording(recording, "g", Setpoints(accel=(0.5, 5.0)), broker.url)
+        machine = for_recording(recording, "g", {"accel": (0.5, 5.0)}, broker.url)
         service = Service(machine, tmp_path, clock)
 
         def state() -> AlarmState:

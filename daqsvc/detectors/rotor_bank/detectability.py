@@ -14,7 +14,12 @@ if TYPE_CHECKING:
 
     from daqsvc.detectors.rotor_bank.detector import RotorBankDetector
     from daqsvc.detectors.rotor_bank.settings import RotorBank
-    from daqsvc.rotor.detectability.prediction import Ambiguity, Detectability, PairEvidence, SmallestChange
+    from daqsvc.rotor.detectability.prediction import (
+        Ambiguity,
+        BankDetectability,
+        PairEvidence,
+        SmallestChange,
+    )
     from daqsvc.settings import MachineFile
 
 _QUANTITIES = {
@@ -27,7 +32,7 @@ _QUANTITIES = {
 
 def bank_detectability(
     machine: MachineFile, given: RotorBank, detector: RotorBankDetector, process_noise: float | None
-) -> Detectability:
+) -> BankDetectability:
     """Detectability of the bank that the service would run for a machine file.
 
     Args:
@@ -50,7 +55,7 @@ def bank_detectability(
     )
 
 
-def as_json(found: Detectability, machine: MachineFile) -> dict[str, Any]:
+def as_json(found: BankDetectability, machine: MachineFile) -> dict[str, Any]:
     """The figures in the units of the machine file; what is never reached is null.
 
     Args:
@@ -93,7 +98,7 @@ def as_json(found: Detectability, machine: MachineFile) -> dict[str, Any]:
     }
 
 
-def as_text(found: Detectability, machine: MachineFile) -> str:
+def as_text(found: BankDetectability, machine: MachineFile) -> str:
     """Tables and sentences for a person.
 
     Args:
@@ -144,7 +149,7 @@ class _Units:
         return self.um(value) if change.fault == "static_load" else value
 
 
-def _matrix(found: Detectability, figure: Callable[[PairEvidence], float]) -> str:
+def _matrix(found: BankDetectability, figure: Callable[[PairEvidence], float]) -> str:
     width = max(6, *(len(name) for name in found.modes)) + 1
     rows = ["".join(name.rjust(width) for name in ("", *found.modes))]
     for truth in found.modes:
@@ -160,7 +165,7 @@ def _matrix(found: Detectability, figure: Callable[[PairEvidence], float]) -> st
     return "\n".join(rows)
 
 
-def _smallest(found: Detectability, units: _Units) -> str:
+def _smallest(found: BankDetectability, units: _Units) -> str:
     head = (
         "Smallest change that can be seen: by a mode of the bank made for it, half of the time within "
         f"{found.within_rev:.4g}\nrevolutions; and by the synchronous vector, however long it takes, "
@@ -178,7 +183,7 @@ def _smallest(found: Detectability, units: _Units) -> str:
     return "\n".join(rows)
 
 
-def _sentences(found: Detectability, units: _Units) -> list[str]:
+def _sentences(found: BankDetectability, units: _Units) -> list[str]:
     rpm = f"{units.rpm(found.w):.6g} rpm"
     said = [_ambiguity(found, ambiguity, rpm, units) for ambiguity in found.ambiguities]
     if not said:
@@ -199,7 +204,7 @@ def _sentences(found: Detectability, units: _Units) -> list[str]:
     return said
 
 
-def _ambiguity(found: Detectability, ambiguity: Ambiguity, rpm: str, units: _Units) -> str:
+def _ambiguity(found: BankDetectability, ambiguity: Ambiguity, rpm: str, units: _Units) -> str:
     one, other = ambiguity.modes
     sentence = f"{one} and {other} cannot be told apart at {rpm}"
     if found.pair(one, other).simulated:

@@ -208,11 +208,11 @@ Count = Annotated[int, _whole(1)]
 _Row = Annotated[list[float], _list("4 numbers", 4)]
 
 
-class _FileTable(BaseModel):
+class _CalibrationTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class _RotorTable(_FileTable):
+class _RotorTable(_CalibrationTable):
     natural_frequency_hz: Positive
     damping_ratio: DampingRatio
     natural_frequency_tolerance: Tolerance
@@ -221,7 +221,7 @@ class _RotorTable(_FileTable):
     static_sag_um: float | None = None
 
 
-class _ComplexTable(_FileTable):
+class _ComplexTable(_CalibrationTable):
     re: float
     im: float
 
@@ -229,7 +229,7 @@ class _ComplexTable(_FileTable):
         return complex(self.re, self.im)
 
 
-class _RunUpTable(_FileTable):
+class _RunUpTable(_CalibrationTable):
     verdict: str = ""
     source: str = ""
     speed_range_rpm: Annotated[list[float], _list("2 numbers", 2), AfterValidator(_rising)]
@@ -259,7 +259,7 @@ class _ComponentTable(_ComplexTable):
     revolution_variance: Positive
 
 
-class _SteadyTable(_FileTable):
+class _SteadyTable(_CalibrationTable):
     verdict: str = ""
     source: str = ""
     mean_position_um: _ComponentTable
@@ -289,7 +289,7 @@ class _SteadyTable(_FileTable):
         )
 
 
-class _File(_FileTable):
+class _CalibrationFile(_CalibrationTable):
     schema_version: Annotated[int, AfterValidator(_this_version), _whole(0)]
     written: str = ""
     rotor: _RotorTable
@@ -500,7 +500,7 @@ def _record(document: Mapping[str, Any], path: Path) -> CalibrationRecord:
             f"--bearing or --orders, and a rotor is watched here; {_REMEDY}"
         )
     try:
-        table = _File.model_validate(document)
+        table = _CalibrationFile.model_validate(document)
     except ValidationError as error:
         raise CalibrationFileError(f"{path}: {_message(error.errors()[0])}") from None
     if table.run_up is None and not table.steady:

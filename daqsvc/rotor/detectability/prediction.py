@@ -323,7 +323,7 @@ class Ambiguity:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Detectability:
+class BankDetectability:
     """What a bank can tell apart at one speed and noise.
 
     Attributes:
@@ -380,7 +380,7 @@ def detectability(
     calibration_rev: float = 50.0,
     faults: Sequence[Fault] = FAULTS,
     seed: int = 0,
-) -> Detectability:
+) -> BankDetectability:
     """What a bank can tell apart, and how soon.
 
     The delay counts the transient: a change shows only as the orbits drift apart, so that the evidence grows
@@ -444,7 +444,7 @@ def detectability(
         )
         for j, i in itertools.permutations(range(len(modes)), 2)
     )
-    return Detectability(
+    return BankDetectability(
         modes=tuple(names),
         w=w,
         samples_per_rev=per_rev,

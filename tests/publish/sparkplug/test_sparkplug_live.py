@@ -21,7 +21,7 @@ from daqsvc.publish.sparkplug.settings import Sparkplug
 from daqsvc.recording.recording import Recording
 from daqsvc.settings import parse_machine_file
 from daqsvc.settings.describe import describe
-from sim_hw.demo.machines import Setpoints, for_recording
+from sim_hw.demo.machines import for_recording
 
 pytestmark = pytest.mark.integration
 RATE_HZ = 2000.0
@@ -33,7 +33,7 @@ async def test_the_service_is_an_edge_node(tmp_path: Path) -> None:
     samples = np.random.default_rng(0).normal(size=(round(2 * RATE_HZ), 1))
     recording = Recording(("accel",), samples, RATE_HZ, Path(__file__), 0)
     with running_mosquitto(tmp_path) as broker:
-        plain = for_recording(recording, "g", Setpoints(accel=(0.5, 5.0)), f"mqtt://127.0.0.1:{broker.port}")
+        plain = for_recording(recording, "g", {"accel": (0.5, 5.0)}, f"mqtt://127.0.0.1:{broker.port}")
         machine = plain.model_copy(
             update={"mqtt": plain.output(Mqtt).model_copy(update={"sparkplug": Sparkplug()})}
         )
