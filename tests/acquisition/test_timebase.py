@@ -104,7 +104,8 @@ def test_a_restarted_counter_is_found_and_its_loss_estimated(seed, before, off, 
     explained = before - 1 + 30 >= 2**16  # the new count may look like a plain loss of frames
     if not explained:
         assert base.state.restarts == 1
-        assert kept.sum() == 79  # the frame that was held back until the next one confirmed it
+        # The last frame of a batch, if it is the first of the new count, comes once more with the next.
+        assert kept.sum() == (79 if split == 41 else 80)
         error = indices[41:] - (before + off + np.arange(1, 40)) * PER_FRAME
         assert (np.diff(indices[kept]) > 0).all()
         assert np.abs(error).max() <= RATE_HZ * 0.012  # the jitter bounds the guess

@@ -249,7 +249,7 @@ def test_a_machine_files_figures_are_those_of_its_verdict(verb: Run, tmp_path: P
     [
         (("--bearing", "6205-2SR"), "did you mean 6205-2RS?"),
         ((), "--bearing or --orders"),
-        (("--bearing", "6205-2RS", "--calibration", "motor.toml"), "give the healthy recording itself"),
+        (("--bearing", "6205-2RS", "--calibration", "motor.toml"), "name a file that daqsvc calibrate wrote"),
     ],
 )
 def test_wrong_usage_is_told_with_the_remedy(

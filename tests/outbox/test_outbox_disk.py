@@ -68,8 +68,8 @@ async def test_alarms_are_delivered_from_a_full_disk_and_from_memory_and_stored_
     fill(disk)
     waiting = [outbox.submit(TOPIC, lambda n: kilobyte(n) * 9, retain=False) for _ in range(200)]
     await eventually(lambda: outbox.counters.write_errors >= 2, "the disk is full")
+    await eventually(lambda: outbox.counters.unbacked == 1, "memory takes over")
     assert not any(future.done() for future in waiting)
-    assert outbox.counters.unbacked == 1
     there = await outbox.pending(0, 1000)
     assert [m.sequence for m in there if m.stored] == before
     assert [m.sequence for m in there] == list(range(before[0], before[-1] + 201))

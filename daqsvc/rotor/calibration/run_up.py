@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.signal import cont2discrete, lfilter
 
 from daqsvc.dsp.speed.revolutions import Revolutions
 from daqsvc.rotor.laval import LavalRotor, unbalance_response
@@ -425,6 +424,8 @@ def whirl_by_unbalance(
         omega: natural frequency in rad/s.
         zeta: damping ratio.
     """
+    from scipy.signal import cont2discrete, lfilter  # noqa: PLC0415 - takes a second to load
+
     damping = 2.0 * zeta * omega
     numerator, denominator, _ = cont2discrete(
         (np.array([damping, omega**2]), np.array([1.0, damping, omega**2])), step_s, method="foh"
