@@ -185,33 +185,33 @@ class AlarmService:
             self._knows_journal, self._is_in_step = latest is not None, False
             if latest is not None:
                 self._witness_known = self._last_on_witness(latest)
-            told = await asyncio.to_thread(restore_alarms, latest or (), self.topics)
-            self._take_over(told)
+            events = await asyncio.to_thread(restore_alarms, latest or (), self.topics)
+            self._take_over(events)
             if self._knows_journal and self.outbox.broker_is_ahead:
                 self._witness_known = None  # all of it is told anyway
-                self._confirm(self._tell_again(told))
+                self._confirm(self._tell_again(events))
             return
         latest = await self.outbox.latest()
         self._witness_known = self._last_on_witness(latest)
-        told = await asyncio.to_thread(restore_alarms, latest, self.topics)
-        self._take_over(told)
+        events = await asyncio.to_thread(restore_alarms, latest, self.topics)
+        self._take_over(events)
         self._damage_seen = self._damage()
         if self.outbox.broker_is_ahead:
             self._witness_known = None
-            self._confirm(self._tell_again(told))
+            self._confirm(self._tell_again(events))
         elif self._damage_seen:
-            self._confirm(self._forget(told))
+            self._confirm(self._forget(events))
 
-    def _take_over(self, told: Sequence[AlarmEvent]) -> None:
-        for event in told:
+    def _take_over(self, events: Sequence[AlarmEvent]) -> None:
+        for event in events:
             self._newest[event.identity.machine, event.alarm] = event
-        for event in self.manager.resume(told, self._active_detectors, self._conditions):
+        for event in self.manager.resume(events, self._active_detectors, self._conditions):
             self._post(event)
 
     def _damage(self) -> int:
         return self.outbox.counters.quarantined + self.outbox.counters.vanished
 
-    def _forget(self, told: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
+    def _forget(self, events: Iterable[AlarmEvent]) -> list[asyncio.Future[int]]:
         """Say of alarms that nobody knows any more that they are normal: the broker shows how they stood.
 
         Of those that were never told of, the broker shows nothing.
@@ -219,24 +219,24 @@ class AlarmService:
         ever = self.outbox.known_topics
         return [
             self._post(event)
-            for event in self.manager.begin_anew(told, FORGOTTEN)
+            for event in self.manager.begin_anew(events, FORGOTTEN)
             if ever is None or self._topic(event) in ever
         ]
 
-    def _tell_again(self, told: Sequence[AlarmEvent]) -> list[asyncio.Future[int]]:
+    def _tell_again(self, events: Sequence[AlarmEvent]) -> list[asyncio.Future[int]]:
         """Say of every alarm how it stands: the broker may show what the journal never got.
 
         Args:
-            told: what the journal knows, which the alarms have taken over.
+            events: what the journal knows, which the alarms have taken over.
         """
         logger.warning(
             "the service was ended while the disk took no writes: the broker may show what the journal does "
             "not know, so the state of every alarm is sent again"
         )
-        again = [event for event in told if self._newest[event.identity.machine, event.alarm] is event]
+        again = [event for event in events if self._newest[event.identity.machine, event.alarm] is event]
         return [
             *(self._submit(event) for event in again),
-            *(self._post(event) for event in self.manager.begin_anew(told, UNJOURNALLED)),
+            *(self._post(event) for event in self.manager.begin_anew(events, UNJOURNALLED)),
         ]
 
     def _last_on_witness(self, latest: Iterable[OutboxMessage]) -> int:
@@ -248,8 +248,8 @@ class AlarmService:
         Such a run leaves nothing on the disk, but what it has said of the journal is retained at the broker.
         """
         try:
-            told = json.loads(payload)
-            number, series = int(told["sequence"]), str(told["id"])
+            witness = json.loads(payload)
+            number, series = int(witness["sequence"]), str(witness["id"])
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             logger.warning("what the broker keeps on %s cannot be read: %s", self._witness, error)
             return
@@ -299,20 +299,20 @@ class AlarmService:
         damage = self._damage()
         before = dict(self._newest)
         try:
-            told = await asyncio.to_thread(restore_alarms, await self.outbox.latest(), self.topics)
+            events = await asyncio.to_thread(restore_alarms, await self.outbox.latest(), self.topics)
         finally:
             self._catching_up = False
         if not self._knows_journal:
             self._knows_journal = True
-            self._take_over([e for e in told if (e.identity.machine, e.alarm) not in self._newest])
-        stands = {(event.identity.machine, event.alarm): _moment(event) for event in told}
+            self._take_over([e for e in events if (e.identity.machine, e.alarm) not in self._newest])
+        stands = {(event.identity.machine, event.alarm): _moment(event) for event in events}
         committed = [
             self._submit(event)
             for alarm, event in before.items()
             if self._newest[alarm] is event and stands.get(alarm) != _moment(event)
         ]
         if damage > self._damage_seen:
-            committed += self._forget([*told, *self._newest.values()])
+            committed += self._forget([*events, *self._newest.values()])
         self._is_in_step, self._damage_seen = True, damage
         self._confirm(committed)
 
@@ -469,12 +469,12 @@ class AlarmService:
 
     def _of_outputs(self) -> Iterator[Condition]:
         """How things stand with the outputs; what one that is no longer there has said stands no longer."""
-        told = self.manager.conditions
+        raised = self.manager.conditions
         for path, output in self.outputs.items():
             with self._supervisor.sparing_others(output_name(path), "it says nothing of itself meanwhile"):
-                yield from [*output.conditions(told)]
+                yield from [*output.conditions(raised)]
         for prefix, sentence in self._outdated.items():
-            for name in sorted(told):
+            for name in sorted(raised):
                 if name.startswith(prefix):
                     yield Condition(name, Level.NORMAL, sentence)
 

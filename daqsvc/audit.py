@@ -108,13 +108,13 @@ class AuditLog:
         Raises:
             AuditError: the line is not on disk.
         """
-        told = refusals.drain()
-        if told is None:
+        refused = refusals.drain()
+        if refused is None:
             return
         try:
-            await self._append(self._stamp(str(uuid.uuid4()), "refused_many") | told.in_json())
+            await self._append(self._stamp(str(uuid.uuid4()), "refused_many") | refused.in_json())
         except AuditError:
-            refusals.put_back(told)
+            refusals.put_back(refused)
             raise
 
     def _stamp(
@@ -285,8 +285,8 @@ def put_aside(path: Path, quota_bytes: int) -> None:
 def older_parts(path: Path) -> dict[int, Path]:
     """The older parts of the log ``path`` by their numbers; the highest is the newest."""
     named = re.compile(rf"{re.escape(path.stem)}-([0-9]{{6,}}){re.escape(path.suffix)}")
-    found = ((named.fullmatch(one.name), one) for one in path.parent.iterdir())
-    return {int(match[1]): one for match, one in found if match is not None}
+    matches = ((named.fullmatch(one.name), one) for one in path.parent.iterdir())
+    return {int(match[1]): one for match, one in matches if match is not None}
 
 
 def _append_durably(path: Path, line: bytes) -> None:

@@ -187,7 +187,7 @@ class ControlServer:
 
     async def serve(self) -> None:
         """Listen until cancelled, and begin again where that fails, or where the socket is taken away."""
-        backoff, said = Backoff(), self._server is None
+        backoff, is_reported = Backoff(), self._server is None
         try:
             while True:
                 if self._server is None:
@@ -196,12 +196,12 @@ class ControlServer:
                     except ControlError:
                         await asyncio.sleep(backoff.next_ns() / NS_PER_S)
                         continue
-                    if said:
+                    if is_reported:
                         log.warning("commands are taken at %s now", self.path)
                     backoff.reset()
                 await asyncio.sleep(LOOK_S)
                 if not await asyncio.to_thread(_is_at, self.path, self._inode):
-                    said = True
+                    is_reported = True
                     log.warning("the control socket %s was taken away; another one is made", self.path)
                     await self.close()
         finally:

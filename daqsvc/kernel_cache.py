@@ -52,20 +52,20 @@ def prepare(*, say: bool = True) -> None:
     except _UnusableError as error:
         reasons.append(f"{error}")
         _compile_at_every_start()
-        told = "compiled kernels cannot be kept, and every start compiles them"
+        consequence = "compiled kernels cannot be kept, and every start compiles them"
     else:
         os.environ[VARIABLE] = str(temporary)
-        told = f"compiled kernels are kept in {temporary}, where they may be deleted"
+        consequence = f"compiled kernels are kept in {temporary}, where they may be deleted"
     if say:
-        log.warning("%s: %s; %s", told, ", and ".join(reasons), REMEDY)
+        log.warning("%s: %s; %s", consequence, ", and ".join(reasons), REMEDY)
 
 
 def _places(reasons: list[str]) -> Iterator[Path]:
     """What may be asked for, in order of preference; notes what is not even a place."""
     if asked := os.environ.get(VARIABLE):
         yield Path(asked)
-    if given := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
-        yield Path(given) / "kernels"
+    if directory := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
+        yield Path(directory) / "kernels"
         return
     try:
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "daqsvc" / "kernels"

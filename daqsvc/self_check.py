@@ -92,14 +92,14 @@ def conditions(buses: Mapping[str, Collection[str]] = MappingProxyType({})) -> l
     Args:
         buses: by name, what can be watched of each bus; see `BusTable.self_checks`.
     """
-    found = list(STORE)
+    names = list(STORE)
     for kind, check in (
         (BUS_OVERRUN, "overrun"),
         (BUS_CONTROLLER, "controller"),
         (BUS_RECORDING, "recording"),
     ):
-        found += [f"{kind}{bus}" for bus, watched in buses.items() if check in watched]
-    return found
+        names += [f"{kind}{bus}" for bus, watched in buses.items() if check in watched]
+    return names
 
 
 class SelfCheck:
@@ -150,11 +150,11 @@ class SelfCheck:
 
     def _buses(self, vitals: Vitals) -> Iterator[Condition]:
         for bus, health in vitals.buses.items():
-            found = [self._overrun(bus, health, vitals.now_ns)]
+            states = [self._overrun(bus, health, vitals.now_ns)]
             if health.state is not None:
-                found.append(self._controller(bus, health, vitals.now_ns))
-                found.append(self._recording(bus, health, vitals.now_ns))
-            for condition in found:
+                states.append(self._controller(bus, health, vitals.now_ns))
+                states.append(self._recording(bus, health, vitals.now_ns))
+            for condition in states:
                 yield from self._once_known(condition, vitals, watched=health.heard)
         of_a_bus = (BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
         for name in sorted(vitals.conditions_told):

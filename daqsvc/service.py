@@ -314,17 +314,17 @@ class Service:
                 output.report(diagnosis)
 
     def _bus_health(self) -> dict[str, BusHealth]:
-        found: dict[str, BusHealth] = {}
+        health: dict[str, BusHealth] = {}
         for driver in self.drivers:
             counters = driver.counters
-            found[driver.name] = BusHealth(
+            health[driver.name] = BusHealth(
                 counters.overruns,
                 counters.bus_off,
                 counters.controller_state,
                 counters.frames_unrecorded,
                 _has_heard(driver),
             )
-        return found
+        return health
 
     async def _tell_status(self) -> None:
         while True:
@@ -373,16 +373,16 @@ class Service:
         }
 
     def _figures_of_outputs(self) -> dict[str, Mapping[str, Any]]:
-        found: dict[str, Mapping[str, Any]] = {}
+        figures: dict[str, Mapping[str, Any]] = {}
         for path, plugin in output_plugins().items():
             if plugin.status_key:
-                found[plugin.status_key] = {}
+                figures[plugin.status_key] = {}
                 with self.supervisor.sparing_others(output_name(path), "its figures are missing"):
                     if path in self.alarms.outputs:
-                        told = self.alarms.outputs[path].figures()
-                        Figures.model_validate(told)
-                        found[plugin.status_key] = told
-        return found
+                        of_output = self.alarms.outputs[path].figures()
+                        Figures.model_validate(of_output)
+                        figures[plugin.status_key] = of_output
+        return figures
 
 
 def _ring(machine: MachineFile, grid: Grid, detectors: Sequence[Detector]) -> SampleRing:

@@ -133,8 +133,8 @@ class Supervisor:
 
     def _hear_loop(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error, message = context.get("exception"), context.get("message", "something failed")
-        told = message if error is None else f"{message}: {_in_words(error)}"
-        self.failed(OTHERS, told, "the rest goes on")
+        text = message if error is None else f"{message}: {_in_words(error)}"
+        self.failed(OTHERS, text, "the rest goes on")
         if error is not None:
             logger.info("traceback of that failure", exc_info=error)
 
@@ -247,9 +247,9 @@ async def over(parts: Iterable[Part], patience_s: float | None = None) -> None:
 
 def _in_words(error: BaseException) -> str:
     """An exception in one line, with the line of this program that it came through last."""
-    said = next(iter(f"{error}".splitlines()), "")
+    first_line = next(iter(f"{error}".splitlines()), "")
     kind = type(error).__name__
-    what = f"{kind}: {said}" if said else kind
+    what = f"{kind}: {first_line}" if first_line else kind
     trace, place = error.__traceback__, ""
     while trace is not None:
         path = Path(trace.tb_frame.f_code.co_filename)

@@ -182,32 +182,32 @@ class Alarm:
         return bool(self._holds) and hold in self._holds
 
     def resume(
-        self, told: AlarmEvent, found: str, since: ClockReading, now: ClockReading, sentence: str = ""
+        self, event: AlarmEvent, finding: str, since: ClockReading, now: ClockReading, sentence: str = ""
     ) -> None:
         """Stand as the last event before a restart said.
 
         Args:
-            told: that event.
-            found: `RuleFinding.identity` of what stood; empty if nobody knows.
+            event: that event.
+            finding: `RuleFinding.identity` of what stood; empty if nobody knows.
             since: when it was, by the clocks as they are now.
             now: the time now. Shelving goes on by the wall clock, which may have been set since: what was
                 left of it at ``told`` is never exceeded.
             sentence: what stood, in words, where ``told`` does not say it; empty if nobody knows.
         """
-        self._state, self._level = told.own_state, told.to_level
-        self._holds = {Hold(state) for state in told.holds}
-        if told.shelved_until_wall_ns is not None:
-            left_ns = told.shelved_until_wall_ns - max(told.wall_ns, now.wall_ns)
+        self._state, self._level = event.own_state, event.to_level
+        self._holds = {Hold(state) for state in event.holds}
+        if event.shelved_until_wall_ns is not None:
+            left_ns = event.shelved_until_wall_ns - max(event.wall_ns, now.wall_ns)
             self._shelved_until_ns = now.t_ns + max(left_ns, 0)
-        self._occurrence = None if self._state is AlarmState.NORMAL else told.occurrence
-        self._found, self._cause = found, told.cause
-        self.doubts = self._told_doubts = self._seen_doubts = told.doubts
-        if told.kind in FINDINGS:
-            self._told_finding = told.message
+        self._occurrence = None if self._state is AlarmState.NORMAL else event.occurrence
+        self._found, self._cause = finding, event.cause
+        self.doubts = self._told_doubts = self._seen_doubts = event.doubts
+        if event.kind in FINDINGS:
+            self._told_finding = event.message
         elif sentence:
-            self._told_finding = self._saying(told.to_level, sentence)
-        self._chatter.resume(chattering=told.chattering)
-        self._since, self._message = since, told.message
+            self._told_finding = self._saying(event.to_level, sentence)
+        self._chatter.resume(chattering=event.chattering)
+        self._since, self._message = since, event.message
 
     def withdraw(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Return to normal, from whatever state, because nobody will judge the alarm any more."""
@@ -259,12 +259,18 @@ class Alarm:
 
     def _held_back(self, finding: RuleFinding, cause: Diagnosis, at: ClockReading) -> list[AlarmEvent]:
         """A return while the alarm chatters; after a restart somebody must know who still doubts a sensor."""
-        not_ok, told = ({d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts))
+        not_ok, told_not_ok = (
+            {d.detector for d in those if d.not_ok} for those in (self.doubts, self._told_doubts)
+        )
         # That nobody lacks samples any more the next good statement after a restart says, too.
-        if not_ok == told:
+        if not_ok == told_not_ok:
             return []
         # A sensor that flickers must not be an event each time; that it was not OK is on the safe side.
-        if not_ok < told and self._changed_ns is not None and 0 <= at.t_ns - self._changed_ns < CHANGES_NS:
+        if (
+            not_ok < told_not_ok
+            and self._changed_ns is not None
+            and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
+        ):
             return []
         self._found = finding.identity
         message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"

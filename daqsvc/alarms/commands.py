@@ -101,9 +101,9 @@ class CommandMessage(BaseModel):
             ValidationError: it is none.
             ValueError: a key stands twice: nobody knows which one is meant.
         """
-        told = cls.model_validate_json(raw)
+        message = cls.model_validate_json(raw)
         json.loads(raw, object_pairs_hook=_once)
-        return told
+        return message
 
     def command(self, verb: Verb) -> AlarmCommand:
         """What it asks for by ``verb``."""

@@ -96,14 +96,14 @@ class FirstOut:
         self._standing: dict[str, set[str]] = {}
         self._first: dict[str, str] = {}
 
-    def resume(self, told: Iterable[AlarmEvent]) -> None:
+    def resume(self, events: Iterable[AlarmEvent]) -> None:
         """Go on from before a restart.
 
         Args:
-            told: the last event of each alarm, in the order in which they were told: of several that claim
+            events: the last event of each alarm, in the order in which they were told: of several that claim
                 the mark the latest is right, the others' groups have been normal since.
         """
-        for event in told:
+        for event in events:
             group = self._groups.get(event.alarm)
             if group is None:
                 continue

@@ -196,7 +196,7 @@ class AlarmManager:
 
     def resume(
         self,
-        told: Iterable[AlarmEvent],
+        events: Iterable[AlarmEvent],
         active_detectors: Mapping[str, Sequence[str]],
         conditions: Iterable[str] = (),
     ) -> list[AlarmEvent]:
@@ -208,7 +208,7 @@ class AlarmManager:
         anew.
 
         Args:
-            told: the last event of each alarm, in the order in which they were told.
+            events: the last event of each alarm, in the order in which they were told.
             active_detectors: the detectors that will make statements, with the sensors that these rest on.
             conditions: names of what the service will say of itself by `condition`.
 
@@ -216,14 +216,14 @@ class AlarmManager:
             The events by which alarms return to normal that nobody will judge any more: the machine file
             no longer has them, or not what a quality alarm is about.
         """
-        told = list(told)
+        events = list(events)
         self._expected.note(active_detectors, conditions)
         for ruled in self._ruled:
             named = {sensor for d in ruled.rule.detectors for sensor in active_detectors.get(d, ())}
             self._ruled.rest(ruled, frozenset(named) or ruled.sensors)
-        self._first_out.resume(event for event in told if event.identity == self._identity)
-        withdrawn = [self._withdraw(event) for event in told if not self._resumed(event, active_detectors)]
-        self._excuse(told)
+        self._first_out.resume(event for event in events if event.identity == self._identity)
+        withdrawn = [self._withdraw(event) for event in events if not self._resumed(event, active_detectors)]
+        self._excuse(events)
         self._unlooked = True
         for ruled in self._ruled:
             if (
@@ -233,14 +233,14 @@ class AlarmManager:
                 self._doubts.unsettle(ruled.rule)
         return withdrawn
 
-    def begin_anew(self, told: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
+    def begin_anew(self, events: Iterable[AlarmEvent], reason: str) -> list[AlarmEvent]:
         """Say of every alarm that the journal does not know that it is normal; after `resume`.
 
         Args:
-            told: what the journal knows, as of `resume`.
+            events: what the journal knows, as of `resume`.
             reason: why the journal does not know more.
         """
-        known = {event.alarm for event in told if event.identity == self._identity}
+        known = {event.alarm for event in events if event.identity == self._identity}
         names = [*(ruled.alarm.name for ruled in self._ruled), *sorted(self._expected.names)]
         now = self._now()
         cause = no_statement(self._identity.machine, now)
@@ -254,14 +254,14 @@ class AlarmManager:
 
     def _tell(self, events: Iterable[AlarmEvent]) -> list[AlarmEvent]:
         """Mark and count events as they come about, and say if they are a flood."""
-        told = [self._marked(event) for event in events]
+        marked = [self._marked(event) for event in events]
         now = self._now()
         sentence = self._flood.sentence(now.t_ns, self._first_out.marked())
         if sentence is not None:
             level = Level.ALERT if self._flood.flooding else Level.NORMAL
-            told += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]
+            marked += [self._marked(event) for event in self._stand(ALARM_FLOOD, level, sentence, now)]
             self.counters.floods = self._flood.floods
-        return told
+        return marked
 
     def _marked(self, event: AlarmEvent) -> AlarmEvent:
         self.counters.events += 1
@@ -288,14 +288,14 @@ class AlarmManager:
             if not ruled.rule.sensors and diagnosis.sensors and diagnosis.quality != "missing":
                 self._ruled.rest(ruled, frozenset(diagnosis.sensors))
         yield from self._suppression(touched.sensors, diagnosis, at)
-        given = Circumstances(self._start_up.multiplies(at.t_ns), self._doubts.not_ok_sensors)
+        circumstances = Circumstances(self._start_up.multiplies(at.t_ns), self._doubts.not_ok_sensors)
         for ruled in followers:
-            told = diagnosis.quality == "good" or diagnosis.partial
-            if not told or ruled.alarm.is_held(Hold.SUPPRESSED):
+            is_judged = diagnosis.quality == "good" or diagnosis.partial
+            if not is_judged or ruled.alarm.is_held(Hold.SUPPRESSED):
                 ruled.watch.hold(diagnosis)
                 ruled.alarm.hold()
                 continue
-            finding = ruled.watch.find(diagnosis, given)
+            finding = ruled.watch.find(diagnosis, circumstances)
             if finding is not None:
                 yield from ruled.alarm.apply(finding, diagnosis, at)
             elif diagnosis.partial:
@@ -427,14 +427,14 @@ class AlarmManager:
             return False
         return True
 
-    def _excuse(self, told: Sequence[AlarmEvent]) -> None:
+    def _excuse(self, events: Sequence[AlarmEvent]) -> None:
         """Take back that a sensor was not OK where later events show that this was over.
 
         Whoever says good while others have not spoken since a restart changes nothing that a person could
         tell, and neither does whoever then says "not OK" again: the last event of the quality alarm still has
         the first doubt. The alarms that it bears on know better; the last of them to speak counts.
         """
-        ours = [event for event in told if event.identity == self._identity]
+        ours = [event for event in events if event.identity == self._identity]
         place = {event.alarm: number for number, event in enumerate(ours)}
         not_ok = self._doubts.not_ok()
         for name, doubt in not_ok:
@@ -456,9 +456,9 @@ class AlarmManager:
     def _resume_unruled(self, event: AlarmEvent) -> None:
         self._resume_alarm(self._add(event.alarm, latching=False), event, event.found)
 
-    def _resume_alarm(self, alarm: Alarm, event: AlarmEvent, found: str) -> None:
+    def _resume_alarm(self, alarm: Alarm, event: AlarmEvent, finding: str) -> None:
         sentence = in_words(event.alarm, event.doubts) if event.doubts else ""
-        alarm.resume(event, found, self._since(event.wall_ns), self._now(), sentence)
+        alarm.resume(event, finding, self._since(event.wall_ns), self._now(), sentence)
         self._count(AlarmState.NORMAL, alarm.status.state)
         self._await_end_of_shelving(alarm)
 

@@ -190,16 +190,16 @@ class SensorHealth:
         )
         return Doubt(detector, diagnosis.quality, not_ok, diagnosis.reason, tuple(diagnosis.sensors))
 
-    def resume(self, doubts: Iterable[Doubt], t_ns: int, found: str = "") -> None:
+    def resume(self, doubts: Iterable[Doubt], t_ns: int, finding: str = "") -> None:
         """Go on from before a restart, by ``t_ns``: what was lacking is good again when that has lasted.
 
         Args:
             doubts: what stood against the sensors.
             t_ns: monotonic time now.
-            found: what the alarm was raised by, as `finding` names it: the same is no change.
+            finding: what the alarm was raised by, as `finding` names it: the same is no change.
         """
         causes = {
-            part.partition("=")[0]: match[0] for part in found.split("|") if (match := _CAUSE.search(part))
+            part.partition("=")[0]: match[0] for part in finding.split("|") if (match := _CAUSE.search(part))
         }
         for doubt in doubts:
             if doubt.quality == "missing" and doubt.detector in causes:
@@ -263,10 +263,10 @@ class SensorHealth:
         doubts = tuple(sorted((*self.of(name), *self._assumed(name))))
         if not doubts:
             return RuleFinding(Level.NORMAL, "good", lambda: f"{name.partition('/')[2]} is good again")
-        said = "|".join(
+        parts = "|".join(
             f"{d.detector}={d.quality}{self._cause(d)}{'+not_ok' if d.not_ok else ''}" for d in doubts
         )
-        return RuleFinding(Level.ALERT, said, lambda: in_words(name, doubts))
+        return RuleFinding(Level.ALERT, parts, lambda: in_words(name, doubts))
 
     def silences(self, rule: Rule, sensors: frozenset[str]) -> str | None:
         """Why the alarm of ``rule`` cannot speak while it rests on ``sensors``; None if it can.

@@ -65,10 +65,10 @@ class RuledAlarms:
         """Those that ``detector`` feeds or that rest on one of ``sensors``, in order."""
         if not sensors:
             return self.fed_by(detector)
-        found = {ruled.place: ruled for ruled in self.fed_by(detector)}
+        touched = {ruled.place: ruled for ruled in self.fed_by(detector)}
         for sensor in sensors:
-            found |= self._by_sensor.get(sensor, {})
-        return [found[place] for place in sorted(found)]
+            touched |= self._by_sensor.get(sensor, {})
+        return [touched[place] for place in sorted(touched)]
 
     def rest(self, ruled: Ruled, sensors: frozenset[str]) -> None:
         """From now on ``ruled`` rests on ``sensors``."""

@@ -82,7 +82,7 @@ class Circumstances(NamedTuple):
 class Watch(Protocol):
     """The memory of one rule."""
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
+    def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:
         """What a good diagnosis says, or a partial one; None if it says nothing new and everything holds."""
         ...
 
@@ -90,12 +90,12 @@ class Watch(Protocol):
         """A diagnosis was not good: what was known stays known."""
         ...
 
-    def resume(self, level: Level, told: AlarmEvent) -> str:
+    def resume(self, level: Level, event: AlarmEvent) -> str:
         """Go on from before a restart.
 
         Args:
             level: the level that stood; normal if the condition was gone.
-            told: the last event.
+            event: the last event.
 
         Returns:
             `RuleFinding.identity` of what stood; empty if ``told`` does not tell.
@@ -226,8 +226,8 @@ def decision_evidence(diagnosis: Diagnosis) -> float | None:
     among = {decision, *diagnosis.group}
     leads = {name.removeprefix("lead."): nats for name, nats in evidence.items() if name.startswith("lead.")}
     if leads and decision == DEPARTURE:
-        found = [evidence[f"cusum.{mode}"] for mode in among if f"cusum.{mode}" in evidence]
-        return _finite(max(found, default=math.nan))
+        values = [evidence[f"cusum.{mode}"] for mode in among if f"cusum.{mode}" in evidence]
+        return _finite(max(values, default=math.nan))
     if leads:
         return _finite(min((nats for mode, nats in leads.items() if mode not in among), default=math.nan))
     return _finite(max((evidence[mode] for mode in among if mode in evidence), default=math.nan))
@@ -256,14 +256,14 @@ class MeasureWatch:
         self.monitor = SetpointMonitor(setpoint)
         self.setpoint = setpoint
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> tuple[Level, float] | None:
+    def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> tuple[Level, float] | None:
         """The level and the value; None, and everything holds, without the measure.
 
         Of a value of which only bounds are known: a level that has risen to where the value is for sure, with
         the bound that says so. None if it has not.
         """
         value = diagnosis.statistics.get(self._measure)
-        factor = self._trip_multiply if given.starting else 1.0
+        factor = self._trip_multiply if circumstances.starting else 1.0
         if (bounds := diagnosis.bounds.get(self._measure)) is not None:
             before = self.monitor.level
             level = self.monitor.rise(*bounds, diagnosis.t_ns, factor)
@@ -328,11 +328,11 @@ class _LevelWatch:
         self._sensor = rule.sensor
         self._watch = MeasureWatch(rule.alarm, rule.measure, rule.setpoint, rule.trip_multiply)
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
-        found = self._watch.find(diagnosis, given)
-        if found is None:
+    def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:
+        finding = self._watch.find(diagnosis, circumstances)
+        if finding is None:
             return None
-        level, value = found
+        level, value = finding
         return RuleFinding(
             level, self._watch.side(value), lambda: self._watch.in_words(diagnosis, self._sensor, value)
         )
@@ -340,10 +340,10 @@ class _LevelWatch:
     def hold(self, diagnosis: Diagnosis) -> None:  # noqa: ARG002  there is one sensor only
         self._watch.monitor.hold()
 
-    def resume(self, level: Level, told: AlarmEvent) -> str:
+    def resume(self, level: Level, event: AlarmEvent) -> str:
         sides = {TOO_LOW: True, TOO_HIGH: False}
-        self._watch.monitor.resume(level, lower=sides.get(told.found))
-        return told.found
+        self._watch.monitor.resume(level, lower=sides.get(event.found))
+        return event.found
 
 
 class _DecisionWatch:
@@ -351,7 +351,7 @@ class _DecisionWatch:
         self._rule = rule
         self._group: tuple[str, ...] | None = None
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:  # noqa: ARG002
+    def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:  # noqa: ARG002
         if diagnosis.decision == UNDETERMINED:
             return None
         level, evidence = Level.of(diagnosis.severity), decision_evidence(diagnosis)
@@ -370,10 +370,10 @@ class _DecisionWatch:
     def hold(self, diagnosis: Diagnosis) -> None:
         """The detector itself holds its decision."""
 
-    def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  it has no memory of levels
-        if told.found:
-            self._group = tuple(told.found.split("|"))
-        return told.found
+    def resume(self, level: Level, event: AlarmEvent) -> str:  # noqa: ARG002  it has no memory of levels
+        if event.found:
+            self._group = tuple(event.found.split("|"))
+        return event.found
 
     @staticmethod
     def _sentence(diagnosis: Diagnosis, evidence: float | None) -> str:

@@ -60,13 +60,13 @@ class Setpoint:
             ("alert", self.alert),
             ("danger", self.danger),
         )
-        given = [(name, limit) for name, limit in upwards if limit is not None]
-        if not given:
+        limits = [(name, limit) for name, limit in upwards if limit is not None]
+        if not limits:
             raise ValueError("a setpoint needs an alert or a danger limit; it has neither")
-        for name, limit in given:
+        for name, limit in limits:
             if not math.isfinite(limit):
                 raise ValueError(f"limits must be finite, not {name} {limit}")
-        for (name, limit), (above, higher) in pairwise(given):
+        for (name, limit), (above, higher) in pairwise(limits):
             if limit >= higher:
                 raise ValueError(f"{name} {limit} must lie below {above} {higher}")
         if not (math.isfinite(self.deadband) and self.deadband >= 0):

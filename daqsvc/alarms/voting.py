@@ -87,24 +87,24 @@ class _VotingWatch:
         self._at_least: dict[str, Level] = {}
         self._level = Level.NORMAL
 
-    def find(self, diagnosis: Diagnosis, given: Circumstances) -> RuleFinding | None:
+    def find(self, diagnosis: Diagnosis, circumstances: Circumstances) -> RuleFinding | None:
         sensor = self._sensor_of[diagnosis.detector]
         watch = self._watches[sensor]
-        found = watch.find(diagnosis, given)
+        finding = watch.find(diagnosis, circumstances)
         self._votes.pop(sensor, None)
         self._at_least.pop(sensor, None)
         bounds = diagnosis.bounds.get(self._rule.measure)
         if bounds is not None:
-            found = watch.sure(bounds)
-        if found is None:
+            finding = watch.sure(bounds)
+        if finding is None:
             return None
-        vote, value = found
+        vote, value = finding
         if bounds is None:
             self._votes[sensor] = vote
         else:
             self._at_least[sensor] = vote
-        valid = {name: level for name, level in self._votes.items() if name not in given.not_ok}
-        sure_of = {name: level for name, level in self._at_least.items() if name not in given.not_ok}
+        valid = {name: level for name, level in self._votes.items() if name not in circumstances.not_ok}
+        sure_of = {name: level for name, level in self._at_least.items() if name not in circumstances.not_ok}
         silent = len(self._rule.sensors) - len(valid)
         level = self._level
         for reached in _LEVELS:
@@ -126,7 +126,7 @@ class _VotingWatch:
         self._votes.pop(sensor, None)
         self._at_least.pop(sensor, None)
 
-    def resume(self, level: Level, told: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
+    def resume(self, level: Level, event: AlarmEvent) -> str:  # noqa: ARG002  a level has one cause only
         self._level = level
         for watch in self._watches.values():
             # Which sensors had reached it is not told: each must be below the deadband to say it has not.

@@ -91,9 +91,9 @@ def separate(inputs: Floats, designs: Records, memories: Records, residual: Floa
         b = _held(inputs[n, 1], inputs[n + 1, 1], y, inputs[n + 3, 1], inputs[n + 4, 1])
         c = _held(inputs[n, 2], inputs[n + 1, 2], z, inputs[n + 3, 2], inputs[n + 4, 2])
         for i in range(2):
-            told = state[i] + feed[0, i] * a + feed[1, i] * b + feed[2, i] * c
-            told += direct[0, i] * x + direct[1, i] * y + direct[2, i] * z
-            residual[n, i] = told if wait == 0 else np.nan
+            predicted = state[i] + feed[0, i] * a + feed[1, i] * b + feed[2, i] * c
+            predicted += direct[0, i] * x + direct[1, i] * y + direct[2, i] * z
+            residual[n, i] = predicted if wait == 0 else np.nan
         for k in range(12):
             # A lag needs its own old state and that of the next of its race: the update is in place.
             fresh = drive[0, k] * a + drive[1, k] * b + drive[2, k] * c

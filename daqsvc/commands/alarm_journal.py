@@ -66,26 +66,26 @@ def standing(store: Path, events: Sequence[Told]) -> list[AlarmView]:
         OutboxError: the journal cannot be read.
     """
     topics = {entry.topic: json.loads(entry.payload) for entry in read_journal(store, history=0).latest}
-    topic_of = {told.get("id"): topic for topic, told in topics.items()}
+    topic_of = {event.get("id"): topic for topic, event in topics.items()}
     standing_now = {
-        topic: told["occurrence"]
-        for told in events
-        if told["occurrence"] and (topic := topic_of.get(told["id"])) is not None
+        topic: event["occurrence"]
+        for event in events
+        if event["occurrence"] and (topic := topic_of.get(event["id"])) is not None
     }
 
     def is_over(entry: JournalEntry) -> bool:
         return bool(json.loads(entry.payload).get("occurrence") != standing_now[entry.topic])
 
     pasts = read_pasts(store, standing_now, is_over, MOST_EVENTS) if standing_now else {}
-    found = []
-    for told in events:
-        past = list(_told(pasts.get(topic_of.get(told["id"], ""), ())))
+    views = []
+    for event in events:
+        past = list(_told(pasts.get(topic_of.get(event["id"], ""), ())))
         findings = [one["message"] for one in past if one["kind"] in _FINDINGS]
-        message = told["message"]
+        message = event["message"]
         if findings and findings[-1] != message:
             message = f"{findings[-1]}; {message}"
-        found.append(AlarmView(told, past[0]["wall_ns"] if past else told["wall_ns"], message))
-    return found
+        views.append(AlarmView(event, past[0]["wall_ns"] if past else event["wall_ns"], message))
+    return views
 
 
 def history(store: Path, most: int) -> list[Told]:
@@ -115,9 +115,9 @@ def _tell_damage(view: JournalView, store: Path) -> None:
 
 def _told(entries: Iterable[JournalEntry]) -> Iterable[Told]:
     for entry in entries:
-        told = json.loads(entry.payload)
-        if str(told.get("schema", "")).startswith(SCHEMA):
-            yield told
+        event = json.loads(entry.payload)
+        if str(event.get("schema", "")).startswith(SCHEMA):
+            yield event
 
 
 ID_LENGTH = 8
@@ -139,15 +139,15 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
     worst_first = sorted(alarms, key=lambda alarm: (-_LEVELS.index(alarm.told["level"]), -alarm.since_ns))
     rows = [
         [
-            told["level"],
-            _state(told),
-            *_machine(told, machines),
-            told["alarm"],
-            (told["occurrence"] or "-")[:ID_LENGTH],
+            event["level"],
+            _state(event),
+            *_machine(event, machines),
+            event["alarm"],
+            (event["occurrence"] or "-")[:ID_LENGTH],
             f"{_local(since_ns)} ({ago(now_ns - since_ns)})",
             message,
         ]
-        for told, since_ns, message in worst_first
+        for event, since_ns, message in worst_first
     ]
     return _aligned(["LEVEL", "STATE", *machines, "ALARM", "ID", "SINCE", "MESSAGE"], rows)
 
@@ -157,16 +157,16 @@ def history_table(events: Sequence[Told]) -> str:
     machines = _machine_title(events)
     rows = [
         [
-            _local(told["wall_ns"]),
-            told["kind"],
-            told["level"],
-            _state(told),
-            *_machine(told, machines),
-            told["alarm"],
-            (told["occurrence"] or "-")[:ID_LENGTH],
-            told["message"],
+            _local(event["wall_ns"]),
+            event["kind"],
+            event["level"],
+            _state(event),
+            *_machine(event, machines),
+            event["alarm"],
+            (event["occurrence"] or "-")[:ID_LENGTH],
+            event["message"],
         ]
-        for told in events
+        for event in events
     ]
     titles = ["TIME", "EVENT", "LEVEL", "STATE", *machines, "ALARM", "ID", "MESSAGE"]
     return _aligned(titles, rows)
@@ -186,26 +186,26 @@ def ago(age_ns: int) -> str:
 _LEVELS = ("normal", "alert", "danger")
 
 
-def _state(told: Told) -> str:
-    words = str(told["state"]).replace("_", " ")
-    if told["state"] == "shelved" and (until_ns := told.get("shelved_until_wall_ns")):
+def _state(event: Told) -> str:
+    words = str(event["state"]).replace("_", " ")
+    if event["state"] == "shelved" and (until_ns := event.get("shelved_until_wall_ns")):
         words += f" until {_local(until_ns)}"
-    if told.get("covered"):
-        words += f" (over {str(told['covered']).replace('_', ' ')})"
-    if told.get("first_out") and told["state"] != "normal":
+    if event.get("covered"):
+        words += f" (over {str(event['covered']).replace('_', ' ')})"
+    if event.get("first_out") and event["state"] != "normal":
         words += ", first out"
-    if told.get("chattering"):
+    if event.get("chattering"):
         words += ", chattering"
     return words
 
 
-def _machine(told: Told, machines: Sequence[str]) -> list[str]:
-    return [told["machine"]] if machines else []
+def _machine(event: Told, machines: Sequence[str]) -> list[str]:
+    return [event["machine"]] if machines else []
 
 
 def _machine_title(events: Iterable[Told]) -> list[str]:
     """A column for the machine, where there are several."""
-    return ["MACHINE"] if len({told["machine"] for told in events}) > 1 else []
+    return ["MACHINE"] if len({event["machine"] for event in events}) > 1 else []
 
 
 def _local(wall_ns: int) -> str:

@@ -76,7 +76,7 @@ class AlarmsCommand:
                 else:
                     events = current(store)
                     if not arguments.all:
-                        events = [told for told in events if told["state"] != "normal"]
+                        events = [event for event in events if event["state"] != "normal"]
                 _show(store, events, arguments)
             finally:
                 if doubt:
@@ -94,8 +94,8 @@ def _show(store: Path, events: list[dict[str, Any]], arguments: argparse.Namespa
     from daqsvc.commands.alarm_journal import current_table, history_table, standing  # noqa: PLC0415
 
     if arguments.json:
-        for told in events:
-            print(json.dumps(told))  # noqa: T201 - this is what the verb is for
+        for event in events:
+            print(json.dumps(event))  # noqa: T201 - this is what the verb is for
     elif arguments.history is not None:
         print(history_table(events) if events else "nothing has happened yet")  # noqa: T201
     elif events:
@@ -207,9 +207,9 @@ class AlarmVerb:
             print(f"daqsvc {name}: {error}", file=sys.stderr)  # noqa: T201 - errors go to stderr
             return EXIT_FAILED
         if arguments.json:
-            told = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
+            answer = {"verb": self._verb, "alarm": alarm, "occurrence": occurrence, "by": request.by}
             came = {"accepted": outcome.accepted, "reason": outcome.reason, "events": list(outcome.events)}
-            print(json.dumps(told | came))  # noqa: T201 - this is what the verb is for
+            print(json.dumps(answer | came))  # noqa: T201 - this is what the verb is for
         elif outcome.accepted:
             print(f"{alarm}: {outcome.reason or _DONE[self._verb]}")  # noqa: T201
         else:
@@ -293,12 +293,12 @@ def _meant(store: Path, words: str) -> tuple[str, str | None, str | None]:
     from daqsvc.commands.alarm_journal import current  # noqa: PLC0415
 
     events = current(store)
-    if any(told["alarm"] == words for told in events):
+    if any(event["alarm"] == words for event in events):
         return words, None, None
     meant = _begun_by(events, words)
     if len(meant) > 1:
         raise NoSuchAlarmError(
-            f"{words!r} begins the ids of {', '.join(told['alarm'] for told in meant)}: "
+            f"{words!r} begins the ids of {', '.join(event['alarm'] for event in meant)}: "
             "write more of the id, or the alarm's name"
         )
     if meant:
@@ -310,4 +310,4 @@ def _meant(store: Path, words: str) -> tuple[str, str | None, str | None]:
 def _begun_by(events: Sequence[Mapping[str, Any]], words: str) -> list[Mapping[str, Any]]:
     if len(words) < LEAST_ID:
         return []
-    return [told for told in events if (told["occurrence"] or "").startswith(words)]
+    return [event for event in events if (event["occurrence"] or "").startswith(words)]

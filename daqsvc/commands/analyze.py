@@ -118,29 +118,31 @@ def _by_options(arguments: argparse.Namespace) -> Runner:
     from daqsvc.offline.runner import Runner  # noqa: PLC0415
 
     # Without the verb itself, which does not go to another process.
-    told = argparse.Namespace(**{k: v for k, v in vars(arguments).items() if k != "command"})
-    if by_bearing(told):
+    analysis_options = argparse.Namespace(**{k: v for k, v in vars(arguments).items() if k != "command"})
+    if by_bearing(analysis_options):
         healthy = options.recording_options(
-            told,
+            analysis_options,
             in_memory=True,
             patterns=True,
-            calibration=told.calibration,
-            healthy=told.baseline,
-            healthy_channels=told.baseline_map,
-            healthy_rate_hz=told.baseline_fs,
+            calibration=analysis_options.calibration,
+            healthy=analysis_options.baseline,
+            healthy_channels=analysis_options.baseline_map,
+            healthy_rate_hz=analysis_options.baseline_fs,
         )
-        return Runner(partial(options.bearing_machine, told), healthy)
-    if by_orders(told):
+        return Runner(partial(options.bearing_machine, analysis_options), healthy)
+    if by_orders(analysis_options):
         from daqsvc.offline.orders import order_detectors  # noqa: PLC0415 - brings SciPy's transforms
 
-        healthy = options.recording_options(told, in_memory=True, healthy=told.baseline)
-        detectors = partial(order_detectors, told.false_alarm_probability)
-        return Runner(partial(options.accelerometer_machine, told), healthy, detectors)
-    step_rpm = 0.0 if told.speed_rpm is None else told.speed_rpm.step_rpm
+        healthy = options.recording_options(
+            analysis_options, in_memory=True, healthy=analysis_options.baseline
+        )
+        detectors = partial(order_detectors, analysis_options.false_alarm_probability)
+        return Runner(partial(options.accelerometer_machine, analysis_options), healthy, detectors)
+    step_rpm = 0.0 if analysis_options.speed_rpm is None else analysis_options.speed_rpm.step_rpm
     rotor = options.recording_options(
-        told, in_memory=True, calibration=told.calibration, speed_step_rpm=step_rpm
+        analysis_options, in_memory=True, calibration=analysis_options.calibration, speed_step_rpm=step_rpm
     )
-    return Runner(partial(options.rotor_machine, told), rotor)
+    return Runner(partial(options.rotor_machine, analysis_options), rotor)
 
 
 def _outcomes(
@@ -154,12 +156,12 @@ def _outcomes(
             outcome = runner.judge(recordings[0], figures[0], bar.update)
         yield outcome
         return
-    found = judge_all(runner, recordings, figures, processes)
+    outcomes = judge_all(runner, recordings, figures, processes)
     if sys.stdout.isatty():
-        yield from found  # each line tells how far it is
+        yield from outcomes  # each line tells how far it is
         return
     with progress_bar(f"{len(recordings)} recordings") as bar:
-        for done, outcome in enumerate(found, 1):
+        for done, outcome in enumerate(outcomes, 1):
             yield outcome
             bar.update(done, len(recordings))
 

@@ -177,18 +177,18 @@ def channel_names(text: str) -> tuple[str, ...]:
 def channel_map(text: str) -> dict[str, str]:
     """``NAME=VARIABLE,...``: what each channel is called from now on, and in the file."""
     pairs = [pair.partition("=") for pair in text.split(",")]
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for name, _, variable in pairs:
         if not (name.strip() and variable.strip()):
             raise argparse.ArgumentTypeError(
                 f"{text!r} is not a map; write NAME=VARIABLE, several with commas between"
             )
-        if name.strip() in found:
+        if name.strip() in columns:
             raise argparse.ArgumentTypeError(
                 f"{text!r} names {name.strip()!r} twice; give each channel a name of its own"
             )
-        found[name.strip()] = variable.strip()
-    return found
+        columns[name.strip()] = variable.strip()
+    return columns
 
 
 def sampling_rate_hz(text: str) -> float:

@@ -129,9 +129,9 @@ class CalibrateCommand:
         from daqsvc.offline.runner import Runner  # noqa: PLC0415
 
         patterns = calibrates_bearing(arguments)
-        given = recording_options(arguments, in_memory=machine is None, patterns=patterns)
+        options = recording_options(arguments, in_memory=machine is None, patterns=patterns)
         try:
-            runner = Runner(lambda: make(arguments), given, machine=machine and _uncalibrated(machine))
+            runner = Runner(lambda: make(arguments), options, machine=machine and _uncalibrated(machine))
             runner.prepare()
         except ValueError as error:
             self._parser.error(str(error))
@@ -167,7 +167,7 @@ class CalibrateCommand:
         (bearings,) = (one for one in runner.detectors.values() if isinstance(one, RecordedBearings))
         (loaded,) = _with_notes_said([runner.load(recording, only=bearings.sensors)])
         try:
-            return calibrate_bearings(runner.machine, bearings.given, loaded, together=machine is None)
+            return calibrate_bearings(runner.machine, bearings.settings, loaded, together=machine is None)
         except (RefusedError, NotIdentifiableError):
             raise
         except ValueError as error:
@@ -179,9 +179,9 @@ def _uncalibrated(machine: MachineFile) -> MachineFile:
     from daqsvc.settings.plugins import configured  # noqa: PLC0415
 
     update = {
-        key: given.model_copy(update={"calibration": None})
-        for key, _, given in configured(machine.pipeline)
-        if "calibration" in type(given).model_fields
+        key: settings.model_copy(update={"calibration": None})
+        for key, _, settings in configured(machine.pipeline)
+        if "calibration" in type(settings).model_fields
     }
     return machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=update)})
 
@@ -242,7 +242,7 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
 
     record = replace(record, written=iso_utc(SystemClock().wall_ns()))
     try:
-        said = (
+        sentence = (
             json.dumps(as_json(record, arguments.predict_rpm, arguments.out))
             if arguments.json
             else as_text(record, arguments.predict_rpm)
@@ -255,29 +255,29 @@ def _keep(record: CalibrationRecord, arguments: argparse.Namespace) -> int:
         except CalibrationFileError as error:
             return _fail(str(error))
         if not arguments.json:
-            said += f"\nwritten to {arguments.out}"
-    print(said, flush=True)  # noqa: T201 - this is what the verb is for
+            sentence += f"\nwritten to {arguments.out}"
+    print(sentence, flush=True)  # noqa: T201 - this is what the verb is for
     return EXIT_OK
 
 
-def _keep_bearings(found: BearingBaseline, arguments: argparse.Namespace) -> int:
+def _keep_bearings(baseline: BearingBaseline, arguments: argparse.Namespace) -> int:
     """Write the file first, then say what was found."""
     from daqsvc.acquisition.clock import SystemClock, iso_utc  # noqa: PLC0415
     from daqsvc.bearing.baseline import BaselineFileError, save_bearing_baseline  # noqa: PLC0415
     from daqsvc.commands.calibrate_report import bearings_as_json, bearings_as_text  # noqa: PLC0415
 
-    found = replace(found, written=iso_utc(SystemClock().wall_ns()))
+    baseline = replace(baseline, written=iso_utc(SystemClock().wall_ns()))
     if arguments.out is not None:
         try:
-            save_bearing_baseline(found, arguments.out)
+            save_bearing_baseline(baseline, arguments.out)
         except BaselineFileError as error:
             return _fail(str(error))
-    said = (
-        json.dumps(bearings_as_json(found, arguments.out))
+    sentence = (
+        json.dumps(bearings_as_json(baseline, arguments.out))
         if arguments.json
-        else bearings_as_text(found, arguments.out)
+        else bearings_as_text(baseline, arguments.out)
     )
-    print(said, flush=True)  # noqa: T201 - this is what the verb is for
+    print(sentence, flush=True)  # noqa: T201 - this is what the verb is for
     return EXIT_OK
 
 

@@ -35,7 +35,7 @@ def speeds_to_predict(fit: RunUpFit, asked: Sequence[float] | None) -> tuple[flo
 def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path | None) -> dict[str, Any]:
     """One JSON object: lengths in um, uncertainties are standard deviations."""
     rotor = record.rotor
-    found: dict[str, Any] = finite(
+    document: dict[str, Any] = finite(
         {
             "refused": None,
             "out": None if out is None else str(out),
@@ -57,17 +57,17 @@ def as_json(record: CalibrationRecord, asked: Sequence[float] | None, out: Path 
             ],
         }
     )
-    return found
+    return document
 
 
-def bearings_as_json(found: BearingBaseline, out: object) -> dict[str, Any]:
+def bearings_as_json(baseline: BearingBaseline, out: object) -> dict[str, Any]:
     """The healthy state of bearings, and where it was written to."""
     return {
         "refused": None,
-        "source": found.source,
+        "source": baseline.source,
         "written_to": None if out is None else str(out),
-        "rate_hz": found.rate_hz,
-        "speed_rpm": found.speed_rpm,
+        "rate_hz": baseline.rate_hz,
+        "speed_rpm": baseline.speed_rpm,
         "models": [
             {
                 "channels": list(channels),
@@ -76,28 +76,28 @@ def bearings_as_json(found: BearingBaseline, out: object) -> dict[str, Any]:
                 "whiteness_p": residual.model.whiteness.p_value,
                 "predictable": residual.model.whiteness.predictable,
                 "windows": residual.windows,
-                "window_s": residual.window_samples / found.rate_hz,
+                "window_s": residual.window_samples / baseline.rate_hz,
                 "spread_db": float(residual.spread_db[0]),
             }
-            for channels, residual in found.residuals.items()
+            for channels, residual in baseline.residuals.items()
         ],
         "lines": {
             channel: {part: {"z": e.z, "size": e.depth} for part, e in race.evidence.items()}
-            for channel, race in found.races.items()
+            for channel, race in baseline.races.items()
         },
     }
 
 
-def bearings_as_text(found: BearingBaseline, out: object) -> str:
+def bearings_as_text(baseline: BearingBaseline, out: object) -> str:
     """The same in lines for a person."""
-    lines = [f"{found.source}: {found.rate_hz:g} Hz, {found.speed_rpm:g} rpm"]
-    for channels, residual in found.residuals.items():
+    lines = [f"{baseline.source}: {baseline.rate_hz:g} Hz, {baseline.speed_rpm:g} rpm"]
+    for channels, residual in baseline.residuals.items():
         model = residual.model
         lines.append(
             f"{' and '.join(channels)}: autoregressive of order {model.order}, stable (largest pole "
             f"{model.spectral_radius:.4f}); {100.0 * model.whiteness.predictable:.2g} % of the innovations "
             f"can still be predicted; {residual.windows} windows of "
-            f"{residual.window_samples / found.rate_hz:.3g} s differ by {residual.spread_db[0]:.2f} dB"
+            f"{residual.window_samples / baseline.rate_hz:.3g} s differ by {residual.spread_db[0]:.2f} dB"
         )
     if out is not None:
         lines.append(f"written to {out}")
@@ -192,14 +192,14 @@ def _run_up_lines(fit: RunUpFit, source: str, asked: Sequence[float] | None) -> 
         f"noise {fit.noise_um:.3g} um a sample, fit error {100.0 * fit.fit_error:.2g} %, backward over "
         f"forward whirl {100.0 * fit.ellipticity:.2g} %"
     )
-    said = [frequency, unbalance, errors, fit.describe()]
+    lines = [frequency, unbalance, errors, fit.describe()]
     for speed in speeds_to_predict(fit, asked):
         vector, deviation = fit.predict(speed)
-        said.append(
+        lines.append(
             f"predicted 1X at {speed:.0f} rpm: {abs(vector):.4g} +- {deviation:.2g} um at "
             f"{_degrees(vector):z.1f} degrees"
         )
-    return [f"{source}: {fit.revolutions} revolutions from {low:.0f} to {high:.0f} rpm", *_indented(said)]
+    return [f"{source}: {fit.revolutions} revolutions from {low:.0f} to {high:.0f} rpm", *_indented(lines)]
 
 
 def _steady_lines(record: CalibrationRecord, calibration: Calibration, source: str) -> list[str]:
@@ -209,20 +209,20 @@ def _steady_lines(record: CalibrationRecord, calibration: Calibration, source: s
         f"1X {abs(forward):.4g} +- {deviations[1]:.2g} um at {_degrees(forward):z.1f} degrees, backward over "
         f"forward 1X {100.0 * calibration.ellipticity:.2g} %"
     )
-    said = [whirl]
+    lines = [whirl]
     if (off := _off_prediction(record.run_up, calibration)) is not None:
-        said.append(f"1X is {100.0 * off:.2g} % off what the run-up predicts")
-    said += [
+        lines.append(f"1X is {100.0 * off:.2g} % off what the run-up predicts")
+    lines += [
         f"mean position ({mean.real:.4g}, {mean.imag:.4g}) +- {deviations[0]:.2g} um",
         f"noise {calibration.noise_um:.3g} um a sample, SNR {calibration.snr_db:.1f} dB",
         f"the machine {calibration.describe()}",
     ]
     head = f"{source}: {calibration.revolutions} revolutions at {calibration.speed_rpm:.2f} rpm"
-    return [head, *_indented(said)]
+    return [head, *_indented(lines)]
 
 
-def _indented(said: Sequence[str]) -> list[str]:
-    return [f"  {line}" for line in said]
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
 
 
 def _off_prediction(fit: RunUpFit | None, calibration: Calibration) -> float | None:

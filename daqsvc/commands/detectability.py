@@ -92,8 +92,8 @@ class DetectabilityCommand:
         if wrong := _misuse(machine, arguments):
             return _complain(arguments, wrong, EXIT_USAGE)
         machine = _varied(machine, arguments.speed_rpm, arguments.false_alarms_per_1000_rev)
-        plugin, given = next(
-            (table, given) for _, table, given in configured(machine.pipeline) if _is_predictable(table)
+        plugin, settings = next(
+            (table, settings) for _, table, settings in configured(machine.pipeline) if _is_predictable(table)
         )
         options = DetectabilityOptions(
             process_noise=arguments.process_noise,
@@ -102,12 +102,12 @@ class DetectabilityCommand:
         )
         self._prepare_kernel_cache()
         try:
-            found = cast("DetectorPlugin[Any]", plugin).detectability(machine, given, options)
+            prediction = cast("DetectorPlugin[Any]", plugin).detectability(machine, settings, options)
         except UnfitOptionError as error:
             return _complain(arguments, f"{error}", EXIT_USAGE)
         except (AssemblyError, ValueError) as error:
             return _complain(arguments, f"{error}", EXIT_FAILED)
-        print(json.dumps(found.json) if arguments.json else found.text)  # noqa: T201 - this is what the verb is for
+        print(json.dumps(prediction.json) if arguments.json else prediction.text)  # noqa: T201 - this is what the verb is for
         return EXIT_OK
 
 
@@ -147,9 +147,9 @@ def _varied(
     if false_alarms_per_1000_rev is not None:
         update = {"false_alarms_per_1000_rev": false_alarms_per_1000_rev}
         watching = {
-            key: given.model_copy(update=update)
-            for key, _, given in configured(machine.pipeline)
-            if update.keys() <= type(given).model_fields.keys()
+            key: settings.model_copy(update=update)
+            for key, _, settings in configured(machine.pipeline)
+            if update.keys() <= type(settings).model_fields.keys()
         }
         machine = machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=watching)})
     return machine

@@ -44,8 +44,10 @@ class Example(NamedTuple):
     @property
     def devices(self) -> list[str]:
         """Names of the DBC files that it needs."""
-        found = [line.split(_DEVICES)[1].split('"')[0] for line in self.text.splitlines() if _DEVICES in line]
-        return [name for name in found if name.endswith(".dbc")]
+        devices = [
+            line.split(_DEVICES)[1].split('"')[0] for line in self.text.splitlines() if _DEVICES in line
+        ]
+        return [name for name in devices if name.endswith(".dbc")]
 
 
 def _root() -> Traversable:
@@ -54,12 +56,12 @@ def _root() -> Traversable:
 
 def examples() -> dict[str, Example]:
     """Every example by name, machine files first."""
-    found: dict[str, Example] = {}
+    by_name: dict[str, Example] = {}
     for folder in _FOLDERS:
         for file in sorted((_root() / folder).iterdir(), key=lambda one: one.name):
             name = file.name.removesuffix(".toml")
-            found[name] = Example(name, folder, file.read_text(encoding="utf-8"))
-    return found
+            by_name[name] = Example(name, folder, file.read_text(encoding="utf-8"))
+    return by_name
 
 
 class ExampleCommand:

@@ -98,7 +98,7 @@ def add_calibrate_options(parser: argparse.ArgumentParser) -> None:
     _add_rotor(
         parser.add_argument_group("without a machine file").add_argument,
         speed_help="speed of the steady recordings, negative if clockwise; exact if there is no keyphasor",
-        told="; a run-up tells it",
+        help_more="; a run-up tells it",
     )
     _add_bearing_of_calibrate(parser)
 
@@ -159,8 +159,8 @@ def calibrate_misuse(arguments: argparse.Namespace, machine: Path | None, record
     if arguments.out is None and not arguments.json:
         return "nothing would be kept: give --out FILE, --json or both"
     rotor = ("--probes", "--speed-rpm", *_ROTOR, "--ac-coupled")
-    if machine is not None and (given := _given(arguments, rotor)):
-        return f"{', '.join(given)}: the machine file says this; leave it out"
+    if machine is not None and (options := _given(arguments, rotor)):
+        return f"{', '.join(options)}: the machine file says this; leave it out"
     if arguments.live:
         return _live_misuse(arguments, machine, recordings)
     if not recordings:
@@ -191,7 +191,7 @@ def fault_orders(text: str) -> dict[str, float]:
         argparse.ArgumentTypeError: one is missing, unknown, given twice or no positive number.
     """
     form = ",".join(f"{key}=.." for key in _ORDER_KEYS)
-    found: dict[str, float] = {}
+    orders: dict[str, float] = {}
     for part in text.split(","):
         key, _, value = (piece.strip() for piece in part.partition("="))
         try:
@@ -200,14 +200,14 @@ def fault_orders(text: str) -> dict[str, float]:
             number = math.nan
         if (
             key.upper() not in _ORDER_KEYS
-            or key.upper() in found
+            or key.upper() in orders
             or not (math.isfinite(number) and number > 0.0)
         ):
             raise argparse.ArgumentTypeError(f"{part!r} is no fault order; write {form}, each once")
-        found[key.upper()] = number
-    if missing := [key for key in _ORDER_KEYS if key not in found]:
+        orders[key.upper()] = number
+    if missing := [key for key in _ORDER_KEYS if key not in orders]:
         raise argparse.ArgumentTypeError(f"{', '.join(missing)} missing in {text!r}; write {form}")
-    return found
+    return orders
 
 
 def _add_rotor_of_analyze(parser: argparse.ArgumentParser) -> None:
@@ -384,13 +384,13 @@ def _add_bearing(add: Callable[..., argparse.Action]) -> None:
     )
 
 
-def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: str = "") -> None:
+def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, help_more: str = "") -> None:
     """Probes, speed and rotor, which a machine file says otherwise.
 
     Args:
         add: ``add_argument`` of the group that takes the options.
         speed_help: what the speed is.
-        told: what is said beside the rotor's figures, where something else can tell them.
+        help_more: what is said beside the rotor's figures, where something else can tell them.
     """
     add("--probes", type=probe_pair, metavar="X,Y", help="channels of the two probes, y 90 degrees after x")
     add(
@@ -410,7 +410,7 @@ def _add_rotor(add: Callable[..., argparse.Action], *, speed_help: str, told: st
         ("natural-frequency", "hz", "F", "natural frequency of the healthy shaft"),
         ("damping", "ratio", "Z", "its damping ratio"),
     ):
-        add(f"--{name}-{unit}", type=positive, metavar=metavar, help=f"{about}{told}")
+        add(f"--{name}-{unit}", type=positive, metavar=metavar, help=f"{about}{help_more}")
         add(
             f"--{name}-tolerance",
             type=percent,

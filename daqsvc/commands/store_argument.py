@@ -37,8 +37,8 @@ def store_directory(machine: MachineFile) -> Path:
     """
     if machine.store is not None:
         return machine.resolve(machine.store.directory)
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.split(":")[0])
+    if directory := os.environ.get("STATE_DIRECTORY"):
+        return Path(directory.split(":")[0])
     return _state_directory() / f"{machine.site}-{machine.box}-{machine.machine.name}"
 
 
@@ -75,8 +75,8 @@ def chosen_store(arguments: argparse.Namespace, load: Load) -> Path:
         if machine is None:
             raise BadFileError
         return store_directory(machine)
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.split(":")[0])
+    if directory := os.environ.get("STATE_DIRECTORY"):
+        return Path(directory.split(":")[0])
     return _only_store(_state_directory())
 
 

@@ -46,8 +46,8 @@ def _answer(request: Mapping[str, Any], replies: BinaryIO) -> None:
     arrays: Sequence[NDArray[np.generic]] = ()
     header: dict[str, Any] = {}
     try:
-        found, arrays = getattr(importlib.import_module(module), name)(**request["arguments"])
-        header = {"found": found, "arrays": [(array.dtype.str, array.shape) for array in arrays]}
+        result, arrays = getattr(importlib.import_module(module), name)(**request["arguments"])
+        header = {"found": result, "arrays": [(array.dtype.str, array.shape) for array in arrays]}
     except MemoryError:
         header, arrays = {"raised": "MemoryError", "message": ""}, ()
     except Exception as error:  # noqa: BLE001 - whoever asked decides what it means

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 def plugins(machine: MachineFile) -> Iterator[tuple[DetectorPlugin[Any], Any]]:
     """The kinds of detectors that a machine file has a table for, each with its table."""
-    for _, plugin, given in configured(machine.pipeline):
-        yield cast("DetectorPlugin[Any]", plugin), given
+    for _, plugin, settings in configured(machine.pipeline):
+        yield cast("DetectorPlugin[Any]", plugin), settings
 
 
 def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]:
@@ -35,9 +35,9 @@ def detectors(machine: MachineFile, store: Path | None = None) -> list[Detector]
             detector under a name that no alarm can follow.
     """
     made: dict[str, Detector] = {}
-    for plugin, given in plugins(machine):
+    for plugin, settings in plugins(machine):
         with failing_in(machine.path):
-            built = list(plugin.build(machine, given, store))
+            built = list(plugin.build(machine, settings, store))
         for detector in built:
             if detector.name in made:
                 raise AssemblyError(f"two detectors are named {detector.name!r}; have the plugin number them")
@@ -58,5 +58,5 @@ def check_files(machine: MachineFile) -> None:
         AssemblyError: one cannot, or is not, or a plugin fails; the message names file, key and remedy.
     """
     with failing_in(machine.path):
-        for plugin, given in plugins(machine):
-            plugin.check_files(machine, given)
+        for plugin, settings in plugins(machine):
+            plugin.check_files(machine, settings)

@@ -345,7 +345,7 @@ class Pipeline:
         heard = {name: (ring.end_index, self._doubts_told[name]) for name, ring in self._rings.items()}
         looked_ns = self._clock.monotonic_ns()
         since_ns = {name: looked_ns + self._settling_ns.get(name, 0) for name in self._rings}
-        said: set[str] = set()
+        silent: set[str] = set()
         while True:
             await self._clock.sleep_ns(LOOK_NS)
             now_ns = self._clock.monotonic_ns()
@@ -356,12 +356,12 @@ class Pipeline:
                 has_doubt = bool(self._standings[name].doubt)
                 come = (heard[name][0] if has_doubt else ring.end_index, self._doubts_told[name])
                 if come != heard[name]:
-                    if name not in said and not has_doubt:
+                    if name not in silent and not has_doubt:
                         self._patience[name].heard_after(now_ns - since_ns[name])
                     heard[name], since_ns[name] = come, now_ns
-                    said.discard(name)
-                elif name not in said and now_ns - since_ns[name] >= self._patience[name].ns:
-                    said.add(name)
+                    silent.discard(name)
+                elif name not in silent and now_ns - since_ns[name] >= self._patience[name].ns:
+                    silent.add(name)
                     self._say_nothing_comes(name, now_ns - since_ns[name], now_ns)
 
     def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> None:
@@ -397,11 +397,11 @@ class Pipeline:
             job = self._under_way[detector.name]
             await self._until_made(detector, job, kernels)
             del self._under_way[detector.name]
-            stream, said = detector.stream, job.outcome.result()
+            stream, diagnoses = detector.stream, job.outcome.result()
             if self._changes[stream] != self._seen_changes[detector.name]:
                 continue  # its samples may not have been what they seemed
             # What lies before a silence that has been told is history: it must not speak after it.
-            self._held[stream] += (one for one in said if one.t_ns > self._silent_until_ns[stream])
+            self._held[stream] += (one for one in diagnoses if one.t_ns > self._silent_until_ns[stream])
             if self._standings[stream].proven:
                 self._let_go(stream)
 

@@ -66,12 +66,12 @@ class DetectorPlugin(PipelineTable[SettingsT]):
     predictable: ClassVar[bool] = False
 
     @may_raise(AssemblyError)
-    def build(self, machine: MachineFile, given: SettingsT, store: Path | None) -> Iterable[Detector]:
+    def build(self, machine: MachineFile, settings: SettingsT, store: Path | None) -> Iterable[Detector]:
         """The detectors that the table asks for.
 
         Args:
             machine: the machine file.
-            given: the table.
+            settings: the table.
             store: directory of the state that survives restarts; None to begin without any and leave none.
 
         Raises:
@@ -80,7 +80,7 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         raise NotImplementedError
 
     @may_raise(AssemblyError)
-    def check_files(self, machine: MachineFile, given: SettingsT) -> None:
+    def check_files(self, machine: MachineFile, settings: SettingsT) -> None:
         """See whether what the table names beside the machine file can be used.
 
         Raises:
@@ -89,13 +89,13 @@ class DetectorPlugin(PipelineTable[SettingsT]):
 
     @may_raise(AssemblyError, ValueError)
     def recorded(
-        self, machine: MachineFile, given: SettingsT, options: RecordingOptions
+        self, machine: MachineFile, settings: SettingsT, options: RecordingOptions
     ) -> RecordedDetector[Any]:
         """The detector for recordings: what ``daqsvc analyze`` shows of it.
 
         Args:
             machine: the machine file.
-            given: the table.
+            settings: the table.
             options: what is said of the recordings.
 
         Returns:
@@ -106,17 +106,17 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         """
         from daqsvc.diagnosis.recorded import RecordedLive  # noqa: PLC0415 - NumPy, which `check` need not
 
-        return RecordedLive(machine, given, options, self.build)
+        return RecordedLive(machine, settings, options, self.build)
 
     @may_raise(AssemblyError, ValueError)
     def detectability(
-        self, machine: MachineFile, given: SettingsT, options: DetectabilityOptions
+        self, machine: MachineFile, settings: SettingsT, options: DetectabilityOptions
     ) -> Detectability:
         """What the detector can tell apart, how soon and from which change on: ``daqsvc detectability``.
 
         Args:
             machine: the machine file.
-            given: the table.
+            settings: the table.
             options: what is said beside it.
 
         Raises:
@@ -126,12 +126,12 @@ class DetectorPlugin(PipelineTable[SettingsT]):
         """
         raise NotImplementedError
 
-    def readings(self, machine: MachineFile, given: SettingsT) -> Iterable[Reading]:
+    def readings(self, machine: MachineFile, settings: SettingsT) -> Iterable[Reading]:
         """The figures that are shown by themselves."""
-        del machine, given
+        del machine, settings
         return ()
 
-    def quality_alarms(self, machine: MachineFile, given: SettingsT) -> Iterable[str]:
+    def quality_alarms(self, machine: MachineFile, settings: SettingsT) -> Iterable[str]:
         """Names of the alarms about what its detectors rest on: that these say ``detector-ok`` is enough."""
-        del machine, given
+        del machine, settings
         return () if self.detector is None else (f"detector-ok/{self.detector}",)

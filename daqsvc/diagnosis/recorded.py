@@ -163,9 +163,9 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
     part: ClassVar[str] = ""
     takes_fewer: ClassVar[bool] = False
 
-    def __init__(self, machine: MachineFile, given: SettingsT, options: RecordingOptions) -> None:
+    def __init__(self, machine: MachineFile, settings: SettingsT, options: RecordingOptions) -> None:
         self.machine = machine
-        self.given = given
+        self.settings = settings
         self.options = options
 
     @property
@@ -180,8 +180,8 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
             sensors: names of the sensors that the recording has.
         """
         known = {sensor.name for sensor in self.machine.sensors}
-        named = known.intersection(_texts(self.given.model_dump()))
-        return self.given if all(name in sensors for name in named) else None
+        named = known.intersection(_texts(self.settings.model_dump()))
+        return self.settings if all(name in sensors for name in named) else None
 
     def left_out(self, sensors: Container[str]) -> str:
         """What of the machine a recording tells nothing of, in a sentence; empty if there is nothing.
@@ -203,12 +203,12 @@ class RecordedDetector(Hooks, Generic[SettingsT]):
         return None
 
     @may_raise(AssemblyError, ValueError)
-    def evaluate(self, recorded: Recorded, given: SettingsT, progress: Progress | None) -> Evaluated:
+    def evaluate(self, recorded: Recorded, settings: SettingsT, progress: Progress | None) -> Evaluated:
         """Process a recording.
 
         Args:
             recorded: the recording, with the machine as far as it has its sensors.
-            given: what `as_recorded` made of the table.
+            settings: what `as_recorded` made of the table.
             progress: told the samples done and to do, now and then.
 
         Raises:
@@ -231,17 +231,17 @@ class RecordedLive(RecordedDetector[SettingsT]):
     def __init__(
         self,
         machine: MachineFile,
-        given: SettingsT,
+        settings: SettingsT,
         options: RecordingOptions,
         build: Callable[[MachineFile, SettingsT, Path | None], Iterable[Detector]],
     ) -> None:
-        super().__init__(machine, given, options)
+        super().__init__(machine, settings, options)
         self._build = build
 
-    def evaluate(self, recorded: Recorded, given: SettingsT, progress: Progress | None) -> Evaluated:
+    def evaluate(self, recorded: Recorded, settings: SettingsT, progress: Progress | None) -> Evaluated:
         """See `RecordedDetector.evaluate`."""
         del progress
-        detectors = self._build(recorded.machine, given, None)
+        detectors = self._build(recorded.machine, settings, None)
         return Evaluated(tuple(s for detector in detectors for s in statements_of(detector, recorded)))
 
 
@@ -305,7 +305,7 @@ class Statements:
                 "history": [],
             }
         worst = self.worst
-        found: dict[str, Any] = finite(
+        document: dict[str, Any] = finite(
             {
                 "decision": last.decision,
                 "severity": last.severity,
@@ -322,7 +322,7 @@ class Statements:
                 "history": [self._step(change) for change in self.changes()],
             }
         )
-        return found
+        return document
 
     def describe(self) -> str:
         """One line for a person."""
@@ -382,8 +382,8 @@ def by_name(detector: str, diagnoses: Iterable[Diagnosis], rate_hz: float) -> tu
 
 def worst(statements: Iterable[Statements]) -> str:
     """The most severe of what several detectors said, in words; empty if all is normal."""
-    found = [(one.detector, one.worst, one.rate_hz) for one in statements if one.worst is not None]
-    alarmed = [one for one in found if one[1].severity != "normal"]
+    candidates = [(one.detector, one.worst, one.rate_hz) for one in statements if one.worst is not None]
+    alarmed = [one for one in candidates if one[1].severity != "normal"]
     if not alarmed:
         return ""
     name, diagnosis, rate_hz = max(alarmed, key=lambda one: _SEVERITIES.index(one[1].severity))

@@ -57,8 +57,8 @@ def alignment(machine: MachineFile, clock: Clock | None, deliver: Callable[[Samp
     def pass_on(block: AlignedBlock) -> None:
         deliver(block.as_block())
 
-    given = machine.pipeline.alignment
-    if given is None:
+    settings = machine.pipeline.alignment
+    if settings is None:
         return Alignment()
     return Alignment(
         Aligner(
@@ -70,8 +70,8 @@ def alignment(machine: MachineFile, clock: Clock | None, deliver: Callable[[Samp
                 for name, stream in grid.streams.items()
             ],
             pass_on,
-            max_error_ns=given.max_error_us * 1e3,
-            max_wait_ns=round(given.max_wait_ms * _NS_PER_MS),
+            max_error_ns=settings.max_error_us * 1e3,
+            max_wait_ns=round(settings.max_wait_ms * _NS_PER_MS),
             clock=clock,
         )
         for grid in machine.grids

@@ -64,17 +64,17 @@ class WindowDetector:
     """
 
     def __init__(self, machine: MachineFile, name: str, sensors: Sequence[str], window_s: float) -> None:
-        found = [_sensor(machine, name, sensor) for sensor in sensors]
-        streams = {sensor.stream for sensor in found}
+        resolved = [_sensor(machine, name, sensor) for sensor in sensors]
+        streams = {sensor.stream for sensor in resolved}
         if len(streams) != 1:
             raise AssemblyError(
                 f"detector {name} takes samples of one stream together, and its sensors "
                 f"{', '.join(sensors)} are in {', '.join(sorted(streams)) or 'none'}; give it sensors of one"
             )
         self.name = name
-        self.stream = found[0].stream
+        self.stream = resolved[0].stream
         self.block = max(round(window_s * machine.streams[self.stream].rate_hz), 1)
-        self._columns = [machine.column(sensor) for sensor in found]
+        self._columns = [machine.column(sensor) for sensor in resolved]
         self._held = Diagnosis(
             machine.machine.name, name, 0, self.stream, 0, 0, "undetermined", sensors=tuple(sensors)
         )
@@ -106,7 +106,7 @@ class WindowDetector:
         after = len(window.samples) - at - length
         missing = float(np.mean(~np.isfinite(samples)))
         quality: Quality = "missing" if missing else "good"
-        said = replace(
+        diagnosis = replace(
             self._held,
             t_ns=window.t_end_ns - round(after * window.period_ns),
             first_index=window.first_index + at,
@@ -117,14 +117,14 @@ class WindowDetector:
             missing_share=missing,
         )
         if missing:
-            return said
+            return diagnosis
         judged = self.judge(samples)
         if not isinstance(judged, Judgement):
             raise TypeError(f"judge() returned {judged!r}; return a Judgement")
         decision = judged.decision or judged.severity
         changed = decision != self._held.decision
         self._held = replace(
-            said,
+            diagnosis,
             decision=decision,
             severity=judged.severity,
             statistics=judged.statistics,

@@ -88,9 +88,9 @@ class _Listener:
         (detector,) = detectors(_only_rotor(machine, revolutions))
         assert isinstance(detector, RotorSynchronousDetector)  # noqa: S101 - the only one left
         self._detector = detector
-        given = machine.pipeline.table(RotorSynchronous)
-        assert given is not None  # noqa: S101 - the command has asked for it
-        grid = machine.grid(given.sampled_together)
+        settings = machine.pipeline.table(RotorSynchronous)
+        assert settings is not None  # noqa: S101 - the command has asked for it
+        grid = machine.grid(settings.sampled_together)
         capacity = max(round(_RING_S * grid.rate_hz), 4 * detector.block)
         self._ring = SampleRing(grid.name, grid.channel_names, capacity)
         self._alignment = alignment(machine, clock, self._deliver)
@@ -137,10 +137,10 @@ class _Listener:
 
 def _only_rotor(machine: MachineFile, revolutions: int) -> MachineFile:
     """The machine with the calibrated rotor as its only detector, not calibrated yet."""
-    given = machine.pipeline.table(RotorSynchronous)
-    assert given is not None  # noqa: S101 - the command has asked for it
+    settings = machine.pipeline.table(RotorSynchronous)
+    assert settings is not None  # noqa: S101 - the command has asked for it
     update: dict[str, Section | None] = {key: None for key, _, _ in configured(machine.pipeline)}
-    update["rotor_synchronous"] = given.model_copy(
+    update["rotor_synchronous"] = settings.model_copy(
         update={"calibration": None, "calibrate_revolutions": revolutions}
     )
     return machine.model_copy(update={"pipeline": machine.pipeline.model_copy(update=update)})

@@ -197,13 +197,13 @@ class _Playing:
 
 def _specs(machine: MachineFile) -> dict[str, list[StreamSpec[FrameLayout]]]:
     """By bus, its streams that come in CAN frames."""
-    found: dict[str, list[StreamSpec[FrameLayout]]] = {}
+    specs: dict[str, list[StreamSpec[FrameLayout]]] = {}
     for name, stream in machine.streams.items():
         if isinstance(stream.layout, PlainLayout | DbcLayout):
             window_ns = round(stream.reorder_window_ms * _NS_PER_MS)
             spec = StreamSpec(name, frame_layout(machine, name), stream.rate_hz, window_ns)
-            found.setdefault(stream.bus, []).append(spec)
-    return found
+            specs.setdefault(stream.bus, []).append(spec)
+    return specs
 
 
 class _Log:
@@ -242,7 +242,7 @@ class _Log:
             )
 
     def _sort(self, messages: list[can.Message], t_ns: NDArray[np.int64]) -> DecodedBatch:
-        found = DecodedBatch()
+        decoded = DecodedBatch()
         channels = ["" if message.channel is None else str(message.channel) for message in messages]
         for channel in dict.fromkeys(channels):
             rows = [k for k, name in enumerate(channels) if name == channel]
@@ -253,13 +253,13 @@ class _Log:
             part = (bus or self._buses[0]).sorter.sort(batch, 0)
             if bus is not None:
                 for stream, frames in part.frames.items():
-                    known = found.frames.get(stream)
+                    known = decoded.frames.get(stream)
                     # Two channels may be the same bus.
-                    found.frames[stream] = frames if known is None else joined(known, frames)
+                    decoded.frames[stream] = frames if known is None else joined(known, frames)
                 self.taken = self.taken or bool(part.frames)
             for name, count in part.unknown.items():
-                found.unknown[name] = found.unknown.get(name, 0) + count
-        return found
+                decoded.unknown[name] = decoded.unknown.get(name, 0) + count
+        return decoded
 
     def _choose(self, channel: str, parts: Mapping[str, DecodedBatch]) -> _Bus | None:
         """The bus that a channel is; None while that does not show.
@@ -338,8 +338,8 @@ def _recording(
         for name, channels in group.items():
             if (sensor.stream, sensor.channel) in channels:
                 column = np.full(length, np.nan)
-                found = rows[name].samples[:, channels.index((sensor.stream, sensor.channel))]
-                column[shifts[name] : shifts[name] + len(found)] = found
+                values = rows[name].samples[:, channels.index((sensor.stream, sensor.channel))]
+                column[shifts[name] : shifts[name] + len(values)] = values
                 names.append(sensor.name)
                 columns.append(column)
     streams = {stream for channels in group.values() for stream, _ in channels}

@@ -58,12 +58,12 @@ def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
     Raises:
         ValueError: the options contradict each other.
     """
-    given = vars(arguments)
+    options = vars(arguments)
     probes, keyphasor, speed = arguments.probes, arguments.keyphasor, arguments.speed_rpm
     speed_rpm = math.nan if speed is None or speed.rpm is None else speed.rpm
-    if math.isnan(speed_rpm) and given.get("sweep_rpm") is not None:
+    if math.isnan(speed_rpm) and options.get("sweep_rpm") is not None:
         speed_rpm = arguments.sweep_rpm[1]
-    orbit = given.get("follow_orbit", False) or (speed is not None and speed.orbit)
+    orbit = options.get("follow_orbit", False) or (speed is not None and speed.orbit)
     if keyphasor is not None and orbit:
         raise ValueError(
             "speed and angle come either from the keyphasor or from the orbit: leave out --keyphasor, or "
@@ -84,12 +84,12 @@ def rotor_machine(arguments: argparse.Namespace) -> MachineFile:
         sensors.append(_sensor(Keyphasor, keyphasor, arguments.map, "V", **hidden))
     frequency_hz, damping = arguments.natural_frequency_hz, arguments.damping_ratio
     asked = {
-        key: given[option]
+        key: options[option]
         for key, option in (
             ("calibrate_revolutions", "calibrate_revs"),
             ("false_alarms_per_1000_rev", "false_alarms_per_1000_rev"),
         )
-        if option in given
+        if option in options
     }
     rotor = RotorSynchronous.model_construct(
         probes=probes,
@@ -121,8 +121,10 @@ def bearing_machine(arguments: argparse.Namespace) -> MachineFile:
     Raises:
         ValueError: the orders contradict each other, or the catalogue does not know the bearing.
     """
-    given = _orders(arguments)
-    orders = FaultOrders.model_construct(bpfi=given.inner, bpfo=given.outer, bsf=given.ball, ftf=given.cage)
+    fault_orders = _orders(arguments)
+    orders = FaultOrders.model_construct(
+        bpfi=fault_orders.inner, bpfo=fault_orders.outer, bsf=fault_orders.ball, ftf=fault_orders.cage
+    )
     bearings = tuple(
         WatchedBearing.model_construct(name=name, sensor=name, type=arguments.bearing, orders=orders)
         for name in arguments.channels
@@ -195,8 +197,10 @@ def _orders(arguments: argparse.Namespace) -> BearingOrders:
             return bearing_orders(arguments.bearing)
         except KeyError as error:
             raise ValueError(f"--bearing: {error.args[0]}") from None
-    given = arguments.orders
+    orders = arguments.orders
     try:
-        return BearingOrders(inner=given["BPFI"], outer=given["BPFO"], ball=given["BSF"], cage=given["FTF"])
+        return BearingOrders(
+            inner=orders["BPFI"], outer=orders["BPFO"], ball=orders["BSF"], cage=orders["FTF"]
+        )
     except ValueError as error:
         raise ValueError(f"--orders: {error}") from None

@@ -50,13 +50,13 @@ class RecordedOrders(RecordedDetector[Orders]):
 
     part = "rotor"
 
-    def __init__(self, machine: MachineFile, given: Orders, options: RecordingOptions) -> None:
-        super().__init__(machine, given, options)
+    def __init__(self, machine: MachineFile, settings: Orders, options: RecordingOptions) -> None:
+        super().__init__(machine, settings, options)
         self._setup = OrderSetup(
             channels=tuple(sensor.name for sensor in machine.sensors),
             speed_rpm=machine.machine.speed_rpm,
             unit=cast("AccelerationUnit", machine.sensors[0].unit),
-            rules=OrderRules(false_alarm_probability=given.false_alarm_probability),
+            rules=OrderRules(false_alarm_probability=settings.false_alarm_probability),
         )
         self._name = cast("str", options.healthy)
         wanted = {sensor.name: sensor.channel for sensor in machine.sensors}
@@ -69,7 +69,7 @@ class RecordedOrders(RecordedDetector[Orders]):
     def as_recorded(self, sensors: Container[str]) -> Orders:
         """See `RecordedDetector.as_recorded`: all accelerometers are there, or nothing is read."""
         del sensors
-        return self.given
+        return self.settings
 
     def not_judged(self, recording: str, why: str) -> OrderVerdict:
         """See `RecordedDetector.not_judged`."""
@@ -81,9 +81,9 @@ class RecordedOrders(RecordedDetector[Orders]):
             refused=why,
         )
 
-    def evaluate(self, recorded: Recorded, given: Orders, progress: Progress | None) -> Evaluated:
+    def evaluate(self, recorded: Recorded, settings: Orders, progress: Progress | None) -> Evaluated:
         """See `RecordedDetector.evaluate`."""
-        del given, progress  # a recording takes a tenth of a second
+        del settings, progress  # a recording takes a tenth of a second
         verdict = analyse_orders(recorded.recording, self._setup, self._baseline, self._name)
         return Evaluated(verdict=verdict)
 
@@ -101,8 +101,8 @@ def order_detectors(
     Raises:
         ValueError: the healthy run cannot be used.
     """
-    given = Orders.model_construct(false_alarm_probability=false_alarm_probability)
-    return {"orders": RecordedOrders(machine, given, options)}
+    settings = Orders.model_construct(false_alarm_probability=false_alarm_probability)
+    return {"orders": RecordedOrders(machine, settings, options)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +152,7 @@ class OrderVerdict(Verdict):
         """A JSON object: all figures finite, amplitudes in the unit of the samples."""
         orders, change = self.orders, self.change
         shares = {} if change is None else {str(name): p for name, p in change.probabilities.items()}
-        found: dict[str, Any] = finite(
+        document: dict[str, Any] = finite(
             {
                 "recording": self.recording,
                 "baseline": self.baseline,
@@ -181,7 +181,7 @@ class OrderVerdict(Verdict):
                 "refused": self.refused,
             }
         )
-        return found
+        return document
 
     def _channels(self, change: OrderChange) -> dict[str, Any]:
         velocity = self._velocity_mm_s(change)
@@ -215,9 +215,11 @@ class OrderVerdict(Verdict):
         if self.change is None or self.orders is None:
             return f"{self.recording}: not judged: {self.refused}"
         change, orders = self.change, self.orders
-        said = " or ".join(name.replace("_", " ") for name in change.group)
+        changes = " or ".join(name.replace("_", " ") for name in change.group)
         seen = "" if orders.speed_seen else ", guessed: no order stands out of the noise"
-        lines = [f"{self.recording}: {said}" + (" (cannot be told apart)" if len(change.group) > 1 else "")]
+        lines = [
+            f"{self.recording}: {changes}" + (" (cannot be told apart)" if len(change.group) > 1 else "")
+        ]
         lines.append(
             f"1X is {change.growth:.3g} (+-{change.growth_uncertainty:.2g}) times that of {self.baseline}; "
             f"departure {change.departure:.1f} nats, threshold {change.departure_threshold:.1f} "

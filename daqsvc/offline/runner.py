@@ -157,32 +157,34 @@ class Runner:
         present, machine = self._as_recorded(loaded)
         left_out = (one.left_out(loaded.names) for one in self.detectors.values())
         notes = [*loaded.notes, *filter(None, left_out)]
-        found: dict[str, Evaluated] = {}
+        evaluated: dict[str, Evaluated] = {}
         wrong = ""
-        for key, given in present.items():
+        for key, settings in present.items():
             detector = self.detectors[key]
             try:
-                found[key] = detector.evaluate(Recorded(machine, loaded, detector.options), given, progress)
+                evaluated[key] = detector.evaluate(
+                    Recorded(machine, loaded, detector.options), settings, progress
+                )
             except (ValueError, AssemblyError) as error:
                 wrong = str(error)
                 continue
-            draw = found[key].draw
+            draw = evaluated[key].draw
             if figures is not None and draw is not None:
                 draw(figures)
         if wrong:
             first = _not_judged({key: self.detectors[key] for key in present}, recording, wrong)
-            return self._outcome(first, found, notes)
+            return self._outcome(first, evaluated, notes)
         heads = _heads({key: self.detectors[key] for key in present})
-        verdicts = [verdict for key in heads.values() if (verdict := found[key].verdict) is not None]
+        verdicts = [verdict for key in heads.values() if (verdict := evaluated[key].verdict) is not None]
         if not verdicts:
             verdicts = [RotorVerdict(recording=recording, quality=known_against(loaded))]
-        others = {key: one for key, one in found.items() if key not in heads.values()}
-        return self._outcome(verdicts[0], found, notes, verdicts[1:], others)
+        others = {key: one for key, one in evaluated.items() if key not in heads.values()}
+        return self._outcome(verdicts[0], evaluated, notes, verdicts[1:], others)
 
     def _outcome(
         self,
         first: Verdict,
-        found: Mapping[str, Evaluated],
+        evaluated: Mapping[str, Evaluated],
         notes: Iterable[str] = (),
         verdicts: Sequence[Verdict] = (),
         others: Mapping[str, Evaluated] | None = None,
@@ -191,7 +193,7 @@ class Runner:
 
         Args:
             first: the verdict about the first part of the machine.
-            found: what all detectors brought forward.
+            evaluated: what all detectors brought forward.
             notes: what a person should know of the recording, in sentences.
             verdicts: about the other parts.
             others: the detectors that give none of these; None: all.
@@ -202,15 +204,19 @@ class Runner:
         quality = json["data_quality"]
         quality["problems"] = list(dict.fromkeys([*notes, *quality["problems"]]))
         texts = [first.describe()]
-        said = [said for one in (found if others is None else others).values() for said in one.statements]
-        texts += [one.describe() for one in said]
+        statement = [
+            statement
+            for one in (evaluated if others is None else others).values()
+            for statement in one.statements
+        ]
+        texts += [one.describe() for one in statement]
         for verdict in verdicts:
             json[verdict.part] = verdict.as_json()
             texts.append(f"{verdict.part}s of {verdict.describe()}")
         json["detectors"] = {
-            each.detector: each.as_json() for one in found.values() for each in one.statements
+            each.detector: each.as_json() for one in evaluated.values() for each in one.statements
         }
-        if alarmed := worst(said):
+        if alarmed := worst(statement):
             texts.insert(1, f"worst of the other detectors: {alarmed}")
         texts[1:1] = [note for note in notes if note not in texts[0]]
         return Outcome(json, "\n  ".join(texts), first.refused is not None)
@@ -227,8 +233,8 @@ class Runner:
             },
             "pipeline": machine.pipeline.model_copy(update=tables),
         }
-        given = {key: table for key, table in tables.items() if table is not None}
-        return given, machine.model_copy(update=update)
+        present = {key: table for key, table in tables.items() if table is not None}
+        return present, machine.model_copy(update=update)
 
     def load(self, recording: str, only: Sequence[str] | None = None) -> Recording:
         """The sensors of the machine in a recording, by their names.
@@ -258,13 +264,13 @@ class Runner:
         from daqsvc.offline.can_logs import load_can_log  # noqa: PLC0415 - brings python-can and kernels
 
         watched = [name for one in self.detectors.values() for name in one.sensors]
-        found = load_can_log(machine, recording, options.rate_hz, watched)
-        self._refuse_lacking(recording, only or _needs(self.detectors), found.names)
+        loaded = load_can_log(machine, recording, options.rate_hz, watched)
+        self._refuse_lacking(recording, only or _needs(self.detectors), loaded.names)
         if only is None:
-            return found
-        samples = found.samples[:, [found.names.index(name) for name in only]]
+            return loaded
+        samples = loaded.samples[:, [loaded.names.index(name) for name in only]]
         return replace(
-            found,
+            loaded,
             names=tuple(only),
             samples=samples,
             nan_count=int(np.isnan(samples).sum()),
@@ -297,23 +303,23 @@ class Runner:
             RefusedError: it lacks a sensor that the verdict needs, or has none at all.
         """
         there = list_channels(recording)
-        channels, found = self.options.channels, {}
+        channels, columns = self.options.channels, {}
         for sensor in self.machine.sensors:
             mapped = channels.get(sensor.name, channels.get(sensor.channel))
             if mapped is not None:
-                found[sensor.name] = matching(recording, mapped, there)
+                columns[sensor.name] = matching(recording, mapped, there)
             elif sensor.name in there:
-                found[sensor.name] = sensor.name
+                columns[sensor.name] = sensor.name
             elif sensor.channel in there:
-                found[sensor.name] = sensor.channel
-        missing = [name for name in _needs(self.detectors) if name not in found]
-        if missing or not found:
+                columns[sensor.name] = sensor.channel
+        missing = [name for name in _needs(self.detectors) if name not in columns]
+        if missing or not columns:
             missing = missing or [sensor.name for sensor in self.machine.sensors]
             raise RefusedError(
                 f"{recording} has no channel for {', '.join(missing)} of {self.machine.path}; name its "
                 f"variable, e.g. --map {missing[0]}=VARIABLE. It holds {', '.join(there) or 'no channel'}"
             )
-        return found
+        return columns
 
 
 def _is_can_log(path: str) -> bool:
@@ -327,12 +333,12 @@ def detectors_of(machine: MachineFile, options: RecordingOptions) -> Detectors:
     Raises:
         ValueError: what they or the options name cannot be used.
     """
-    found: Detectors = {}
+    chosen: Detectors = {}
     calibration = options.calibration
-    for key, table, given in configured(machine.pipeline):
+    for key, table, settings in configured(machine.pipeline):
         plugin = cast("DetectorPlugin[Any]", table)
-        found[key] = plugin.recorded(
-            machine, given, replace(options, calibration=calibration if plugin.calibrated else None)
+        chosen[key] = plugin.recorded(
+            machine, settings, replace(options, calibration=calibration if plugin.calibrated else None)
         )
         if plugin.calibrated:
             calibration = None
@@ -341,7 +347,7 @@ def detectors_of(machine: MachineFile, options: RecordingOptions) -> Detectors:
             f"--calibration: {machine.path} has neither {' nor '.join(calibrated_tables())} that would use "
             "it; add it"
         )
-    return found
+    return chosen
 
 
 def calibrated_tables() -> list[str]:

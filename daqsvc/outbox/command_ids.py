@@ -161,11 +161,11 @@ class CommandIds:
         self._until_ns.clear()
         is_whole = any(lines)
         for line in lines:
-            found = _parsed(line)
-            if found is None:
+            parsed = _parsed(line)
+            if parsed is None:
                 is_whole &= not line
-            elif found[0] != _HEAD:
-                key, until_ns = found
+            elif parsed[0] != _HEAD:
+                key, until_ns = parsed
                 self._until_ns[key] = until_ns
                 self._until_ns.move_to_end(key)
         while len(self._until_ns) > REMEMBERED:
@@ -199,8 +199,8 @@ def _line(key: tuple[str, str], until_ns: int) -> bytes:
 
 def _parsed(line: bytes) -> tuple[tuple[str, str], int] | None:
     """What a line says; None if it is cut or damaged."""
-    text, _, told = line.rpartition(b" ")
+    text, _, check = line.rpartition(b" ")
     parts = text.split(b" ")
-    if len(parts) != 3 or told != b"%08x" % zlib.crc32(text):
+    if len(parts) != 3 or check != b"%08x" % zlib.crc32(text):
         return None
     return (parts[1].decode(), parts[2].decode()), int(parts[0])

@@ -161,12 +161,12 @@ class DeadLetters:
             connection.execute(_TABLE)
             result = work(connection, *args, **options)
             connection.execute("COMMIT")
-            found = connection.execute(
+            row = connection.execute(
                 "SELECT topic, reason, count(*) FROM letters GROUP BY topic HAVING sequence = min(sequence)"
             ).fetchall()
         # A whole new one, for the event loop may be reading.
-        self._reasons = {topic: reason for topic, reason, _ in found}
-        self.waiting = sum(count for _, _, count in found)
+        self._reasons = {topic: reason for topic, reason, _ in row}
+        self.waiting = sum(count for _, _, count in row)
         self._loaded = True
         return result
 
@@ -229,8 +229,8 @@ def _make(connection: sqlite3.Connection) -> None:
 
 
 def _is_row_sound(row: tuple[Any, ...]) -> bool:
-    sequence, topic, payload, retain, reason, wall_ns, told = row
-    told_rightly = isinstance(told, int) and is_sound(sequence, topic, payload, told)
+    sequence, topic, payload, retain, reason, wall_ns, check = row
+    told_rightly = isinstance(check, int) and is_sound(sequence, topic, payload, check)
     return told_rightly and isinstance(retain, int) and isinstance(reason, str) and isinstance(wall_ns, int)
 
 
@@ -249,8 +249,8 @@ def _oldest(connection: sqlite3.Connection, topic: str) -> OutboxMessage | None:
         ).fetchone()
         if row is None:
             return None
-        sequence, of, payload, retain, told = row
-        if is_sound(sequence, of, payload, told):
+        sequence, of, payload, retain, check = row
+        if is_sound(sequence, of, payload, check):
             return OutboxMessage(sequence, of, payload, bool(retain))
         log.error("refused message %s on %s has changed on the disk and is dropped", sequence, topic)
         _delete(connection, sequence)

@@ -639,33 +639,33 @@ class Journal:
         """Messages above ``after`` that are not sent, in order, at most ``limit``."""
         marks = self._unwritten.marks
         try:
-            found = self._unsent_above(after, limit, marks)
+            messages = self._unsent_above(after, limit, marks)
         except (OutboxError, *FileError):
             recent = [m for m in self._recent.values() if m.sequence not in marks]
             if not self._shows or self._unsent > self._unwritten.marks_elsewhere() + len(recent):
                 raise
             # Of all else in the journal, the broker has it.
-            found = [replace(m, stored=True) for m in recent if m.sequence > after][:limit]
+            messages = [replace(m, stored=True) for m in recent if m.sequence > after][:limit]
         waiting = (m for m in self._shown() if m.sequence > after and m.sequence not in marks)
-        return [*found, *islice(waiting, limit - len(found))]
+        return [*messages, *islice(waiting, limit - len(messages))]
 
     def _unsent_above(self, after: int, limit: int, marks: frozenset[int]) -> list[OutboxMessage]:
         where = "WHERE NOT sent AND sequence > ? AND sequence < ? ORDER BY sequence LIMIT ?"
-        found: list[OutboxMessage] = []
-        while len(found) < limit:
+        messages: list[OutboxMessage] = []
+        while len(messages) < limit:
             some = self._select(where, after, self._first_unwritten() or LARGEST, limit)
-            found += [m for m in some if m.sequence not in marks]
+            messages += [m for m in some if m.sequence not in marks]
             if len(some) < limit:
                 break
             after = some[-1].sequence
-        return found[:limit]
+        return messages[:limit]
 
     def following(self, after: int, limit: int) -> list[OutboxMessage]:
         """Messages above ``after`` that are still kept, sent or not, in order, at most ``limit``."""
         where = "WHERE sequence > ? AND sequence < ? ORDER BY sequence LIMIT ?"
-        found = self._select(where, after, self._first_unwritten() or LARGEST, limit)
+        messages = self._select(where, after, self._first_unwritten() or LARGEST, limit)
         waiting = (m for m in self._shown() if m.sequence > after)
-        return [*found, *islice(waiting, limit - len(found))]
+        return [*messages, *islice(waiting, limit - len(messages))]
 
     def retained(self) -> list[OutboxMessage]:
         """The latest retained message of each topic, if it is sent, in order."""
@@ -766,8 +766,8 @@ class Journal:
             parameters,
         )
         messages = []
-        for sequence, topic, payload, retain, told in rows:
-            if not is_sound(sequence, topic, payload, told):
+        for sequence, topic, payload, retain, check in rows:
+            if not is_sound(sequence, topic, payload, check):
                 raise corruption(f"message {sequence} has changed on the disk")
             messages.append(OutboxMessage(sequence, topic, payload, bool(retain)))
         return messages

@@ -52,9 +52,9 @@ class KnownTopics:
             is_whole: whether these are all: then the file can be made anew, if it is damaged or missing.
         """
         restrict(self._path)
-        told = self._read()
-        self._is_sound = told is not None
-        self._topics = frozenset() if told is None and is_whole else told
+        topics = self._read()
+        self._is_sound = topics is not None
+        self._topics = frozenset() if topics is None and is_whole else topics
         self.add(latest)
 
     def add(self, topics: Iterable[str]) -> None:
@@ -101,8 +101,8 @@ def _understood(content: bytes) -> frozenset[str]:
         raise ValueError(f"it is empty or has more than {MOST_BYTES} bytes")
     topics: set[str] = set()
     for line in content.splitlines(keepends=True):
-        told, _, listed = line.partition(b" ")
-        if not listed.endswith(b"\n") or told != b"%08x" % zlib.crc32(listed[:-1]):
+        check, _, listed = line.partition(b" ")
+        if not listed.endswith(b"\n") or check != b"%08x" % zlib.crc32(listed[:-1]):
             raise ValueError("a line of it is damaged or was cut off")
         topics.update(json.loads(listed))
     return frozenset(topics)

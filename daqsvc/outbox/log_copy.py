@@ -56,14 +56,14 @@ class LogCopy:
         Raises:
             OSError: the log cannot be read.
         """
-        found = [_content(self._copy), _content(self._log)]
+        contents = [_content(self._copy), _content(self._log)]
         # After a try that failed, memory may be all that has it.
-        self._contents = list(dict.fromkeys(content for content in (*self._contents, *found) if content))
+        self._contents = list(dict.fromkeys(content for content in (*self._contents, *contents) if content))
         self._was_emptied |= self.is_there and not (self._path.exists() and self._path.stat().st_size)
-        if found[0] or not found[1]:
+        if contents[0] or not contents[1]:
             return
         try:
-            replace_durably(self._copy, found[1])
+            replace_durably(self._copy, contents[1])
         except OSError as error:
             self._copy.with_name(self._copy.name + ".new").unlink(missing_ok=True)
             log.info("the log of outbox %s is copied to memory only: %s", self._path, error)

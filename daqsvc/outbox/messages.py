@@ -90,11 +90,11 @@ def event_id(series: str, sequence: int) -> str:
     return f"{series}-{sequence}"
 
 
-def is_sound(number: object, topic: object, payload: object, told: object) -> bool:
+def is_sound(number: object, topic: object, payload: object, check: object) -> bool:
     """Whether a row is what was written: ``told`` is its checksum, None in files of the first version."""
     if not (isinstance(number, int) and isinstance(topic, str) and isinstance(payload, bytes)):
         return False
-    return told is None or told == checksum(number, topic, payload)
+    return check is None or check == checksum(number, topic, payload)
 
 
 def checksum(number: int, topic: str, payload: bytes) -> int:

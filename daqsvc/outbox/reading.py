@@ -208,8 +208,8 @@ def _view(connection: sqlite3.Connection, history: int) -> JournalView:
 def _sound(rows: Iterable[tuple[int, str, bytes, int, int, int, int | None]]) -> list[JournalEntry]:
     return [
         JournalEntry(sequence, topic, payload, bool(retain), bool(sent), wall_ns)
-        for sequence, topic, payload, retain, sent, wall_ns, told in rows
-        if is_sound(sequence, topic, payload, told)
+        for sequence, topic, payload, retain, sent, wall_ns, check in rows
+        if is_sound(sequence, topic, payload, check)
     ]
 
 

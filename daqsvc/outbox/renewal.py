@@ -143,12 +143,12 @@ class Renewal:
 
     def aside(self) -> list[Path]:
         """Corrupt files that were set aside, the newest first."""
-        found = [
+        parts = [
             old
             for old in self._path.parent.glob(f"{self._path.name}.corrupt-*")
             if not old.name.endswith((*SIDE_FILES[1:], ASIDE_SUFFIX))
         ]
-        return sorted(found, key=lambda old: (old.stat().st_mtime_ns, old.name), reverse=True)
+        return sorted(parts, key=lambda old: (old.stat().st_mtime_ns, old.name), reverse=True)
 
     def forget_aside(self, keep: int) -> bool:
         """Delete corrupt files but for the newest; whether there were any."""
@@ -167,8 +167,8 @@ class Renewal:
     def untold(self) -> Damage:
         """What an earlier run could not tell any more."""
         try:
-            told = json.loads(read_whole(self._note, 1024))
-            return Damage(int(told["quarantined"]), int(told["vanished"]))
+            note = json.loads(read_whole(self._note, 1024))
+            return Damage(int(note["quarantined"]), int(note["vanished"]))
         except FileNotFoundError:
             return Damage()
         except (OSError, ValueError, KeyError, TypeError) as error:

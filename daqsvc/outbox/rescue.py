@@ -84,17 +84,17 @@ def _rows(
     path: Path, table: str, is_row_sound: Callable[[tuple[Any, ...]], bool]
 ) -> dict[int, tuple[Any, ...]]:
     """From both ends, up to a bad page."""
-    found: dict[int, tuple[Any, ...]] = {}
+    rows: dict[int, tuple[Any, ...]] = {}
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as broken:
         broken.text_factory = lambda raw: raw.decode(errors="replace")
         for order in ("ASC", "DESC"):
             try:
                 for row in broken.execute(f"SELECT * FROM {table} NOT INDEXED ORDER BY 1 {order}"):  # noqa: S608  constants
                     if is_row_sound(row):
-                        found[row[0]] = row
+                        rows[row[0]] = row
             except (sqlite3.Error, ValueError, OverflowError) as error:
                 log.debug("corrupt file %s could be read up to a point: %s", path, error)
-    return found
+    return rows
 
 
 def _saved(path: Path) -> Path:

@@ -73,8 +73,8 @@ class _Told:
         """As it is written; of one length for one boot and place, so that it can be written in place."""
         figures = " ".join(f"{number:0{_DIGITS}d}" for number in (self.ceiling, self.used, self.first))
         how = "ended" if self.ended else "ahead" if self.ahead else "going"
-        told = f"{figures} {self.boot} {self.place} {how}".encode()
-        return b"%b %08x\n" % (told, zlib.crc32(told))
+        text = f"{figures} {self.boot} {self.place} {how}".encode()
+        return b"%b %08x\n" % (text, zlib.crc32(text))
 
 
 _NOTHING = _Told(0, 0, 0, "", "", ended=True)
@@ -107,25 +107,25 @@ class SequenceMark:
         """
         self.close()
         self._here = replace(_NOTHING, boot=boot_id(), place=place)
-        found = [side.read() for side in self._sides]
-        sound = [told for told in found if told is not None]
+        sides = [side.read() for side in self._sides]
+        sound = [mark for mark in sides if mark is not None]
         # An earlier version wrote the first one alone, and said nothing of the place.
-        is_earlier = [told is not None and not told.place for told in found] == [True, False]
-        self._damaged = 0 < len(sound) < len(found) and not is_earlier
+        is_earlier = [mark is not None and not mark.place for mark in sides] == [True, False]
+        self._damaged = 0 < len(sound) < len(sides) and not is_earlier
         self._damaged |= any(
-            side.is_there and told is None for side, told in zip(self._sides, found, strict=True)
+            side.is_there and mark is None for side, mark in zip(self._sides, sides, strict=True)
         )
         if self._damaged:
             log.warning(
                 "outbox mark %s or its twin is damaged or missing: sequence numbers jump ahead",
                 self._sides[0].path,
             )
-        newest = max(sound, key=lambda told: (told.ceiling, told.used), default=_NOTHING)
+        newest = max(sound, key=lambda mark: (mark.ceiling, mark.used), default=_NOTHING)
         self._told = replace(
             newest,
-            used=max((told.used for told in sound), default=0),
-            ended=newest.ended and all(told.ceiling == newest.ceiling for told in sound),
-            ahead=any(told.ahead for told in sound),
+            used=max((mark.used for mark in sound), default=0),
+            ended=newest.ended and all(mark.ceiling == newest.ceiling for mark in sound),
+            ahead=any(mark.ahead for mark in sound),
         )
         self._ended = not self._damaged and (self._told.ended or self._told.boot != self._here.boot)
         self._is_unsure = bool(self._told.ceiling) and not self._told.ended
@@ -259,11 +259,11 @@ class SequenceMark:
             OSError: the disk takes no writes any more, so that its word for the last sync is worth nothing.
         """
         first = self._first if self._told.used < self._first else self._told.first
-        told = replace(self._told, used=used, first=first)
+        mark = replace(self._told, used=used, first=first)
         errors: list[OSError] = []
         for side in self._sides:
             try:
-                side.note(told.line())
+                side.note(mark.line())
             except OSError as error:
                 errors.append(error)
         if len(errors) == len(self._sides) and not is_full(errors[0]):
@@ -271,7 +271,7 @@ class SequenceMark:
         if errors and self._noted:
             log.warning("outbox mark %s cannot be written: %s", self._sides[0].path, errors[0])
         self._noted = not errors
-        self._told = told
+        self._told = mark
 
     def settle(self, last: int) -> None:
         """Tell, durably, that ``last`` is the highest number in use and will stay so for now.
@@ -286,19 +286,19 @@ class SequenceMark:
         for side in self._sides:
             side.close()
 
-    def _write(self, told: _Told, *, both: bool = False) -> None:
+    def _write(self, mark: _Told, *, both: bool = False) -> None:
         """Write the side files; one of them at least, or ``both``."""
         errors: list[OSError] = []
         for side in self._sides:
             try:
-                side.write(told.line())
+                side.write(mark.line())
             except OSError as error:
                 errors.append(error)
         if errors and (both or len(errors) == len(self._sides)):
             raise errors[0]
         for failure in errors:
             log.warning("one of the outbox marks %s cannot be written: %s", self._sides[0].path, failure)
-        self._told = told
+        self._told = mark
 
 
 def _is_unset(wall_ms: int, known: int) -> bool:
@@ -369,11 +369,11 @@ def _opened(path: Path) -> int | None:
 
 
 def _understood(line: bytes) -> _Told | None:
-    told = line.split()
-    if len(told) not in {4, 7} or _hexadecimal(told[-1]) != zlib.crc32(line[: line.rfind(b" ")]):
+    fields = line.split()
+    if len(fields) not in {4, 7} or _hexadecimal(fields[-1]) != zlib.crc32(line[: line.rfind(b" ")]):
         return None
     try:
-        words = [word.decode("ascii") for word in told[:-1]]
+        words = [word.decode("ascii") for word in fields[:-1]]
         if (
             len(words) == 3
         ):  # of an earlier version, which had ended properly if it used all up to its ceiling

@@ -371,12 +371,12 @@ class _Books:
             succeed(done, number)
 
     def abandoned(
-        self, lost: Sequence[asyncio.Future[int]], told: Sequence[asyncio.Future[int]], error: OutboxError
+        self, lost: Sequence[asyncio.Future[int]], accepted: Sequence[asyncio.Future[int]], error: OutboxError
     ) -> None:
         """See `Reports.abandoned`."""
         self._counters.lost += len(lost)
-        self._counters.unjournalled += len(told)
-        for done in (*lost, *told):
+        self._counters.unjournalled += len(accepted)
+        for done in (*lost, *accepted):
             self._counters.waiting -= 1
             fail(done, error)
 

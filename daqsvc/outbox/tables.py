@@ -87,15 +87,15 @@ def sound_row(raw: tuple[object, ...], unsent: set[int]) -> Row | None:
         raw: its columns as they were read, text as bytes.
         unsent: numbers of messages that another source takes for unsent.
     """
-    sequence, name, payload, retain, sent, wall_ns, told = raw
+    sequence, name, payload, retain, sent, wall_ns, check = raw
     try:
         topic = name.decode() if isinstance(name, bytes) else None
     except UnicodeDecodeError:
         return None
     if not (isinstance(sequence, int) and isinstance(topic, str) and isinstance(payload, bytes)):
         return None
-    if not isinstance(told, int) or not is_sound(sequence, topic, payload, told):
+    if not isinstance(check, int) or not is_sound(sequence, topic, payload, check):
         return None
     is_sent = sent == 1 and sequence not in unsent
     written_ns = wall_ns if isinstance(wall_ns, int) else 0
-    return sequence, topic, payload, int(retain != 0), int(is_sent), written_ns, told
+    return sequence, topic, payload, int(retain != 0), int(is_sent), written_ns, check

@@ -157,9 +157,9 @@ class TelemetryFile:
         number = self._next
         rows = []
         for topic, payload, lifetime_ns in arrived:
-            told = checksum(number, topic, payload)
+            check = checksum(number, topic, payload)
             rows.append(
-                (number, topic, payload, now_ns + lifetime_ns, wall_ns + lifetime_ns, lifetime_ns, told)
+                (number, topic, payload, now_ns + lifetime_ns, wall_ns + lifetime_ns, lifetime_ns, check)
             )
             number += 1
         with self._transaction() as connection:
@@ -209,8 +209,8 @@ class TelemetryFile:
             (after, self._clock.monotonic_ns(), limit),
         )
         messages = []
-        for number, topic, payload, expires_ns, told in rows:
-            if not is_sound(number, topic, payload, told):
+        for number, topic, payload, expires_ns, check in rows:
+            if not is_sound(number, topic, payload, check):
                 raise corruption(f"message {number} has changed on the disk")
             messages.append(TelemetryMessage(number, topic, payload, expires_ns))
         return messages
@@ -372,8 +372,8 @@ def _known_version(connection: sqlite3.Connection) -> int:
 
 
 def _is_row_sound(row: tuple[Any, ...]) -> bool:
-    number, topic, payload, *times, told = row
-    told_rightly = isinstance(told, int) and is_sound(number, topic, payload, told)
+    number, topic, payload, *times, check = row
+    told_rightly = isinstance(check, int) and is_sound(number, topic, payload, check)
     return told_rightly and all(isinstance(time_ns, int) for time_ns in times)
 
 

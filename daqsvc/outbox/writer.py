@@ -144,7 +144,7 @@ class Reports(Protocol):
         """A corrupt file was set aside; so many unsent messages are in the new one."""
 
     def abandoned(
-        self, lost: Sequence[asyncio.Future[int]], told: Sequence[asyncio.Future[int]], error: OutboxError
+        self, lost: Sequence[asyncio.Future[int]], accepted: Sequence[asyncio.Future[int]], error: OutboxError
     ) -> None:
         """Messages that will not reach the disk any more: ``lost``, or ``told`` to the broker."""
 
@@ -440,9 +440,9 @@ class JournalWriter:
         waiting = self._journal.waiting
         lost = [self._waiting.pop(m.sequence) for m in waiting if m.sequence in self._waiting]
         lost += [done for _, done in batch.drafts]
-        told = list(self._waiting.values())
+        accepted = list(self._waiting.values())
         self._waiting.clear()
-        post(self._reports.abandoned, lost, told, failure)
+        post(self._reports.abandoned, lost, accepted, failure)
         for _, answer in batch.reads:
             post(fail, answer, failure)
         topics = Counter(
@@ -456,11 +456,11 @@ class JournalWriter:
                 error,
                 _named(topics),
             )
-        if told:
+        if accepted:
             log.error(
                 "outbox %s will never have %d messages that the broker has: %s",
                 self._journal.path,
-                len(told),
+                len(accepted),
                 error,
             )
 

@@ -37,17 +37,17 @@ def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSe
         machine: the machine file.
         conditions: names of what the service may say of itself, outputs aside.
     """
-    installed, given = output_plugins(), {path: given for path, _, given in configured_outputs(machine)}
+    installed, tables = output_plugins(), {path: tables for path, _, tables in configured_outputs(machine)}
     own: list[str] = []
-    for path, table in tuple(given.items()):
-        with _left_out(given, path):
+    for path, table in tuple(tables.items()):
+        with _left_out(tables, path):
             own += installed[path].conditions(table)
-    outdated = [plugin.outdated for path, plugin in installed.items() if path not in given]
+    outdated = [plugin.outdated for path, plugin in installed.items() if path not in tables]
 
     def make(port: OutputPort) -> dict[str, Output]:
         made: dict[str, Output] = {}
-        for path, table in tuple(given.items()):
-            with _left_out(given, path):
+        for path, table in tuple(tables.items()):
+            with _left_out(tables, path):
                 output = installed[path].build(machine, table, port)
                 if output is not None:
                     made[path] = output
@@ -64,12 +64,12 @@ def output_set(machine: MachineFile, conditions: Iterable[str] = ()) -> OutputSe
 
 
 @contextmanager
-def _left_out(given: dict[str, Any], path: str) -> Iterator[None]:
+def _left_out(settings: dict[str, Any], path: str) -> Iterator[None]:
     """Go on without an output that fails: whatever a plugin does, the machine is watched."""
     try:
         yield
     except PluginFailedError as failed:
-        del given[path]
+        del settings[path]
         log.error("output %s cannot be made and is left out: %s", path, failed.words)  # noqa: TRY400
 
 
@@ -80,8 +80,8 @@ def check_outputs(machine: MachineFile) -> None:
         AssemblyError: one fails.
     """
     with failing_in(machine.path):
-        for path, _, given in configured_outputs(machine):
-            tuple(output_plugins()[path].conditions(given))
+        for path, _, settings in configured_outputs(machine):
+            tuple(output_plugins()[path].conditions(settings))
         watched(machine)
 
 
@@ -97,7 +97,9 @@ def watched(machine: MachineFile, conditions: Iterable[str] = ()) -> Watched:
         machine.machine.description,
         alarms=tuple(alarm.name for alarm in machine.alarms),
         services=tuple(_services(machine, conditions)),
-        readings=tuple(one for plugin, given in plugins(machine) for one in plugin.readings(machine, given)),
+        readings=tuple(
+            one for plugin, settings in plugins(machine) for one in plugin.readings(machine, settings)
+        ),
         findings=machine.detectors,
         rests_on={alarm.name: tuple(_rests_on(alarm)) for alarm in machine.alarms},
     )
@@ -113,7 +115,7 @@ def _rests_on(alarm: Alarm) -> Iterator[str]:
 
 def _services(machine: MachineFile, conditions: Iterable[str]) -> Iterator[str]:
     """The alarms that are there by themselves: about sensors, detectors, all alarms and the service."""
-    for plugin, given in plugins(machine):
-        yield from plugin.quality_alarms(machine, given)
+    for plugin, settings in plugins(machine):
+        yield from plugin.quality_alarms(machine, settings)
     yield from handling_conditions(machine.alarm_handling)
     yield from conditions

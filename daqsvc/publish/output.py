@@ -108,13 +108,13 @@ class Output:
         """What it has done, in numbers, or mappings of numbers, by name: part of the status."""
         return {}
 
-    def conditions(self, told: frozenset[str]) -> Iterable[Condition]:
+    def conditions(self, raised: frozenset[str]) -> Iterable[Condition]:
         """How things stand with it, as far as that is known; each is an alarm. Asked for once a second.
 
         Args:
-            told: names of conditions that were ever told of, also before a restart.
+            raised: names of conditions that were ever told of, also before a restart.
         """
-        del told
+        del raised
         return ()
 
 

@@ -222,10 +222,10 @@ def alarm_event(payload: bytes) -> AlarmEvent:
     Raises:
         ValueError: it is no alarm payload of this version, or one that no event of this program has.
     """
-    told = AlarmPayload.model_validate_json(payload)
-    state, previous = AlarmState(told.state), AlarmState(told.previous.state)
-    kind = EventKind(told.kind)
-    holds, covered = tuple(map(AlarmState, told.holds)), told.covered and AlarmState(told.covered)
+    message = AlarmPayload.model_validate_json(payload)
+    state, previous = AlarmState(message.state), AlarmState(message.previous.state)
+    kind = EventKind(message.kind)
+    holds, covered = tuple(map(AlarmState, message.holds)), message.covered and AlarmState(message.covered)
     if kind is EventKind.SUPPRESSED and not holds:
         # Before holds were told of one by one there was this one only, laid over the state before.
         holds, covered = (AlarmState.SUPPRESSED,), previous
@@ -235,31 +235,31 @@ def alarm_event(payload: bytes) -> AlarmEvent:
         or shown is not state
         or (state in HOLDS) != (covered is not None)
         or covered in HOLDS
-        or (AlarmState.SHELVED in holds) != (told.shelved_until_wall_ns is not None)
+        or (AlarmState.SHELVED in holds) != (message.shelved_until_wall_ns is not None)
     ):
         raise ValueError(f"an event {kind} from {previous} to {state} is none of this program's")
     return AlarmEvent(
-        identity=Identity(told.site, told.box, told.machine),
-        alarm=told.alarm,
-        occurrence=told.occurrence,
+        identity=Identity(message.site, message.box, message.machine),
+        alarm=message.alarm,
+        occurrence=message.occurrence,
         kind=kind,
         from_state=previous,
         to_state=state,
-        from_level=Level.of(told.previous.level),
-        to_level=Level.of(told.level),
-        t_ns=told.monotonic_ns,
-        wall_ns=told.wall_ns,
-        cause=_diagnosis(told.machine, told.cause),
-        message=told.message,
-        by=told.by,
-        reason=told.reason,
+        from_level=Level.of(message.previous.level),
+        to_level=Level.of(message.level),
+        t_ns=message.monotonic_ns,
+        wall_ns=message.wall_ns,
+        cause=_diagnosis(message.machine, message.cause),
+        message=message.message,
+        by=message.by,
+        reason=message.reason,
         holds=holds,
         covered=covered,
-        shelved_until_wall_ns=told.shelved_until_wall_ns,
-        first_out=told.first_out,
-        chattering=told.chattering,
-        found=told.found,
-        doubts=tuple(Doubt(**dict(doubt)) for doubt in told.doubts),
+        shelved_until_wall_ns=message.shelved_until_wall_ns,
+        first_out=message.first_out,
+        chattering=message.chattering,
+        found=message.found,
+        doubts=tuple(Doubt(**dict(doubt)) for doubt in message.doubts),
     )
 
 

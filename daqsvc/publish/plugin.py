@@ -34,18 +34,18 @@ class OutputPlugin(OutputTable[SettingsT]):
     status_key: ClassVar[str] = ""
     outdated: ClassVar[Mapping[str, str]] = MappingProxyType({})
 
-    def conditions(self, given: SettingsT) -> Iterable[str]:
+    def conditions(self, settings: SettingsT) -> Iterable[str]:
         """Names of all that `Output.conditions` may say, so that people may act on it before it is said."""
-        del given
+        del settings
         return ()
 
     @may_raise(AssemblyError)
-    def build(self, machine: MachineFile, given: SettingsT, port: OutputPort) -> Output | None:
+    def build(self, machine: MachineFile, settings: SettingsT, port: OutputPort) -> Output | None:
         """The output; None for one that another output takes with it. Making it opens nothing.
 
         Args:
             machine: the machine file.
-            given: the table.
+            settings: the table.
             port: what it works with.
 
         Raises:

@@ -84,10 +84,10 @@ class Contents:
 
     def listing(self) -> str:
         """What the file holds, in words."""
-        told = [_told(name, values) for name, values in self.entries.items()]
-        if len(told) > MOST_LISTED:
-            told[MOST_LISTED:] = [f"and {len(told) - MOST_LISTED} more"]
-        return ", ".join(told) or "nothing"
+        lines = [_told(name, values) for name, values in self.entries.items()]
+        if len(lines) > MOST_LISTED:
+            lines[MOST_LISTED:] = [f"and {len(lines) - MOST_LISTED} more"]
+        return ", ".join(lines) or "nothing"
 
 
 def _told(name: str, values: NDArray[np.generic]) -> str:

@@ -78,15 +78,15 @@ def load_streams(
     file = Path(path)
     contents = read(file, ResourceLimits(memory_bytes))
     notes: list[Sequence[str]] = []
-    found: list[Floats] = []
+    loaded: list[Floats] = []
     for channels, rate_hz in streams:
         columns, length = _channels(file, contents, channels)
         rows, noted = place_at(file, contents, length, rate_hz)
         samples = _together(columns, length, rows)
         _refuse_impossible(file, list(channels), samples)
         notes.append(noted)
-        found.append(samples)
-    return notes, found
+        loaded.append(samples)
+    return notes, loaded
 
 
 def channels_of(path: str, memory_bytes: int) -> tuple[dict[str, int], tuple[()]]:

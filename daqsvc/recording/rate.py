@@ -120,9 +120,11 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         rate_hz = column.stamps.rate_hz
         source = f"derived from time column {column.name!r}, read as {column.unit}"
     else:
-        told = f"states several: {stated}" if stated else f"does not state one{_why_not(contents, length)}"
+        statement = (
+            f"states several: {stated}" if stated else f"does not state one{_why_not(contents, length)}"
+        )
         raise RecordingError(
-            f"the sampling rate of {path} is not known: the file {told}. Give it with --fs, in Hz"
+            f"the sampling rate of {path} is not known: the file {statement}. Give it with --fs, in Hz"
         )
     if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
         raise RecordingError(
@@ -203,10 +205,12 @@ def _other_rates(stated: Mapping[str, float], column: _TimeColumn | None, given_
 
 
 def _rates(stated: Mapping[str, float], column: _TimeColumn | None) -> str:
-    said = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
+    statements = [f"{hz:g} Hz ({name})" for name, hz in stated.items()]
     if column is not None:
-        said.append(f"{column.stamps.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})")
-    return " and ".join(said)
+        statements.append(
+            f"{column.stamps.rate_hz:g} Hz (time column {column.name!r}, read as {column.unit})"
+        )
+    return " and ".join(statements)
 
 
 def time_column(contents: Contents, length: int) -> str | None:
@@ -216,8 +220,8 @@ def time_column(contents: Contents, length: int) -> str | None:
     without a header it is the first column if it rises by even steps, which no measured signal does. Steps
     of one are left: they number the samples.
     """
-    found = (_read(contents, name) for name in _candidates(contents, length))
-    return next((column.name for column in found if column is not None and column.stamps.is_even), None)
+    columns = (_read(contents, name) for name in _candidates(contents, length))
+    return next((column.name for column in columns if column is not None and column.stamps.is_even), None)
 
 
 def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
@@ -226,8 +230,8 @@ def _time(path: Path, contents: Contents, length: int) -> _TimeColumn | None:
     Raises:
         RecordingError: it lacks most of the samples.
     """
-    found = [column for name in _candidates(contents, length) if (column := _read(contents, name))]
-    column = next((one for one in found if one.stamps.is_even), found[0] if found else None)
+    columns = [column for name in _candidates(contents, length) if (column := _read(contents, name))]
+    column = next((one for one in columns if one.stamps.is_even), columns[0] if columns else None)
     rows = None if column is None else column.stamps.rows
     if column is not None and rows is not None and rows[-1] >= MOST_STRETCHED * length:
         longest = int(np.argmax(np.diff(rows)))
@@ -244,12 +248,12 @@ def _candidates(contents: Contents, length: int) -> list[str]:
         for name, values in contents.entries.items()
         if values.ndim == 1 and len(values) == length > 2 and values.dtype.kind in "iufM"
     }
-    found = [name for name, values in fitting.items() if values.dtype.kind == "M" or _is_named(name)]
+    names = [name for name, values in fitting.items() if values.dtype.kind == "M" or _is_named(name)]
     if contents.is_table and not contents.has_header and "0" in fitting and len(fitting) > 1:
         first = np.asarray(fitting["0"][:2], np.float64)
         if abs(first[1] - first[0]) != 1.0:
-            found.append("0")
-    return found
+            names.append("0")
+    return names
 
 
 def _is_named(name: str) -> bool:

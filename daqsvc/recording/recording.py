@@ -150,8 +150,8 @@ def list_channels(path: Path | str) -> dict[str, int]:
     Raises:
         RecordingError: the file cannot be read.
     """
-    found: dict[str, int] = _there("channels_of", Path(path), {}).found
-    return found
+    lengths: dict[str, int] = _there("channels_of", Path(path), {}).found
+    return lengths
 
 
 def load_matching(path: Path | str, channels: Mapping[str, str], rate_hz: float | None = None) -> Recording:
@@ -164,10 +164,10 @@ def load_matching(path: Path | str, channels: Mapping[str, str], rate_hz: float 
         return load_recording(path, channels, rate_hz)
     except RecordingError:
         there = list_channels(path)
-        found = {name: matching(path, variable, there) for name, variable in channels.items()}
-        if found == channels:
+        paths = {name: matching(path, variable, there) for name, variable in channels.items()}
+        if paths == channels:
             raise
-    return load_recording(path, found, rate_hz)
+    return load_recording(path, paths, rate_hz)
 
 
 def matching(path: Path | str, variable: str, there: Iterable[str]) -> str:

@@ -82,15 +82,15 @@ def _detector(draft: MachineFile, alarm: DiagnosisAlarm, at: KeyPath) -> Iterato
         yield Finding((*at, "detector"), "there is no such detector", choice(alarm.detector, keys))
         return
     key = keys[alarm.detector]
-    given = getattr(draft.pipeline, key)
-    if given is None:
+    settings = getattr(draft.pipeline, key)
+    if settings is None:
         yield Finding(
             (*at, "detector"),
             "this detector is not configured",
             f"write a table [pipeline.{key}], or remove the alarm",
         )
         return
-    yield from detector_tables()[key].alarm_checks(given, at)
+    yield from detector_tables()[key].alarm_checks(settings, at)
 
 
 def _start_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
@@ -125,8 +125,8 @@ def _never_up(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
 
 def _start_up_signal(draft: MachineFile, start_up: StartUp) -> Iterator[Finding]:
     signals: dict[str, tuple[str, ...]] = {}
-    for _, plugin, given in configured(draft.pipeline):
-        signals |= plugin.start_up_signals(draft, given)
+    for _, plugin, settings in configured(draft.pipeline):
+        signals |= plugin.start_up_signals(draft, settings)
     if not signals:
         tables = [f"[pipeline.{key}]" for key, plugin in detector_tables().items() if plugin.states_speed]
         yield Finding(
@@ -289,17 +289,17 @@ def _believed(draft: MachineFile, alarm: SetpointAlarm, at: KeyPath) -> Iterator
         key, limits = _ok_limits(sensor)
         if limits is None:
             continue
-        said = f'the OK limits {limits[0]:g} to {limits[1]:g} of "{name}"'
+        limits_text = f'the OK limits {limits[0]:g} to {limits[1]:g} of "{name}"'
         for setpoint, value in alarm.setpoints.items():
             if not limits[0] <= value <= limits[1]:
                 yield Finding(
                     (*at, setpoint),
-                    f"is never reached: it lies outside {said}, where that is not believed",
+                    f"is never reached: it lies outside {limits_text}, where that is not believed",
                     f"correct it, or {key} of the sensor",
                 )
             room = value - limits[0] if setpoint in _UPPER else limits[1] - value
             if 0 < room <= alarm.deadband:
-                yield _never_returns(at, f"the {room:g} that {said} leave beside {setpoint}", room)
+                yield _never_returns(at, f"the {room:g} that {limits_text} leave beside {setpoint}", room)
                 return
 
 

@@ -46,8 +46,8 @@ class Bus(Hooks, Section):
     @property
     def summary(self) -> str:
         """What a person should know about it, in a few words."""
-        given = [f"{key} {value}" for key, value in self if key not in {"driver", "start"}]
-        return ", ".join([f"driver {self.driver}", *given])
+        options = [f"{key} {value}" for key, value in self if key not in {"driver", "start"}]
+        return ", ".join([f"driver {self.driver}", *options])
 
     @property
     def device(self) -> Device | None:

@@ -49,9 +49,9 @@ def check(draft: MachineFile, facts: Mapping[str, Any]) -> list[Finding]:
         facts: by stream, what was read from the files that its layout names.
     """
     findings: list[Finding] = []
-    for found in _checks(draft, facts):
+    for one in _checks(draft, facts):
         with suppress(UnusableValueError):
-            for finding in found:
+            for finding in one:
                 findings.append(finding)
                 if len(findings) >= _MOST_FINDINGS:
                     return findings
@@ -107,14 +107,14 @@ def _checks(draft: MachineFile, facts: Mapping[str, Any]) -> Iterator[Iterator[F
     yield _names(draft)
     yield from physics_checks(draft)
     with suppress(UnusableValueError):
-        for _, detector, given in configured(draft.pipeline, valid_only=True):
+        for _, detector, settings in configured(draft.pipeline, valid_only=True):
             with suppress(UnusableValueError):
-                yield from detector.checks(draft, given)
+                yield from detector.checks(draft, settings)
     yield from _alignment_checks(draft)
     yield from alarm_checks(draft)
-    for _, output, given in configured_outputs(draft, valid_only=True):
+    for _, output, settings in configured_outputs(draft, valid_only=True):
         with suppress(UnusableValueError):
-            yield from output.checks(draft, given)
+            yield from output.checks(draft, settings)
 
 
 def _drivers_of(draft: MachineFile, stream: Stream) -> list[BusTable]:

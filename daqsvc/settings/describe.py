@@ -156,8 +156,8 @@ def _detectors(machine: MachineFile) -> Iterator[tuple[str, str]]:
         error_us, wait_ms = pipeline.alignment.max_error_us, pipeline.alignment.max_wait_ms
         text = f"{', '.join(others)} on the samples of {reference}; left out where they may be more than "
         yield "grid", f"{text}{error_us:g} us off, missing when more than {wait_ms:g} ms late"
-    for key, plugin, given in configured(pipeline):
-        yield plugin.detector or key, _words(partial(plugin.describe, machine, given))
+    for key, plugin, settings in configured(pipeline):
+        yield plugin.detector or key, _words(partial(plugin.describe, machine, settings))
 
 
 _ALARM_HEADER = ("name", "watches", "alert", "danger", "deadband and delays")
@@ -196,12 +196,12 @@ def _limits(low: float | None, high: float | None, unit: str) -> str:
 
 
 def _outlets(machine: MachineFile) -> Iterator[tuple[str, str]]:
-    told = [
-        (path, _words(partial(plugin.describe, machine, given)))
-        for path, plugin, given in configured_outputs(machine)
+    lines = [
+        (path, _words(partial(plugin.describe, machine, settings)))
+        for path, plugin, settings in configured_outputs(machine)
     ]
     for path, plugin in output_tables().items():
-        below = [words for at, words in told if f"{at}.".startswith(f"{path}.") and words]
+        below = [words for at, words in lines if f"{at}.".startswith(f"{path}.") and words]
         if "." not in path and (below or plugin.absent):
             yield plugin.label or path, "; ".join(below) or plugin.absent
     yield (

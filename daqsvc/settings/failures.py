@@ -22,9 +22,9 @@ def raised(error: Exception, kind: type[Any], part: str) -> str:
     home = getattr(sys.modules.get(kind.__module__), "__file__", None)
     frames = traceback.extract_tb(error.__traceback__)
     place = next((frame for frame in reversed(frames) if frame.filename == home), frames[-1])
-    said = ": ".join(word for word in (type(error).__name__, " ".join(f"{error}".split())) if word)
+    error_text = ": ".join(word for word in (type(error).__name__, " ".join(f"{error}".split())) if word)
     where = f"{Path(place.filename).name}, line {place.lineno}"
-    return f"{part} of {kind.__module__}.{kind.__qualname__} has failed: {said} ({where})"
+    return f"{part} of {kind.__module__}.{kind.__qualname__} has failed: {error_text} ({where})"
 
 
 def mend_or_remove(kind: type[Any], table: str = "") -> str:

@@ -150,9 +150,9 @@ def _called(by: Hooks, name: str, hook: Callable[..., Any], *args: Any, **kwargs
     return _each(by, name, at, got) if isinstance(got, Iterator) else got
 
 
-def _each(by: Hooks, name: str, at: KeyPath | None, found: Iterator[Any]) -> Iterator[Any]:
+def _each(by: Hooks, name: str, at: KeyPath | None, items: Iterator[Any]) -> Iterator[Any]:
     with _guarded(by, name, at):
-        for one in found:
+        for one in items:
             yield _each(by, name, at, one) if isinstance(one, Iterator) else one
 
 

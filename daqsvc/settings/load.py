@@ -173,9 +173,9 @@ class _Reading:
 
     def problems(self) -> tuple[list[Problem], list[Problem]]:
         """What makes the file unusable, and what is worth a warning; both in the order of the file."""
-        found = [one for one in dict.fromkeys(self.findings) if not self._only_follows(one.path)]
-        fatal = [self._problem(finding) for finding in found if finding.fatal]
-        warnings = [self._problem(finding) for finding in found if not finding.fatal]
+        findings = [one for one in dict.fromkeys(self.findings) if not self._only_follows(one.path)]
+        fatal = [self._problem(finding) for finding in findings if finding.fatal]
+        warnings = [self._problem(finding) for finding in findings if not finding.fatal]
         return sorted(fatal, key=_place), sorted(warnings, key=_place)
 
     def _only_follows(self, path: KeyPath) -> bool:
@@ -238,8 +238,8 @@ def _read_files(draft: MachineFile, path: Path, findings: list[Finding]) -> dict
                 plugin = driver_of_layout(stream.layout)
                 if plugin is None:
                     continue
-                facts, found = plugin.read_files(stream.layout, path.parent, ("streams", name, "layout"))
-                findings += found
+                facts, problems = plugin.read_files(stream.layout, path.parent, ("streams", name, "layout"))
+                findings += problems
                 if facts is not None:
                     known[name] = facts
     return known

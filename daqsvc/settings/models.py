@@ -196,9 +196,9 @@ class MachineFile(Section):
 
     def found_at(self, origin: Origin) -> MachineFile:
         """The same, with where it came from."""
-        found = self.model_copy()
-        found._origin = origin  # noqa: SLF001 - its own
-        return found
+        copy = self.model_copy()
+        copy._origin = origin  # noqa: SLF001 - its own
+        return copy
 
     @property
     def path(self) -> Path:
@@ -234,7 +234,9 @@ class MachineFile(Section):
         Raises:
             UnusableValueError: it is there and not valid.
         """
-        return next((given for _, _, given in configured_outputs(self) if isinstance(given, kind)), None)
+        return next(
+            (settings for _, _, settings in configured_outputs(self) if isinstance(settings, kind)), None
+        )
 
     def resolve(self, path: Path) -> Path:
         """A path of the file, made absolute: relative ones start at the directory of the machine file."""
@@ -254,7 +256,7 @@ class MachineFile(Section):
     @property
     def sampled_together(self) -> tuple[tuple[str, ...], ...]:
         """The sensors that each detector takes together, sample by sample; the reference's first."""
-        together = (plugin.sampled_together(given) for _, plugin, given in configured(self.pipeline))
+        together = (plugin.sampled_together(settings) for _, plugin, settings in configured(self.pipeline))
         return tuple(names for names in together if names)
 
     def grid(self, together: Sequence[str]) -> Grid:

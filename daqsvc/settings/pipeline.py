@@ -42,7 +42,7 @@ class Pipeline(Section):
             UnusableValueError: it is there and not valid.
         """
         for key in type(self).model_fields:
-            given = getattr(self, key) if key not in Pipeline.model_fields else None
-            if isinstance(given, kind):
-                return given
+            settings = getattr(self, key) if key not in Pipeline.model_fields else None
+            if isinstance(settings, kind):
+                return settings
         return None

@@ -27,35 +27,35 @@ SettingsT = TypeVar("SettingsT", bound=Section)
 class PipelineTable(DetectorKind[SettingsT]):
     """What a detector says of its table in ``[pipeline]``; `daqsvc.diagnosis.plugin` adds the detector."""
 
-    def checks(self, draft: MachineFile, given: SettingsT) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: SettingsT) -> Iterator[Iterator[Finding]]:
         """Every check of what the table says, and of what it asks of other tables.
 
         Args:
             draft: the machine file, or what is valid of it.
-            given: the table, or what is valid of it.
+            settings: the table, or what is valid of it.
         """
-        del draft, given
+        del draft, settings
         return iter(())
 
-    def alarm_checks(self, given: SettingsT, at: KeyPath) -> Iterator[Finding]:
+    def alarm_checks(self, settings: SettingsT, at: KeyPath) -> Iterator[Finding]:
         """Whether an alarm that follows the detector can be raised.
 
         Args:
-            given: the table, or what is valid of it.
+            settings: the table, or what is valid of it.
             at: where the alarm stands in the file.
         """
-        del given, at
+        del settings, at
         return iter(())
 
-    def start_up_signals(self, draft: MachineFile, given: SettingsT) -> Mapping[str, tuple[str, ...]]:
+    def start_up_signals(self, draft: MachineFile, settings: SettingsT) -> Mapping[str, tuple[str, ...]]:
         """By detector, the statistics that it goes on stating while the speed of the machine changes."""
-        del draft, given
+        del draft, settings
         return {}
 
-    def describe(self, machine: MachineFile, given: SettingsT) -> str:
+    def describe(self, machine: MachineFile, settings: SettingsT) -> str:
         """What was understood of the table, for a person."""
         del machine
-        return ", ".join(f"{key} {value}" for key, value in given)
+        return ", ".join(f"{key} {value}" for key, value in settings)
 
 
 @contract
@@ -70,20 +70,20 @@ class OutputTable(OutputKind[SettingsT]):
     label: ClassVar[str] = ""
     absent: ClassVar[str] = ""
 
-    def checks(self, draft: MachineFile, given: SettingsT) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: SettingsT) -> Iterator[Iterator[Finding]]:
         """Every check of what the table says, and of what it asks of other tables.
 
         Args:
             draft: the machine file, or what is valid of it.
-            given: the table, or what is valid of it.
+            settings: the table, or what is valid of it.
         """
-        del draft, given
+        del draft, settings
         return iter(())
 
-    def describe(self, machine: MachineFile, given: SettingsT) -> str:
+    def describe(self, machine: MachineFile, settings: SettingsT) -> str:
         """What was understood of the table, for a person; empty for nothing."""
         del machine
-        return ", ".join(f"{key} {value}" for key, value in given)
+        return ", ".join(f"{key} {value}" for key, value in settings)
 
 
 class StreamWords(NamedTuple):
@@ -173,8 +173,8 @@ def configured(
     pipeline: Pipeline, *, valid_only: bool = False
 ) -> Iterator[tuple[str, PipelineTable[Any], Any]]:
     """See `registry.configured`."""
-    found = registry.configured(pipeline, valid_only=valid_only)
-    return cast("Iterator[tuple[str, PipelineTable[Any], Any]]", found)
+    tables = registry.configured(pipeline, valid_only=valid_only)
+    return cast("Iterator[tuple[str, PipelineTable[Any], Any]]", tables)
 
 
 def output_tables() -> Mapping[str, OutputTable[Any]]:
@@ -186,5 +186,5 @@ def configured_outputs(
     root: Section, *, valid_only: bool = False
 ) -> Iterator[tuple[str, OutputTable[Any], Any]]:
     """See `registry.configured_outputs`."""
-    found = registry.configured_outputs(root, valid_only=valid_only)
-    return cast("Iterator[tuple[str, OutputTable[Any], Any]]", found)
+    tables = registry.configured_outputs(root, valid_only=valid_only)
+    return cast("Iterator[tuple[str, OutputTable[Any], Any]]", tables)

@@ -77,12 +77,12 @@ class DetectorKind(Hooks, Generic[SettingsT]):
     measures_levels: ClassVar[bool] = False
     place: ClassVar[int] = 100
 
-    def sampled_together(self, given: SettingsT) -> tuple[str, ...]:
+    def sampled_together(self, settings: SettingsT) -> tuple[str, ...]:
         """Sensors whose samples it takes together, wherever they come from; the reference's first.
 
         Where these lie in several streams, they are put on one grid: ``[pipeline.alignment]``.
         """
-        del given
+        del settings
         return ()
 
 
@@ -158,14 +158,14 @@ class _Installed:
 
 @cache
 def _installed(group: str, what: str, contract: type[Any]) -> _Installed:
-    found: dict[str, Any] = {}
+    plugins: dict[str, Any] = {}
     broken: dict[str, str] = {}
     for point in entry_points(group=group):
         try:
-            found[point.name] = _made(point, what, contract)
+            plugins[point.name] = _made(point, what, contract)
         except (Exception, SystemExit) as error:  # noqa: BLE001  whatever a plugin does when it is imported
             broken[point.name] = f"the {what} cannot be loaded from {point.value}: {error}"
-    ordered = sorted(found.items(), key=lambda item: (item[1].place, item[0]))
+    ordered = sorted(plugins.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
 
 
@@ -199,9 +199,9 @@ def _fits(plugin: type[Any]) -> None:
             raise TypeError(f"{name} of {plugin.__name__} holds {table!r}, which is no {kind.__name__}")
     for declared in (one for one in plugin.__mro__ if "__hooks__" in vars(one)):
         for name, usual in vars(declared).items():
-            given, allowed = getattr(plugin, name, usual), _ALLOWED.get(type(usual))
-            if allowed is not None and not name.startswith("_") and not isinstance(given, allowed):
-                raise TypeError(f"{name} of {plugin.__name__} is {given!r}: write what {name} = {usual!r} is")
+            value, allowed = getattr(plugin, name, usual), _ALLOWED.get(type(usual))
+            if allowed is not None and not name.startswith("_") and not isinstance(value, allowed):
+                raise TypeError(f"{name} of {plugin.__name__} is {value!r}: write what {name} = {usual!r} is")
 
 
 def forget() -> None:
@@ -249,8 +249,8 @@ def driver_of_layout(layout: Layout) -> DriverKind | None:
 
 def _bus_kind(table: Mapping[str, Any]) -> type[Bus]:
     drivers = bus_tables()
-    given = table.get("driver")
-    name = given if isinstance(given, str) else next(iter(drivers), "")
+    settings = table.get("driver")
+    name = settings if isinstance(settings, str) else next(iter(drivers), "")
     with suppress(PluginFailedError):  # it is a finding, and nobody knows what the table may hold
         if name in drivers:
             return drivers[name].bus_of(table)
@@ -342,9 +342,9 @@ def configured(
     """
     for key, plugin in detector_tables().items():
         with suppress(*((UnusableValueError,) if valid_only else ())):
-            given = getattr(pipeline, key)
-            if given is not None:
-                yield key, plugin, given
+            settings = getattr(pipeline, key)
+            if settings is not None:
+                yield key, plugin, settings
 
 
 def table_at(root: Section, path: str) -> Section | None:
@@ -357,10 +357,10 @@ def table_at(root: Section, path: str) -> Section | None:
     Raises:
         UnusableValueError: there is one that is no table at all.
     """
-    given: Section | None = root
+    table: Section | None = root
     for key in path.split("."):
-        given = getattr(given, key, None)
-    return given
+        table = getattr(table, key, None)
+    return table
 
 
 def configured_outputs(
@@ -377,6 +377,6 @@ def configured_outputs(
     """
     for path, plugin in output_tables().items():
         with suppress(*((UnusableValueError,) if valid_only else ())):
-            given = table_at(root, path)
-            if given is not None:
-                yield path, plugin, given
+            settings = table_at(root, path)
+            if settings is not None:
+                yield path, plugin, settings

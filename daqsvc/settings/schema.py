@@ -85,7 +85,7 @@ def declared_at(root: type[Section], document: Any, path: KeyPath) -> Any:
 @cache
 def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
     """Every key of the format, with the tables that can hold it."""
-    found: dict[str, list[str]] = {}
+    homes: dict[str, list[str]] = {}
 
     def walk(declared: Any, path: str) -> None:
         kinds, bare = kinds_of(declared), _bare(declared)
@@ -93,7 +93,7 @@ def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
         if kinds is not None or _is_section(bare):
             for section in kinds.sections if kinds is not None else (bare,):
                 for name, field in section.model_fields.items():
-                    places = found.setdefault(name, [])
+                    places = homes.setdefault(name, [])
                     if path and path not in places:
                         places.append(path)
                     walk(field_type(field), f"{path}.{name}" if path else name)
@@ -102,7 +102,7 @@ def _homes(root: type[Section]) -> Mapping[str, tuple[str, ...]]:
             walk(element, path if "." in path and get_origin(bare) is tuple else several)
 
     walk(root, "")
-    return {name: tuple(places) for name, places in found.items()}
+    return {name: tuple(places) for name, places in homes.items()}
 
 
 def forget_homes() -> None:

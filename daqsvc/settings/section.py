@@ -85,9 +85,9 @@ class Section(BaseModel):
         except (ValueError, AssertionError):  # it is not valid, which validators say so
             raise
         except Exception as error:
-            said, remedy = raised(error, cls, "a validator"), mend_or_remove(cls)
+            sentence, remedy = raised(error, cls, "a validator"), mend_or_remove(cls)
             raise PydanticCustomError(
-                "validator_failed", "{said}", {"said": said, "remedy": remedy}
+                "validator_failed", "{said}", {"said": sentence, "remedy": remedy}
             ) from error
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist

@@ -101,19 +101,19 @@ def _of_a_rotor(draft: MachineFile, name: str) -> bool:
 
 def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
     """The sensitivity is one that sensors of this unit have."""
-    given, usual = sensor.sensitivity_mv_per_unit, _USUAL.get(sensor.unit)
-    if given is None or usual is None or isinstance(sensor, TrendValue):
+    stated, usual = sensor.sensitivity_mv_per_unit, _USUAL.get(sensor.unit)
+    if stated is None or usual is None or isinstance(sensor, TrendValue):
         return
-    size = abs(given)
+    size = abs(stated)
     if usual.few_below <= size <= usual.few_above:
         return
     built = usual.least <= size <= usual.most
     meant = [
         f"{unit_text} are sensitivity_mv_per_unit = {value:.4g}"
         for value, unit_text in (
-            (given * 1000.0, f"{given:g} V/{sensor.unit}"),
+            (stated * 1000.0, f"{stated:g} V/{sensor.unit}"),
             *(
-                (given * (factor_between(sensor.unit, other) or math.nan), f"{given:g} mV/{other}")
+                (stated * (factor_between(sensor.unit, other) or math.nan), f"{stated:g} mV/{other}")
                 for other in _USUAL
                 if other != sensor.unit
             ),
@@ -122,7 +122,7 @@ def check_sensitivity(sensor: Sensor, at: KeyPath) -> Iterator[Finding]:
     ]
     yield Finding(
         (*at, "sensitivity_mv_per_unit"),
-        f"{given:g} mV/{sensor.unit} is what {'hardly any' if built else 'no'} sensor has; usual is some "
+        f"{stated:g} mV/{sensor.unit} is what {'hardly any' if built else 'no'} sensor has; usual is some "
         f"{usual.example:g}",
         "; ".join(meant) or f"write it in mV per {sensor.unit}, from the sensor's calibration sheet",
         fatal=not built,

@@ -78,11 +78,11 @@ def parse(text: str) -> tuple[dict[str, Any], Mapping[KeyPath, Spot]]:
     text = text.removeprefix("\ufeff")
     if len(text) > MOST_BYTES:
         raise TomlTextError(f"is larger than {MOST_BYTES / 1e6:.3g} MB", "see whether it is the right file")
-    if (found := _LONG_KEY.search(text)) is not None:
-        raise _too_deep(_line_at(text, found.start()))
-    if (found := _LONG_NUMBER.search(text)) is not None:
+    if (match := _LONG_KEY.search(text)) is not None:
+        raise _too_deep(_line_at(text, match.start()))
+    if (match := _LONG_NUMBER.search(text)) is not None:
         raise TomlTextError(
-            "has a number with hundreds of digits", "write a number", _line_at(text, found.start())
+            "has a number with hundreds of digits", "write a number", _line_at(text, match.start())
         )
     try:
         # With its last line ended: else tomllib has no line number for a mistake there.

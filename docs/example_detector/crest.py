@@ -20,9 +20,9 @@ class Crest(Section):
 class CrestDetector(WindowDetector):
     """Peak over RMS of each second."""
 
-    def __init__(self, machine: MachineFile, given: Crest) -> None:
-        super().__init__(machine, "crest", [given.sensor], window_s=1.0)
-        self._alert = given.alert
+    def __init__(self, machine: MachineFile, settings: Crest) -> None:
+        super().__init__(machine, "crest", [settings.sensor], window_s=1.0)
+        self._alert = settings.alert
 
     def judge(self, samples: np.ndarray) -> Judgement:
         """Whether the crest factor is at the setpoint; a sensor that stands still has none."""
@@ -36,13 +36,13 @@ class CrestPlugin(DetectorPlugin[Crest]):
 
     settings, about, detector = Crest, "knocks in an acceleration", "crest"
 
-    def checks(self, draft: MachineFile, given: Crest) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: Crest) -> Iterator[Iterator[Finding]]:
         """There is such a sensor."""
         names = [sensor.name for sensor in draft.sensors]
-        if given.sensor not in names:
+        if settings.sensor not in names:
             at = ("pipeline", "crest", "sensor")
-            yield iter([Finding(at, "there is no such sensor", choice(given.sensor, names))])
+            yield iter([Finding(at, "there is no such sensor", choice(settings.sensor, names))])
 
-    def build(self, machine: MachineFile, given: Crest, _store: Path | None) -> list[CrestDetector]:
+    def build(self, machine: MachineFile, settings: Crest, _store: Path | None) -> list[CrestDetector]:
         """One detector."""
-        return [CrestDetector(machine, given)]
+        return [CrestDetector(machine, settings)]

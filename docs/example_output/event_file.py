@@ -60,6 +60,6 @@ class EventFilePlugin(OutputPlugin[EventFile]):
 
     settings, about, status_key = EventFile, "alarm events in a file", "event_file"
 
-    def build(self, machine: MachineFile, given: EventFile, port: OutputPort) -> Output:
+    def build(self, machine: MachineFile, settings: EventFile, port: OutputPort) -> Output:
         """The output."""
-        return EventFileOutput(machine.resolve(Path(given.path)), port)
+        return EventFileOutput(machine.resolve(Path(settings.path)), port)

@@ -90,13 +90,13 @@ class SampleTable:
         wanted = [({one.name: one.column for one in spec.layout.columns}, spec.rate_hz) for spec in specs]
         try:
             with reader or ConfinedProcess() as process:
-                found = load_streams(path, wanted, limits or ResourceLimits(), process)
+                loaded = load_streams(path, wanted, limits or ResourceLimits(), process)
         except RecordingError as error:
             raise RecordedLogError(f"{error}") from error
-        self.notes = dict.fromkeys(note for _, notes in found for note in notes)
+        self.notes = dict.fromkeys(note for _, notes in loaded for note in notes)
         self._streams: list[tuple[StreamSpec[TableLayout], NDArray[np.float32]]] = []
         for spec in specs:
-            samples, _ = found.pop(0)  # so that they and the values need not all be held at once
+            samples, _ = loaded.pop(0)  # so that they and the values need not all be held at once
             values = np.empty(samples.shape, np.float32)
             with np.errstate(over="ignore", invalid="ignore"):
                 for i, column in enumerate(spec.layout.columns):
@@ -112,16 +112,16 @@ class SampleTable:
         span_ns = max(span_ns, round(2 * NS_PER_S / max(rates)))
         span_ns = min(span_ns, round(PIECE_SAMPLES * NS_PER_S / max(rates)))
         end_ns = self._t_ns + span_ns
-        found = DecodedBatch()
+        batch = DecodedBatch()
         left = False
         for spec, values in self._streams:
             first, last = (min(round(t * spec.rate_hz / NS_PER_S), len(values)) for t in (self._t_ns, end_ns))
             left = left or last < len(values)
             if last > first:
-                found.frames[spec.name] = self._frames(spec, values, first, last)
+                batch.frames[spec.name] = self._frames(spec, values, first, last)
         self._t_ns = end_ns
-        if found.frames or left:
-            return found
+        if batch.frames or left:
+            return batch
         for spec, values in self._streams:
             self._first_index[spec.name] = self._first_index.get(spec.name, 0) + len(values)
         return None

@@ -395,9 +395,9 @@ def doubted(probability: Mapping[str, float], notes: int, repairs: int, lost: fl
     """
     doubt = min(NOTE_DOUBT * notes + REPAIR_DOUBT * repairs + lost, MOST_DOUBT)
     shares = dict(probability)
-    given = doubt * shares.get("normal", 0.0)
-    if given > 0.0:
-        shares["normal"] -= given
+    normal_share = doubt * shares.get("normal", 0.0)
+    if normal_share > 0.0:
+        shares["normal"] -= normal_share
         for part in PARTS:
-            shares[part] = shares.get(part, 0.0) + given / len(PARTS)
+            shares[part] = shares.get(part, 0.0) + normal_share / len(PARTS)
     return shares

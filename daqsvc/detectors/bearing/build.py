@@ -34,13 +34,13 @@ SAME_RATE = 1e-3
 
 
 def bearing_detector(
-    machine: MachineFile, given: Bearing, store: Path | None, calibration: Path | None = None
+    machine: MachineFile, settings: Bearing, store: Path | None, calibration: Path | None = None
 ) -> BearingDetector:
     """The detector that ``[pipeline.bearing]`` asks for.
 
     Args:
         machine: the machine file.
-        given: its bearings.
+        settings: its bearings.
         store: directory of the state that survives restarts; None to begin without any and leave none.
         calibration: file with the healthy machine, in place of what the machine file names.
 
@@ -48,23 +48,23 @@ def bearing_detector(
         ValueError: a bearing is not in the catalogue, its orders contradict each other, or a file with the
             healthy machine cannot be used.
     """
-    stream = machine.sensor(given.bearings[0].sensor).stream
+    stream = machine.sensor(settings.bearings[0].sensor).stream
     rate_hz = machine.streams[stream].rate_hz
-    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
+    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(settings.bearings)]
     speed_rpm = machine.machine.speed_rpm
-    keyphasor = None if given.keyphasor is None else _keyphasor(machine, given.keyphasor)
+    keyphasor = None if settings.keyphasor is None else _keyphasor(machine, settings.keyphasor)
     # A measured speed tells by itself when the healthy machine's is another one.
     same_speed_rpm = speed_rpm if keyphasor is None else None
     baseline: BearingBaseline | None = None
     kept: Path | None = None
     if calibration is not None:
         baseline = _fitting(calibration, bearings, rate_hz, same_speed_rpm)
-    elif given.calibration is not None:
+    elif settings.calibration is not None:
         try:
-            baseline = _fitting(machine.resolve(given.calibration), bearings, rate_hz, same_speed_rpm)
+            baseline = _fitting(machine.resolve(settings.calibration), bearings, rate_hz, same_speed_rpm)
         except BaselineFileError as error:
             raise BaselineFileError(
-                f"pipeline.bearing.calibration = {str(given.calibration)!r}: {error}"
+                f"pipeline.bearing.calibration = {str(settings.calibration)!r}: {error}"
             ) from None
     elif store is not None:
         kept = store / f"{BEARING}.toml"
@@ -77,38 +77,41 @@ def bearing_detector(
         bearings=bearings,
         keyphasor=keyphasor,
         rules=ChangeRules(
-            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+            false_alarm_probability=settings.false_alarm_probability,
+            repeatability_db=settings.repeatability_db,
         ),
         baseline=baseline,
-        calibrate_s=given.calibrate_s,
+        calibrate_s=settings.calibrate_s,
         name=BEARING,
         keep=None if kept is None else partial(_keep, kept),
     )
 
 
-def healthy_machine(machine: MachineFile, given: Bearing, calibration: Path) -> BearingBaseline:
+def healthy_machine(machine: MachineFile, settings: Bearing, calibration: Path) -> BearingBaseline:
     """The healthy machine of a file, if it is that of these bearings at their rate and speed.
 
     Raises:
         ValueError: it is not, the file cannot be used, or a bearing is not known.
     """
-    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(given.bearings)]
-    rate_hz = machine.streams[machine.sensor(given.bearings[0].sensor).stream].rate_hz
+    bearings = [_housed(machine, index, bearing) for index, bearing in enumerate(settings.bearings)]
+    rate_hz = machine.streams[machine.sensor(settings.bearings[0].sensor).stream].rate_hz
     return _fitting(calibration, bearings, rate_hz, machine.machine.speed_rpm)
 
 
-def pair_models(machine: MachineFile, given: Bearing) -> dict[tuple[str, ...], PairModel]:
+def pair_models(machine: MachineFile, settings: Bearing) -> dict[tuple[str, ...], PairModel]:
     """Bearings with an accelerometer on rotor and housing, by the names of these in that order.
 
     Args:
         machine: the machine file.
-        given: its bearings, or those that a recording has.
+        settings: its bearings, or those that a recording has.
 
     Raises:
         ValueError: masses and springs cannot be those of a bearing, or the rate is too low for them.
     """
-    found = ((bearing.sensors, _two_sensors(machine, bearing, i)) for i, bearing in enumerate(given.bearings))
-    return {tuple(sensors): two.model for sensors, two in found if two is not None}
+    pairs = (
+        (bearing.sensors, _two_sensors(machine, bearing, i)) for i, bearing in enumerate(settings.bearings)
+    )
+    return {tuple(sensors): two.model for sensors, two in pairs if two is not None}
 
 
 def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
@@ -118,33 +121,33 @@ def _keyphasor(machine: MachineFile, name: str) -> KeyphasorProbe:
     return KeyphasorProbe(name, column, sensor.threshold_v, sensor.hysteresis_v, sensor.edge)
 
 
-def _housed(machine: MachineFile, index: int, given: WatchedBearing) -> HousedBearing:
-    sensor = machine.sensor(given.sensor)
+def _housed(machine: MachineFile, index: int, settings: WatchedBearing) -> HousedBearing:
+    sensor = machine.sensor(settings.sensor)
     column = machine.streams[sensor.stream].layout.channel_names.index(sensor.channel)
-    two = _two_sensors(machine, given, index)
-    return HousedBearing(given.name, given.sensor, column, orders_of(given, index), two)
+    two = _two_sensors(machine, settings, index)
+    return HousedBearing(settings.name, settings.sensor, column, orders_of(settings, index), two)
 
 
-def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> TwoSensors | None:
+def _two_sensors(machine: MachineFile, settings: WatchedBearing, index: int) -> TwoSensors | None:
     """The accelerometer on the rotor and the masses of a bearing of a machine file; None if it has none.
 
     Args:
         machine: the machine file.
-        given: the bearing.
+        settings: the bearing.
         index: its place in ``pipeline.bearing.bearings``.
 
     Raises:
         ValueError: its masses and springs cannot be those of a bearing, or the rate is too low for them.
     """
-    if given.rotor_sensor is None or given.model is None:
+    if settings.rotor_sensor is None or settings.model is None:
         return None
-    model = given.model
+    model = settings.model
     (m_r, m_b, m_h), (k_s, k_c, k_h), (c_s, c_c, c_h) = (
         model.masses_kg,
         model.stiffness_n_per_m,
         model.damping_n_s_per_m,
     )
-    rotor, housing = machine.sensor(given.rotor_sensor), machine.sensor(given.sensor)
+    rotor, housing = machine.sensor(settings.rotor_sensor), machine.sensor(settings.sensor)
     column = machine.streams[rotor.stream].layout.channel_names.index(rotor.channel)
     m_s2_per_unit = (M_S2_PER_UNIT[rotor.unit], M_S2_PER_UNIT[housing.unit])
     try:
@@ -162,24 +165,24 @@ def _two_sensors(machine: MachineFile, given: WatchedBearing, index: int) -> Two
     return TwoSensors(rotor.name, column, PairModel(parameters, m_s2_per_unit, model.mismatch))
 
 
-def orders_of(given: WatchedBearing, index: int) -> BearingOrders:
+def orders_of(settings: WatchedBearing, index: int) -> BearingOrders:
     """Fault orders of a bearing of a machine file.
 
     Args:
-        given: the bearing.
+        settings: the bearing.
         index: its place in ``pipeline.bearing.bearings``.
 
     Raises:
         ValueError: the catalogue does not know it, or its orders contradict each other.
     """
     at = f"pipeline.bearing.bearings[{index}]"
-    if given.orders is None:
-        assert given.type is not None  # noqa: S101 - detectors/bearing/checks.py: one of the two
+    if settings.orders is None:
+        assert settings.type is not None  # noqa: S101 - detectors/bearing/checks.py: one of the two
         try:
-            return bearing_orders(given.type)
+            return bearing_orders(settings.type)
         except KeyError as error:
             raise ValueError(f"{at}.type: {error.args[0]}") from None
-    orders = given.orders
+    orders = settings.orders
     try:
         return BearingOrders(inner=orders.bpfi, outer=orders.bpfo, ball=orders.bsf, cage=orders.ftf)
     except ValueError as error:
@@ -200,21 +203,21 @@ def _fitting(
     Raises:
         BaselineFileError: it is not, or the file cannot be used.
     """
-    found = load_bearing_baseline(path)
+    baseline = load_bearing_baseline(path)
     lacking = [
         name
         for b in bearings
         for name in b.sensors
-        if b.sensors not in found.residuals or b.sensor not in found.races
+        if b.sensors not in baseline.residuals or b.sensor not in baseline.races
     ]
     if lacking:
-        known = ", ".join(found.races) or "none"
+        known = ", ".join(baseline.races) or "none"
         raise BaselineFileError(
             f"{path}: holds nothing of {', '.join(lacking)}, but of {known}; calibrate with all of them"
         )
     for what, value, wanted, tolerance in (
-        ("sampled at {:g} Hz", found.rate_hz, rate_hz, SAME_RATE),
-        ("of a machine at {:g} rpm", found.speed_rpm, abs(speed_rpm or found.speed_rpm), SAME_SPEED),
+        ("sampled at {:g} Hz", baseline.rate_hz, rate_hz, SAME_RATE),
+        ("of a machine at {:g} rpm", baseline.speed_rpm, abs(speed_rpm or baseline.speed_rpm), SAME_SPEED),
     ):
         if abs(value / wanted - 1.0) > tolerance:
             raise BaselineFileError(
@@ -223,7 +226,7 @@ def _fitting(
     for bearing in bearings:
         if bearing.two is None:
             continue
-        pair = found.pairs.get(bearing.sensors)
+        pair = baseline.pairs.get(bearing.sensors)
         names = " and ".join(bearing.sensors)
         if pair is None:
             raise BaselineFileError(f"{path}: holds nothing of {names} together; calibrate with both")
@@ -236,7 +239,7 @@ def _fitting(
             TwoSensorMonitor(pair)
         except ValueError as error:
             raise BaselineFileError(f"{path}: pair of {names}: {error}; calibrate again") from None
-    return found
+    return baseline
 
 
 def _kept(

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 
 def calibrate_bearings(
-    machine: MachineFile, given: Bearing, recording: Recording, *, together: bool = False
+    machine: MachineFile, settings: Bearing, recording: Recording, *, together: bool = False
 ) -> BearingBaseline:
     """The healthy machine of a recording, which must show no fault.
 
     Args:
         machine: the machine file.
-        given: its bearings.
+        settings: its bearings.
         recording: of the healthy machine, with all accelerometers. What is faster than the stream of the
             machine is learnt at its rate, as it is compared with the machine's own samples.
         together: whether all accelerometers are compared together, too.
@@ -44,15 +44,15 @@ def calibrate_bearings(
         ValueError: a bearing is not known.
     """
     speed_rpm = abs(machine.machine.speed_rpm)
-    orders = {bearing.sensor: orders_of(bearing, index) for index, bearing in enumerate(given.bearings)}
+    orders = {bearing.sensor: orders_of(bearing, index) for index, bearing in enumerate(settings.bearings)}
     _refuse_faults(recording, orders, speed_rpm)
-    watched_hz = machine.streams[machine.sensor(given.bearings[0].sensor).stream].rate_hz
+    watched_hz = machine.streams[machine.sensor(settings.bearings[0].sensor).stream].rate_hz
     # Options do not tell the rate of a stream: it is that of the recording then.
     rate_hz = watched_hz if abs(recording.rate_hz / watched_hz - 1.0) > SAME_RATE else recording.rate_hz
-    groups = [tuple(bearing.sensors) for bearing in given.bearings]
+    groups = [tuple(bearing.sensors) for bearing in settings.bearings]
     if together and len(groups) > 1:
-        groups.append(given.sensors)
-    return _learn(recording, rate_hz, speed_rpm, orders, groups, pair_models(machine, given))
+        groups.append(settings.sensors)
+    return _learn(recording, rate_hz, speed_rpm, orders, groups, pair_models(machine, settings))
 
 
 def _learn(

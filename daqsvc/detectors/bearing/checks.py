@@ -28,26 +28,26 @@ _LEAST_BLOCK_S = 0.5 * WINDOW_S
 """A shorter block of samples tells the detector nothing."""
 
 
-def bearing_checks(draft: MachineFile, given: Bearing) -> Iterator[Iterator[Finding]]:
+def bearing_checks(draft: MachineFile, settings: Bearing) -> Iterator[Iterator[Finding]]:
     """Every check of the bearings' detector.
 
     Args:
         draft: the machine file, or what is valid of it.
-        given: its bearings.
+        settings: its bearings.
     """
-    yield unique([bearing.name for bearing in given.bearings], (*_BEARING, "bearings"), "bearing")
-    for index, bearing in enumerate(given.bearings):
+    yield unique([bearing.name for bearing in settings.bearings], (*_BEARING, "bearings"), "bearing")
+    for index, bearing in enumerate(settings.bearings):
         at = (*_BEARING, "bearings", index)
         yield _kinematics(bearing, at)
         yield _sensors(draft, bearing, at)
         yield _direction(draft, bearing, at)
         yield _lines(draft, bearing, at)
-    yield _one_stream(draft, given)
-    yield _keyphasor(draft, given)
-    yield _pulses(draft, given)
+    yield _one_stream(draft, settings)
+    yield _keyphasor(draft, settings)
+    yield _pulses(draft, settings)
     yield _speed(draft)
     yield _ring(draft)
-    yield _blocks(draft, given)
+    yield _blocks(draft, settings)
 
 
 def _kinematics(bearing: WatchedBearing, at: KeyPath) -> Iterator[Finding]:
@@ -155,12 +155,12 @@ def _direction(draft: MachineFile, bearing: WatchedBearing, at: KeyPath) -> Iter
         )
 
 
-def _one_stream(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+def _one_stream(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
     sensors = named(draft)
-    first = sensors.get(given.bearings[0].sensor)
+    first = sensors.get(settings.bearings[0].sensor)
     if first is None:
         return
-    for index, bearing in enumerate(given.bearings):
+    for index, bearing in enumerate(settings.bearings):
         for key, name in (("sensor", bearing.sensor), ("rotor_sensor", bearing.rotor_sensor)):
             other = None if name is None else sensors.get(name)
             if other is not None and other.stream != first.stream:
@@ -171,19 +171,19 @@ def _one_stream(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
                 )
 
 
-def _keyphasor(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+def _keyphasor(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
     """What measures the speed is a keyphasor, sampled with the accelerometers."""
-    if given.keyphasor is None:
+    if settings.keyphasor is None:
         return
     at = (*_BEARING, "keyphasor")
     sensors = named(draft)
     keyphasors = [name for name, sensor in sensors.items() if sensor.type == "keyphasor"]
-    if given.keyphasor not in sensors:
-        yield Finding(at, "there is no such sensor", choice(given.keyphasor, keyphasors))
-    elif given.keyphasor not in keyphasors:
-        yield Finding(at, 'must be a sensor of type "keyphasor"', choice(given.keyphasor, keyphasors))
+    if settings.keyphasor not in sensors:
+        yield Finding(at, "there is no such sensor", choice(settings.keyphasor, keyphasors))
+    elif settings.keyphasor not in keyphasors:
+        yield Finding(at, 'must be a sensor of type "keyphasor"', choice(settings.keyphasor, keyphasors))
     else:
-        first, own = sensors.get(given.bearings[0].sensor), sensors[given.keyphasor].stream
+        first, own = sensors.get(settings.bearings[0].sensor), sensors[settings.keyphasor].stream
         if first is not None and own != first.stream:
             yield Finding(
                 at,
@@ -205,9 +205,9 @@ def _speed(draft: MachineFile) -> Iterator[Finding]:
         )
 
 
-def _pulses(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+def _pulses(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
     """A revolution has enough samples for the keyphasor's pulse."""
-    keyphasor = None if given.keyphasor is None else named(draft).get(given.keyphasor)
+    keyphasor = None if settings.keyphasor is None else named(draft).get(settings.keyphasor)
     if keyphasor is None or keyphasor.stream not in draft.streams:
         return
     rate_hz, speed_rpm = draft.streams[keyphasor.stream].rate_hz, abs(draft.machine.speed_rpm)
@@ -247,9 +247,9 @@ def _ring(draft: MachineFile) -> Iterator[Finding]:
         )
 
 
-def _blocks(draft: MachineFile, given: Bearing) -> Iterator[Finding]:
+def _blocks(draft: MachineFile, settings: Bearing) -> Iterator[Finding]:
     """Blocks that a device takes by themselves are long enough for a look each."""
-    first = named(draft).get(given.bearings[0].sensor)
+    first = named(draft).get(settings.bearings[0].sensor)
     stream = None if first is None else draft.streams.get(first.stream)
     block = None if stream is None else stream.layout.block
     if first is None or stream is None or block is None:

@@ -224,15 +224,15 @@ class BearingDetector:
             return [self._snapshot(window)]
         if window.first_index != self._end_index:
             self._forget()
-        said = []
+        diagnoses = []
         count = len(window.samples) // self.block
         for number in range(count):
             self._pending.append(window.samples[number * self.block : (number + 1) * self.block])
             self._end_index = window.first_index + (number + 1) * self.block
             if len(self._pending) == _BLOCKS_PER_LOOK:
                 after = len(window.samples) - (number + 1) * self.block
-                said.append(self._look(window.t_end_ns - round(after * window.period_ns)))
-        return said
+                diagnoses.append(self._look(window.t_end_ns - round(after * window.period_ns)))
+        return diagnoses
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
@@ -394,8 +394,8 @@ class BearingDetector:
         if bearing.name not in self._directions or not self._comparable:
             return {}
         pair = samples[:, list(bearing.columns)]
-        found = self._directions[bearing.name].judge(pair, suspected=suspected)
-        return {} if found is None else {bearing.name: found}
+        judged = self._directions[bearing.name].judge(pair, suspected=suspected)
+        return {} if judged is None else {bearing.name: judged}
 
     def _departed(self, bearing: HousedBearing, samples: Floats) -> ResidualChange | None:
         """How the innovations at a bearing differ from the healthy machine's.
@@ -473,7 +473,7 @@ class BearingDetector:
         where = standing.where or (evaluated.finding.where if evaluated.finding is not None else "")
         good = evaluated.quality == "good"
         figures = figures_of(evaluated, where)
-        said = Diagnosis(
+        diagnosis = Diagnosis(
             machine=self._machine,
             detector=self.name,
             t_ns=t_ns,
@@ -500,8 +500,8 @@ class BearingDetector:
             missing_share=missing_share,
         )
         if good and not evaluated.reason and self.baseline is None:
-            return replace(said, reason=self._learning.reason)
-        return said
+            return replace(diagnosis, reason=self._learning.reason)
+        return diagnosis
 
 
 def _lacking_pair(bearing: HousedBearing, samples: Floats) -> Iterator[tuple[Quality, str]]:

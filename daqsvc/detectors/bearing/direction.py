@@ -108,17 +108,17 @@ class RaceDirection:
         """
         self._monitor.reset()
         try:
-            found = self._monitor.evaluate(pair * self._m_s2_per_unit, suspected=suspected)
+            evaluated = self._monitor.evaluate(pair * self._m_s2_per_unit, suspected=suspected)
         except ValueError:
             return None  # no stretch between the gaps is as long as a frame
-        isolation = found.isolation
+        isolation = evaluated.isolation
         return Direction(
-            detected=found.detection.detected,
+            detected=evaluated.detection.detected,
             group=() if isolation is None else isolation.group,
-            change_nats=found.detection.statistic,
-            limit_nats=found.detection.limit,
+            change_nats=evaluated.detection.statistic,
+            limit_nats=evaluated.detection.limit,
             inner_nats=0.0 if isolation is None else isolation.inner_nats,
             outer_nats=0.0 if isolation is None else isolation.outer_nats,
-            bursts=found.bursts,
-            ratio_db=found.ratio_db,
+            bursts=evaluated.bursts,
+            ratio_db=evaluated.ratio_db,
         )

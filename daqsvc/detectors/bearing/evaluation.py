@@ -83,9 +83,9 @@ def figures_of(evaluated: Evaluation, where: str) -> dict[str, float]:
     race_there = evaluated.races.get(where)
     if race_there is not None:
         figures["speed"] = race_there.speed_rpm
-        found = [line for line in race_there.lines if line.part in race_there.group]
-        if found:
-            figures |= {"line.frequency": found[0].frequency_hz, "line.order": found[0].order}
+        lines = [line for line in race_there.lines if line.part in race_there.group]
+        if lines:
+            figures |= {"line.frequency": lines[0].frequency_hz, "line.order": lines[0].order}
     return figures
 
 

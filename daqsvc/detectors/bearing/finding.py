@@ -70,21 +70,21 @@ def find(
         directions: what the two accelerometers of a bearing tell, of those that have two.
     """
     directions = directions or {}
-    told = {name: one for name, one in directions.items() if one.decides}
-    faulty = {name: said for name, said in verdicts.items() if said.verdict not in SOUND}
+    deciding = {name: one for name, one in directions.items() if one.decides}
+    faulty = {name: race for name, race in verdicts.items() if race.verdict not in SOUND}
     felt = {name: one for name, one in directions.items() if one.detected}
-    if not faulty and (felt or told):
-        among = {name: told[name] for name in felt if name in told} or felt or told
+    if not faulty and (felt or deciding):
+        among = {name: deciding[name] for name in felt if name in deciding} or felt or deciding
         where = max(among, key=lambda name: among[name].change_nats / among[name].limit_nats)
     else:
         where = max(faulty or verdicts, key=lambda name: severity_of(verdicts[name]))
-    said = verdicts[where]
-    shares = _probabilities(said)
-    verdict: RaceWord = said.verdict
-    group = said.group
+    race = verdicts[where]
+    shares = _probabilities(race)
+    verdict: RaceWord = race.verdict
+    group = race.group
     if faulty:
-        if where in told:
-            verdict, group = _corroborated(said, told[where])
+        if where in deciding:
+            verdict, group = _corroborated(race, deciding[where])
     else:
         changed = any(v.verdict == "changed" for v in verdicts.values()) if change is None else change.changed
         verdict = "changed" if changed or felt else "normal"
@@ -100,36 +100,36 @@ def find(
         # What cannot be told apart is one word.
         shares |= {"inner_or_outer": shares["inner_or_outer"] + shares["inner"] + shares["outer"]}
         shares |= {"inner": 0.0, "outer": 0.0}
-    elif verdict != said.verdict and said.verdict == "inner_or_outer":
+    elif verdict != race.verdict and race.verdict == "inner_or_outer":
         shares |= {verdict: shares["inner"] + shares["outer"], _OTHER[verdict]: 0.0}
     return BearingFinding(
-        verdict=verdict, group=group, where=where, probabilities=shares, severity=severity_of(said)
+        verdict=verdict, group=group, where=where, probabilities=shares, severity=severity_of(race)
     )
 
 
 _OTHER: Mapping[RaceWord, RaceWord] = {"inner": "outer", "outer": "inner"}
 
 
-def _corroborated(said: RaceVerdict, told: Direction) -> tuple[RaceWord, tuple[str, ...]]:
+def _corroborated(verdict: RaceVerdict, direction: Direction) -> tuple[RaceWord, tuple[str, ...]]:
     """A verdict by lines, with what the direction says of the races: it settles a doubt, or raises one."""
-    race = told.group[0]
-    if len(told.group) == 1 and race in _OTHER:
-        if said.verdict == "inner_or_outer":
+    race = direction.group[0]
+    if len(direction.group) == 1 and race in _OTHER:
+        if verdict.verdict == "inner_or_outer":
             return race, (race,)
-        if race == _OTHER.get(said.verdict):
-            return "inner_or_outer", (said.verdict, race)
-    return said.verdict, said.group
+        if race == _OTHER.get(verdict.verdict):
+            return "inner_or_outer", (verdict.verdict, race)
+    return verdict.verdict, verdict.group
 
 
-def severity_of(said: RaceVerdict) -> float:
+def severity_of(verdict: RaceVerdict) -> float:
     """Of the part that a verdict names; of the one that shows most if it names none."""
-    parts = [part for part in PARTS if part in said.group] or PARTS
-    return max(said.evidence[part].severity for part in parts)
+    parts = [part for part in PARTS if part in verdict.group] or PARTS
+    return max(verdict.evidence[part].severity for part in parts)
 
 
-def _probabilities(said: RaceVerdict) -> dict[RaceWord, float]:
+def _probabilities(verdict: RaceVerdict) -> dict[RaceWord, float]:
     """Of every word."""
-    return {word: said.probability.get(word, 0.0) for word in WORDS}
+    return {word: verdict.probability.get(word, 0.0) for word in WORDS}
 
 
 UNDETERMINED = "undetermined"
@@ -189,28 +189,28 @@ class PersistenceFilter:
         Returns:
             Whether the standing has changed.
         """
-        found = ConfirmedState.of(finding)
-        if found == self.standing or (not self.standing.sound and found.decision == "changed"):
+        state = ConfirmedState.of(finding)
+        if state == self.standing or (not self.standing.sound and state.decision == "changed"):
             # A part once named is a change, too; that its lines come and go takes nothing back.
             self._looks = 0
             return False
         before = self._candidate
-        alike = found.decision == before.decision
-        if self.standing.sound and not (found.sound or before.sound):
+        alike = state.decision == before.decision
+        if self.standing.sound and not (state.sound or before.sound):
             alike = True  # two names of a fault are a fault all the same
         self._looks = self._looks + 1 if alike else 1
-        self._candidate = found
+        self._candidate = state
         at_once = last and self.standing.decision == UNDETERMINED
-        if not at_once and self._looks < self._needed(found):
+        if not at_once and self._looks < self._needed(state):
             return False
-        self.standing, self._looks = found, 0
+        self.standing, self._looks = state, 0
         return True
 
     def interrupt(self) -> None:
         """Looks before a gap do not count with those after it; what is stood by stays."""
         self._looks = 0
 
-    def _needed(self, found: ConfirmedState) -> int:
-        if found.sound:
+    def _needed(self, state: ConfirmedState) -> int:
+        if state.sound:
             return 1 if self.standing.decision == UNDETERMINED else CLEAR_LOOKS
         return CONFIRM_LOOKS

@@ -53,10 +53,10 @@ def _envelope(analysis: BearingVerdict, name: str, race: RaceVerdict) -> Figure:
     spectrum = race.spectrum
     assert spectrum is not None  # noqa: S101 - the race test of a recording keeps it
     figure = Figure(figsize=(9.6, 5.2), layout="constrained")
-    said = race.verdict.replace("_", " ")
+    verdict = race.verdict.replace("_", " ")
     figure.suptitle(
         f"Envelope spectrum: {shortened(Path(analysis.recording).name)}, {shortened(name)}\n"
-        f"{said} (by this channel), {race.speed_rpm:.1f} rpm, {race.revolutions:.0f} revolutions",
+        f"{verdict} (by this channel), {race.speed_rpm:.1f} rpm, {race.revolutions:.0f} revolutions",
         fontsize=11,
     )
     axes = figure.add_subplot()
@@ -99,11 +99,11 @@ def _mark(axes: Axes, race: RaceVerdict, bearing: BearingOrders, last: float) ->
                 alpha=0.55 if e.testable else 0.2,
                 label=label if harmonic == 1 else None,
             )
-        found = [line for line in race.lines if line.part == part and line.order <= last]
-        if found:
+        lines = [line for line in race.lines if line.part == part and line.order <= last]
+        if lines:
             axes.plot(
-                [line.order for line in found],
-                [line.depth for line in found],
+                [line.order for line in lines],
+                [line.depth for line in lines],
                 _MARKS[part],
                 color=_COLOURS[part],
                 markersize=6,

@@ -31,55 +31,57 @@ class BearingPlugin(DetectorPlugin[Bearing]):
     calibrated = True
     place = 3
 
-    def checks(self, draft: MachineFile, given: Bearing) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: Bearing) -> Iterator[Iterator[Finding]]:
         """See `PipelineTable.checks`."""
-        return bearing_checks(draft, given)
+        return bearing_checks(draft, settings)
 
-    def describe(self, machine: MachineFile, given: Bearing) -> str:
+    def describe(self, machine: MachineFile, settings: Bearing) -> str:
         """See `PipelineTable.describe`."""
         del machine
-        return _described(given)
+        return _described(settings)
 
-    def build(self, machine: MachineFile, given: Bearing, store: Path | None) -> tuple[Detector, ...]:
+    def build(self, machine: MachineFile, settings: Bearing, store: Path | None) -> tuple[Detector, ...]:
         """See `DetectorPlugin.build`."""
         from daqsvc.detectors.bearing.build import bearing_detector  # noqa: PLC0415 - SciPy's statistics
 
         try:
-            return (bearing_detector(machine, given, store),)
+            return (bearing_detector(machine, settings, store),)
         except ValueError as error:
             raise AssemblyError(f"{machine.path}: {error}") from error
 
-    def check_files(self, machine: MachineFile, given: Bearing) -> None:
+    def check_files(self, machine: MachineFile, settings: Bearing) -> None:
         """See `DetectorPlugin.check_files`: its calibration, and that its bearings are known."""
-        self.build(machine, given, None)
+        self.build(machine, settings, None)
 
-    def recorded(self, machine: MachineFile, given: Bearing, options: RecordingOptions) -> RecordedBearings:
+    def recorded(
+        self, machine: MachineFile, settings: Bearing, options: RecordingOptions
+    ) -> RecordedBearings:
         """See `DetectorPlugin.recorded`."""
         from daqsvc.detectors.bearing.recorded import RecordedBearings  # noqa: PLC0415 - brings SciPy
 
-        return RecordedBearings(machine, given, options)
+        return RecordedBearings(machine, settings, options)
 
-    def readings(self, machine: MachineFile, given: Bearing) -> Iterator[Reading]:
+    def readings(self, machine: MachineFile, settings: Bearing) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
         from daqsvc.detectors.bearing.finding import WORDS  # noqa: PLC0415 - brings SciPy's statistics
 
-        del machine, given
+        del machine, settings
         for word in WORDS:
             yield Reading(BEARING, "probabilities", word)
 
 
-def _described(given: Bearing) -> str:
+def _described(settings: Bearing) -> str:
     healthy = (
-        f"the first {given.calibrate_s:g} s are the healthy state, kept over restarts"
-        if given.calibration is None
-        else f"healthy state in {given.calibration}"
+        f"the first {settings.calibrate_s:g} s are the healthy state, kept over restarts"
+        if settings.calibration is None
+        else f"healthy state in {settings.calibration}"
     )
     return "; ".join(
         [
-            *(_watched(bearing) for bearing in given.bearings),
-            *(() if given.keyphasor is None else (f"speed by {given.keyphasor}",)),
+            *(_watched(bearing) for bearing in settings.bearings),
+            *(() if settings.keyphasor is None else (f"speed by {settings.keyphasor}",)),
             healthy,
-            f'false alarms of "changed" {given.false_alarm_probability:g} a look',
+            f'false alarms of "changed" {settings.false_alarm_probability:g} a look',
         ]
     )
 

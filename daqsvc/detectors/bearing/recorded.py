@@ -67,12 +67,12 @@ class RecordedBearings(RecordedDetector[Bearing]):
     part = "bearing"
     takes_fewer = True
 
-    def __init__(self, machine: MachineFile, given: Bearing, options: RecordingOptions) -> None:
-        super().__init__(machine, given, options)
-        self._setup = setup_of(machine, given)
+    def __init__(self, machine: MachineFile, settings: Bearing, options: RecordingOptions) -> None:
+        super().__init__(machine, settings, options)
+        self._setup = setup_of(machine, settings)
         calibration = options.calibration
-        if calibration is None and given.calibration is not None:
-            calibration = machine.resolve(given.calibration)
+        if calibration is None and settings.calibration is not None:
+            calibration = machine.resolve(settings.calibration)
         if calibration is not None:
             load_bearing_baseline(calibration)
         self._healthy = None if options.healthy is None else self._load_healthy(options.healthy)
@@ -92,24 +92,26 @@ class RecordedBearings(RecordedDetector[Bearing]):
     @property
     def sensors(self) -> tuple[str, ...]:
         """See `RecordedDetector.sensors`."""
-        return self.given.sensors
+        return self.settings.sensors
 
     def as_recorded(self, sensors: Container[str]) -> Bearing | None:
         """The bearings whose accelerometers a recording has; None if there is none."""
-        given = self.given
+        settings = self.settings
         bearings = tuple(
             bearing
             if bearing.rotor_sensor is None or bearing.rotor_sensor in sensors
             else bearing.model_copy(update={"rotor_sensor": None, "model": None})
-            for bearing in given.bearings
+            for bearing in settings.bearings
             if bearing.sensor in sensors
         )
-        keyphasor = given.keyphasor if given.keyphasor in sensors else None
-        return given.model_copy(update={"bearings": bearings, "keyphasor": keyphasor}) if bearings else None
+        keyphasor = settings.keyphasor if settings.keyphasor in sensors else None
+        return (
+            settings.model_copy(update={"bearings": bearings, "keyphasor": keyphasor}) if bearings else None
+        )
 
     def left_out(self, sensors: Container[str]) -> str:
         """See `RecordedDetector.left_out`."""
-        missing = [bearing for bearing in self.given.bearings if bearing.sensor not in sensors]
+        missing = [bearing for bearing in self.settings.bearings if bearing.sensor not in sensors]
         if not missing:
             return ""
         bearings, accelerometers = (
@@ -128,48 +130,51 @@ class RecordedBearings(RecordedDetector[Bearing]):
             refused=why,
         )
 
-    def evaluate(self, recorded: Recorded, given: Bearing, progress: Progress | None) -> Evaluated:
+    def evaluate(self, recorded: Recorded, settings: Bearing, progress: Progress | None) -> Evaluated:
         """See `RecordedDetector.evaluate`."""
         del progress  # a recording takes a tenth of a second
         statements: tuple[Statements, ...] = ()
-        setup = setup_of(recorded.machine, given)
+        setup = setup_of(recorded.machine, settings)
         if self.options.in_memory:
-            verdict = self._judged_whole(recorded, given, setup)
+            verdict = self._judged_whole(recorded, settings, setup)
         else:
-            detector = bearing_detector(recorded.machine, given, None, self.options.calibration)
+            detector = bearing_detector(recorded.machine, settings, None, self.options.calibration)
             diagnoses, looks = _watched(detector, recorded)
             statements = (Statements(detector.name, tuple(diagnoses), recorded.recording.rate_hz),)
             verdict = _concluded(setup, recorded.recording, detector, diagnoses, looks)
         draw = partial(_draw, verdict) if verdict.races else None
         return Evaluated(statements=statements, verdict=verdict, draw=draw)
 
-    def _judged_whole(self, recorded: Recorded, given: Bearing, setup: BearingSetup) -> BearingVerdict:
+    def _judged_whole(self, recorded: Recorded, settings: Bearing, setup: BearingSetup) -> BearingVerdict:
         """Judge a recording at one go, against the healthy machine if options tell of one."""
         path = self.options.calibration
         if path is None:
             return _against(recorded.recording, setup, self._healthy)
-        baseline = healthy_machine(recorded.machine, given, path)
+        baseline = healthy_machine(recorded.machine, settings, path)
         if len(setup.channels) > 1 and setup.channels not in baseline.residuals:
             lacking = f"nothing of {' and '.join(setup.channels)} together"
             raise ValueError(f"{path}: holds {lacking}; calibrate with --channels {','.join(setup.channels)}")
         return analyse_bearings(recorded.recording, setup, baseline)
 
 
-def setup_of(machine: MachineFile, given: Bearing) -> BearingSetup:
+def setup_of(machine: MachineFile, settings: Bearing) -> BearingSetup:
     """What the bearings of a machine are judged by, in the words of an analysis.
 
     Raises:
         ValueError: a bearing is not known.
     """
-    unit = machine.sensor(given.bearings[0].sensor).unit
+    unit = machine.sensor(settings.bearings[0].sensor).unit
     return BearingSetup(
-        channels=tuple(bearing.name for bearing in given.bearings),
+        channels=tuple(bearing.name for bearing in settings.bearings),
         speed_rpm=abs(machine.machine.speed_rpm),
-        bearings={bearing.name: orders_of(bearing, i) for i, bearing in enumerate(given.bearings)},
-        designations={bearing.name: bearing.type for bearing in given.bearings if bearing.type is not None},
+        bearings={bearing.name: orders_of(bearing, i) for i, bearing in enumerate(settings.bearings)},
+        designations={
+            bearing.name: bearing.type for bearing in settings.bearings if bearing.type is not None
+        },
         unit=cast("AccelerationUnit", unit),
         change=ChangeRules(
-            false_alarm_probability=given.false_alarm_probability, repeatability_db=given.repeatability_db
+            false_alarm_probability=settings.false_alarm_probability,
+            repeatability_db=settings.repeatability_db,
         ),
     )
 
@@ -182,13 +187,13 @@ def _draw(verdict: BearingVerdict, prefix: str) -> None:
 
 def _watched(detector: BearingDetector, recorded: Recorded) -> tuple[list[Diagnosis], list[Evaluation]]:
     """Have the detector see a recording block by block, so that no look is missed: statements and looks."""
-    said: list[Diagnosis] = []
+    diagnoses: list[Diagnosis] = []
     looks: list[Evaluation] = []
     for statements in _watch(detector, recorded.samples_of(detector.stream), recorded.recording.rate_hz):
-        said += statements
+        diagnoses += statements
         if detector.seen is not None and (not looks or detector.seen is not looks[-1]):
             looks.append(detector.seen)
-    return said, looks
+    return diagnoses, looks
 
 
 def _watch(detector: BearingDetector, samples: Floats, rate_hz: float) -> Iterator[Sequence[Diagnosis]]:
@@ -208,14 +213,14 @@ def _concluded(
     setup: BearingSetup,
     recording: Recording,
     detector: BearingDetector,
-    said: list[Diagnosis],
+    diagnoses: list[Diagnosis],
     looks: list[Evaluation],
 ) -> BearingVerdict:
     """What the detector stands by at the end, with the figures of the look that shows it most."""
     columns = [recording.names.index(bearing.sensor) for bearing in detector.bearings]
     quality = accelerometer_quality(setup.channels, recording.samples[:, columns], setup.unit)
-    good = [one for one in said if one.quality == "good"]
-    poor = [one for one in said if one.quality != "good"]
+    good = [one for one in diagnoses if one.quality == "good"]
+    poor = [one for one in diagnoses if one.quality != "good"]
     for reason in dict.fromkeys(one.reason for one in poor):
         quality = quality.with_problem(reason)
     analysis = BearingVerdict(

@@ -39,8 +39,8 @@ def stated_speed_problem(recording: Recording, speed_rpm: float) -> str:
     stated = {name: rpm for name, rpm in recording.scalars.items() if _RPM_NAME.fullmatch(name) and rpm > 0.0}
     if not stated or any(abs(rpm / speed_rpm - 1.0) <= _SAME_SPEED for rpm in stated.values()):
         return ""
-    said = " and ".join(f"{rpm:g} rpm ({name})" for name, rpm in stated.items())
-    return f"{recording.source} states {said}, --speed-rpm is {speed_rpm:g}: correct the one that is wrong"
+    speeds = " and ".join(f"{rpm:g} rpm ({name})" for name, rpm in stated.items())
+    return f"{recording.source} states {speeds}, --speed-rpm is {speed_rpm:g}: correct the one that is wrong"
 
 
 def meant_in_hz(recording: Recording, setup: BearingSetup) -> str:

@@ -81,7 +81,7 @@ class BearingVerdict(Verdict):
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite."""
         finding, race = self.finding, self.leading
-        found: dict[str, Any] = finite(
+        document: dict[str, Any] = finite(
             {
                 "recording": self.recording,
                 "baseline": self.baseline,
@@ -109,7 +109,7 @@ class BearingVerdict(Verdict):
                 "refused": self.refused,
             }
         )
-        return found
+        return document
 
     def _channel(self, name: str) -> dict[str, Any]:
         """What one channel says by itself."""
@@ -184,11 +184,11 @@ class BearingVerdict(Verdict):
                 for part, e in ((part, race.evidence[part]) for part in PARTS)
             )
         )
-        told = [line for line in race.lines if line.part in finding.group][:_TOLD_LINES]
+        shown_lines = [line for line in race.lines if line.part in finding.group][:_TOLD_LINES]
         lines += [
             f"{_line_name(line)} at {line.frequency_hz:.2f} Hz ({line.order:.3f} per revolution), modulation "
             f"{line.depth:.2f}"
-            for line in told
+            for line in shown_lines
         ]
         if self.change is not None:
             change = self.change
@@ -201,7 +201,11 @@ class BearingVerdict(Verdict):
         lines.append(f"{race.speed_rpm:.1f} rpm {seen}, {race.revolutions:.0f} revolutions")
         lines += [f"{name}: not judged: {why}" for name, why in self.unfit.items()]
         # Those about the samples are problems of the data.
-        lines += [note for note in race.notes if not any(note in told for told in self.quality.problems)]
+        lines += [
+            note
+            for note in race.notes
+            if not any(note in shown_lines for shown_lines in self.quality.problems)
+        ]
         return "\n  ".join([*lines, *self.quality.problems])
 
     @staticmethod
@@ -214,15 +218,19 @@ class BearingVerdict(Verdict):
             "ball": "ball",
             "inner_or_outer": "inner or outer race (cannot be told apart)",
         }
-        said = words[finding.verdict]
+        sentence = words[finding.verdict]
         others = [words[name] for name in finding.group if name != finding.verdict and name in words]
         if finding.verdict not in {"normal", "changed", "inner_or_outer"} and others:
-            told = "and perhaps" if race.both else "or"
-            said += f" {told} {' or '.join(others)}"
+            conjunction = "and perhaps" if race.both else "or"
+            sentence += f" {conjunction} {' or '.join(others)}"
         if finding.verdict in {"normal", "changed"}:
             blind = [part for part in PARTS if not race.evidence[part].testable]
-            return f"{said} as far as it can be tested ({', '.join(blind)} not testable)" if blind else said
-        return f"{said} at {finding.where}, severity {finding.severity:.1f}"
+            return (
+                f"{sentence} as far as it can be tested ({', '.join(blind)} not testable)"
+                if blind
+                else sentence
+            )
+        return f"{sentence} at {finding.where}, severity {finding.severity:.1f}"
 
 
 def evidence_json(race: RaceVerdict) -> dict[str, Any]:

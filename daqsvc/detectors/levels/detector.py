@@ -132,17 +132,17 @@ class LevelDetector:
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
-        said = [self._skipped(channel, window) for channel in self._channels if window.skipped]
+        diagnoses = [self._skipped(channel, window) for channel in self._channels if window.skipped]
         self._next_index = window.first_index + len(window.samples)
         block = len(window.samples) if window.snapshot else self.block
         for start in range(0, len(window.samples), block):
             part = window.samples[start : start + block]
             after = len(window.samples) - start - len(part)
             t_ns = window.t_end_ns - round(after * window.period_ns)
-            said += [
+            diagnoses += [
                 self._judge(c, part[:, c.column], window.first_index + start, t_ns) for c in self._channels
             ]
-        return said
+        return diagnoses
 
     def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.silent`."""
@@ -213,19 +213,19 @@ class LevelDetector:
         self, channel: LevelChannel, samples: NDArray[np.float32], share: float
     ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         """The measures of a window that lacks a ``share`` of its samples, and the bounds of the uncertain."""
-        found = levels(samples)
+        measured = levels(samples)
         known = samples[np.isfinite(samples)]
-        bounds = level_bounds(found, float(known.min()), float(known.max()), share)
+        bounds = level_bounds(measured, float(known.min()), float(known.max()), share)
         statistics = {
-            "mean": found.mean,
-            "rms": found.rms,
-            "peak": found.peak,
-            "peak_to_peak": found.peak_to_peak,
-            "crest_factor": found.crest_factor,
+            "mean": measured.mean,
+            "rms": measured.rms,
+            "peak": measured.peak,
+            "peak_to_peak": measured.peak_to_peak,
+            "crest_factor": measured.crest_factor,
         }
         if channel.gap is not None:
             gap = channel.gap
-            statistics["gap_voltage"] = gap.zero_v + found.mean * gap.volts_per_unit
+            statistics["gap_voltage"] = gap.zero_v + measured.mean * gap.volts_per_unit
             if "mean" in bounds:
                 volts = sorted(gap.zero_v + end * gap.volts_per_unit for end in bounds["mean"])
                 bounds["gap_voltage"] = (volts[0], volts[1])

@@ -41,41 +41,41 @@ class LevelsPlugin(DetectorPlugin[Levels]):
     measures_levels = True
     place = 0
 
-    def checks(self, draft: MachineFile, given: Levels) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: Levels) -> Iterator[Iterator[Finding]]:
         """See `PipelineTable.checks`."""
-        return level_checks(draft, given)
+        return level_checks(draft, settings)
 
-    def start_up_signals(self, draft: MachineFile, given: Levels) -> Mapping[str, tuple[str, ...]]:
+    def start_up_signals(self, draft: MachineFile, settings: Levels) -> Mapping[str, tuple[str, ...]]:
         """See `PipelineTable.start_up_signals`: a trend value may be the speed."""
-        del given
+        del settings
         trends = (sensor.name for sensor in draft.sensors if sensor.type == "trend")
         return {f"levels/{name}": ("value",) for name in trends}
 
-    def describe(self, machine: MachineFile, given: Levels) -> str:
+    def describe(self, machine: MachineFile, settings: Levels) -> str:
         """See `PipelineTable.describe`."""
-        return _described(machine, given)
+        return _described(machine, settings)
 
-    def build(self, machine: MachineFile, given: Levels, store: Path | None) -> Iterator[Detector]:
+    def build(self, machine: MachineFile, settings: Levels, store: Path | None) -> Iterator[Detector]:
         """See `DetectorPlugin.build`."""
         del store
         for stream in machine.streams:
-            yield from _of_stream(machine, given, stream)
+            yield from _of_stream(machine, settings, stream)
 
-    def readings(self, machine: MachineFile, given: Levels) -> Iterator[Reading]:
+    def readings(self, machine: MachineFile, settings: Levels) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
-        del given
+        del settings
         for sensor in _measured(machine):
             rate_hz = machine.streams[sensor.stream].rate_hz
             silent_s = patience(machine, sensor.stream, rate_hz).ns / NS_PER_S
             yield from _readings(sensor, max(STALE_S, math.ceil(silent_s)))
 
-    def quality_alarms(self, machine: MachineFile, given: Levels) -> Iterator[str]:
+    def quality_alarms(self, machine: MachineFile, settings: Levels) -> Iterator[str]:
         """See `DetectorPlugin.quality_alarms`."""
-        del given
+        del settings
         return (f"sensor-ok/{sensor.name}" for sensor in _measured(machine))
 
 
-def _of_stream(machine: MachineFile, given: Levels, stream: str) -> Iterator[Detector]:
+def _of_stream(machine: MachineFile, settings: Levels, stream: str) -> Iterator[Detector]:
     """What measures the levels of waveforms, and what takes levels as the device has measured them."""
     # Here, not above: they bring SciPy, which `daqsvc check` need not wait for.
     from daqsvc.detectors.levels.detector import LevelChannel, LevelDetector  # noqa: PLC0415
@@ -94,8 +94,8 @@ def _of_stream(machine: MachineFile, given: Levels, stream: str) -> Iterator[Det
             stream,
             rate_hz,
             channels,
-            window_s=given.window_s,
-            velocity_band_hz=given.velocity_band_hz,
+            window_s=settings.window_s,
+            velocity_band_hz=settings.velocity_band_hz,
         )
     trends = [
         TrendChannel(s.name, machine.column(s), s.unit, _limits(machine, s.name), s.ok_between)
@@ -103,7 +103,7 @@ def _of_stream(machine: MachineFile, given: Levels, stream: str) -> Iterator[Det
         if isinstance(s, TrendValue)
     ]
     if trends:
-        yield TrendDetector(name, stream, rate_hz, trends, window_s=given.window_s)
+        yield TrendDetector(name, stream, rate_hz, trends, window_s=settings.window_s)
 
 
 def _limits(machine: MachineFile, sensor: str) -> list[Limits]:
@@ -144,7 +144,7 @@ def _readings(sensor: Sensor, stale_s: int) -> Iterator[Reading]:
         yield Reading(detector, "statistics", "velocity_rms", "mm/s", stale_s)
 
 
-def _described(machine: MachineFile, given: Levels) -> str:
+def _described(machine: MachineFile, settings: Levels) -> str:
     casing = [s.name for s in machine.sensors if isinstance(s, Accelerometer | VelocitySensor)]
     waveforms = [s for s in machine.sensors if not isinstance(s, Keyphasor | TrendValue)]
     steady = [s.name for s in waveforms if not at_once(machine, s.stream)]
@@ -152,15 +152,15 @@ def _described(machine: MachineFile, given: Levels) -> str:
     trends = [s.name for s in machine.sensors if isinstance(s, TrendValue)]
     parts: list[str] = []
     if steady:
-        parts.append(f"RMS, peak and crest factor over {given.window_s:g} s of {', '.join(steady)}")
+        parts.append(f"RMS, peak and crest factor over {settings.window_s:g} s of {', '.join(steady)}")
     if of_blocks:
         parts.append(f"RMS, peak and crest factor over each block of {', '.join(of_blocks)}")
     if casing:
-        low_hz, high_hz = given.velocity_band_hz
+        low_hz, high_hz = settings.velocity_band_hz
         parts.append(f"velocity RMS {low_hz:g} to {high_hz:g} Hz of {', '.join(casing)}")
     if trends:
         parts.append(
-            f"{', '.join(trends)} as they come, or averaged over {given.window_s:g} s if they are faster"
+            f"{', '.join(trends)} as they come, or averaged over {settings.window_s:g} s if they are faster"
         )
     return "; ".join(parts)
 

@@ -104,13 +104,13 @@ class LevelStatements:
         before = self._decided.get(sensor)
         severity = before or "normal"
         if quality == "good" or bounds:
-            found: Severity = max(
+            worst: Severity = max(
                 (limit.severity(*_span(limit.measure, statistics, bounds)) for limit in limits),
                 key=_DECISIONS.index,
                 default="normal",
             )
-            better = _DECISIONS.index(found) < _DECISIONS.index(severity)
-            severity = severity if bounds and better else found
+            better = _DECISIONS.index(worst) < _DECISIONS.index(severity)
+            severity = severity if bounds and better else worst
         if quality == "good" or severity != (before or "normal"):
             self._decided[sensor] = severity
         return Diagnosis(

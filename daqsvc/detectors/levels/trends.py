@@ -85,7 +85,7 @@ class TrendDetector:
 
     def process(self, window: Window) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.process`."""
-        said = [self._skipped(channel, window) for channel in self._channels if window.skipped]
+        diagnoses = [self._skipped(channel, window) for channel in self._channels if window.skipped]
         self._next_index = window.first_index + len(window.samples)
         block = len(window.samples) if window.snapshot else self.block
         for start in range(0, len(window.samples), block):
@@ -97,8 +97,8 @@ class TrendDetector:
             for channel in self._channels:
                 judged = self._judge(channel, part[:, channel.column], evidence)
                 if judged is not None:
-                    said.append(judged)
-        return said
+                    diagnoses.append(judged)
+        return diagnoses
 
     def silent(self, silence_s: float, t_ns: int) -> list[Diagnosis]:
         """See `daqsvc.diagnosis.detector.Detector.silent`."""

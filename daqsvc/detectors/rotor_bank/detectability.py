@@ -31,13 +31,13 @@ _QUANTITIES = {
 
 
 def bank_detectability(
-    machine: MachineFile, given: RotorBank, detector: RotorBankDetector, process_noise: float | None
+    machine: MachineFile, settings: RotorBank, detector: RotorBankDetector, process_noise: float | None
 ) -> BankDetectability:
     """Detectability of the bank that the service would run for a machine file.
 
     Args:
         machine: the machine file.
-        given: its rotor bank.
+        settings: its rotor bank.
         detector: made of that.
         process_noise: how much the machine itself shakes at random; None: what the bank says.
 
@@ -49,29 +49,29 @@ def bank_detectability(
         noise=detector.noise,
         duration=detector.duration,
         threshold_nats=detector.rules.thresholds(len(detector.bank_modes)),
-        variance_factor=VARIANCE_FACTOR if given.calibrate_revolutions > 0 else 1.0,
+        variance_factor=VARIANCE_FACTOR if settings.calibrate_revolutions > 0 else 1.0,
         process_noise=process_noise,
         ac_coupled=machine.ac_coupled,
     )
 
 
-def as_json(found: BankDetectability, machine: MachineFile) -> dict[str, Any]:
+def as_json(prediction: BankDetectability, machine: MachineFile) -> dict[str, Any]:
     """The figures in the units of the machine file; what is never reached is null.
 
     Args:
-        found: the figures.
+        prediction: the figures.
         machine: the machine file that they are for.
     """
     units = _Units(machine)
     return {
         "machine": machine.machine.name,
-        "speed_rpm": units.rpm(found.w),
-        "samples_per_rev": found.samples_per_rev,
-        "noise_um": units.um(found.noise),
-        "process_noise": found.process_noise,
-        "false_alarms_per_1000_rev": found.false_alarms_per_1000_rev,
-        "modes": list(found.modes),
-        "pairs": [asdict(pair) | {"delay_rev": _finite(pair.delay_rev)} for pair in found.pairs],
+        "speed_rpm": units.rpm(prediction.w),
+        "samples_per_rev": prediction.samples_per_rev,
+        "noise_um": units.um(prediction.noise),
+        "process_noise": prediction.process_noise,
+        "false_alarms_per_1000_rev": prediction.false_alarms_per_1000_rev,
+        "modes": list(prediction.modes),
+        "pairs": [asdict(pair) | {"delay_rev": _finite(pair.delay_rev)} for pair in prediction.pairs],
         "ambiguous": [
             {
                 "modes": list(ambiguity.modes),
@@ -79,7 +79,7 @@ def as_json(found: BankDetectability, machine: MachineFile) -> dict[str, Any]:
                 "opens_at_rpm": None if ambiguity.opens_at_w is None else units.rpm(ambiguity.opens_at_w),
                 "open_nats_per_rev": ambiguity.open_nats_per_rev,
             }
-            for ambiguity in found.ambiguities
+            for ambiguity in prediction.ambiguities
         ],
         "smallest_change": [
             {
@@ -90,39 +90,40 @@ def as_json(found: BankDetectability, machine: MachineFile) -> dict[str, Any]:
                 "by_bank": units.quantity(change, change.by_bank),
                 "by_vector": units.quantity(change, change.by_vector),
             }
-            for change in found.smallest
+            for change in prediction.smallest
         ],
-        "within_rev": found.within_rev,
-        "calibration_rev": found.calibration_rev,
-        "touching": list(found.touching),
+        "within_rev": prediction.within_rev,
+        "calibration_rev": prediction.calibration_rev,
+        "touching": list(prediction.touching),
     }
 
 
-def as_text(found: BankDetectability, machine: MachineFile) -> str:
+def as_text(prediction: BankDetectability, machine: MachineFile) -> str:
     """Tables and sentences for a person.
 
     Args:
-        found: the figures.
+        prediction: the figures.
         machine: the machine file that they are for.
     """
     units = _Units(machine)
-    thresholds = sorted({pair.threshold_nats for pair in found.pairs})
+    thresholds = sorted({pair.threshold_nats for pair in prediction.pairs})
     head = (
-        f"{machine.machine.name} at {units.rpm(found.w):.6g} rpm: {len(found.modes)} modes, "
-        f"{found.samples_per_rev:.4g} samples a revolution,\n"
-        f"noise {units.um(found.noise):.3g} um, the machine's own process noise {found.process_noise:.3g}; "
+        f"{machine.machine.name} at {units.rpm(prediction.w):.6g} rpm: {len(prediction.modes)} modes, "
+        f"{prediction.samples_per_rev:.4g} samples a revolution,\n"
+        f"noise {units.um(prediction.noise):.3g} um, "
+        f"the machine's own process noise {prediction.process_noise:.3g}; "
         f"a mode is declared at {' or '.join(f'{nats:.3g}' for nats in thresholds)} nats"
     )
     paragraphs = [
         head,
         "Evidence in nats a revolution: the machine is in the mode of the row, against that of the column\n"
-        + _matrix(found, lambda pair: pair.nats_per_rev),
+        + _matrix(prediction, lambda pair: pair.nats_per_rev),
         "Revolutions to declare the mode of the row after an abrupt change from that of the column (median)\n"
-        + _matrix(found, lambda pair: pair.delay_rev),
+        + _matrix(prediction, lambda pair: pair.delay_rev),
     ]
-    if any(pair.simulated for pair in found.pairs):
+    if any(pair.simulated for pair in prediction.pairs):
         paragraphs[-1] += "\n* from simulated runs of the rub; everything else is computed"
-    paragraphs += [_smallest(found, units), "\n".join(_sentences(found, units))]
+    paragraphs += [_smallest(prediction, units), "\n".join(_sentences(prediction, units))]
     return "\n\n".join(paragraphs)
 
 
@@ -149,33 +150,33 @@ class _Units:
         return self.um(value) if change.fault == "static_load" else value
 
 
-def _matrix(found: BankDetectability, figure: Callable[[PairEvidence], float]) -> str:
-    width = max(6, *(len(name) for name in found.modes)) + 1
-    rows = ["".join(name.rjust(width) for name in ("", *found.modes))]
-    for truth in found.modes:
+def _matrix(prediction: BankDetectability, figure: Callable[[PairEvidence], float]) -> str:
+    width = max(6, *(len(name) for name in prediction.modes)) + 1
+    rows = ["".join(name.rjust(width) for name in ("", *prediction.modes))]
+    for truth in prediction.modes:
         row = truth.rjust(width)
-        for rival in found.modes:
+        for rival in prediction.modes:
             if truth == rival:
                 row += ".".rjust(width)
             else:
-                pair = found.pair(truth, rival)
+                pair = prediction.pair(truth, rival)
                 mark = "*" if pair.simulated else " "
                 row += (_figure(figure(pair)) + mark).rjust(width)
         rows.append(row.rstrip())
     return "\n".join(rows)
 
 
-def _smallest(found: BankDetectability, units: _Units) -> str:
+def _smallest(prediction: BankDetectability, units: _Units) -> str:
     head = (
         "Smallest change that can be seen: by a mode of the bank made for it, half of the time within "
-        f"{found.within_rev:.4g}\nrevolutions; and by the synchronous vector, however long it takes, "
-        f"from {found.calibration_rev:.4g} revolutions of calibration"
+        f"{prediction.within_rev:.4g}\nrevolutions; and by the synchronous vector, however long it takes, "
+        f"from {prediction.calibration_rev:.4g} revolutions of calibration"
     )
     rows = [
         head,
         f"{'':>34}{'healthy':>12}{'bank':>12}{'vector':>12}",
     ]
-    for change in found.smallest:
+    for change in prediction.smallest:
         quantity, unit = _QUANTITIES[change.fault]
         values = (units.quantity(change, v) for v in (change.healthy, change.by_bank, change.by_vector))
         cells = ("never" if v is None else f"{v:.3g} {unit}".rstrip() for v in values)
@@ -183,31 +184,31 @@ def _smallest(found: BankDetectability, units: _Units) -> str:
     return "\n".join(rows)
 
 
-def _sentences(found: BankDetectability, units: _Units) -> list[str]:
-    rpm = f"{units.rpm(found.w):.6g} rpm"
-    said = [_ambiguity(found, ambiguity, rpm, units) for ambiguity in found.ambiguities]
-    if not said:
-        closest = min(found.pairs, key=lambda pair: pair.nats_per_rev)
-        said.append(
+def _sentences(prediction: BankDetectability, units: _Units) -> list[str]:
+    rpm = f"{units.rpm(prediction.w):.6g} rpm"
+    sentences = [_ambiguity(prediction, ambiguity, rpm, units) for ambiguity in prediction.ambiguities]
+    if not sentences:
+        closest = min(prediction.pairs, key=lambda pair: pair.nats_per_rev)
+        sentences.append(
             f"All modes can be told apart at {rpm}; {closest.truth} and {closest.rival} are the closest, "
             f"{_figure(closest.nats_per_rev)} nats a revolution."
         )
-    said += [
+    sentences += [
         f"The orbit of {name} reaches the housing, but its model has no contact: "
         "give the mode rub = true, or these figures do not hold for it."
-        for name in found.touching
+        for name in prediction.touching
     ]
-    said.append(
+    sentences.append(
         "False alarms of a healthy machine: "
-        f"at most {found.false_alarms_per_1000_rev:.2g} in 1000 revolutions."
+        f"at most {prediction.false_alarms_per_1000_rev:.2g} in 1000 revolutions."
     )
-    return said
+    return sentences
 
 
-def _ambiguity(found: BankDetectability, ambiguity: Ambiguity, rpm: str, units: _Units) -> str:
+def _ambiguity(prediction: BankDetectability, ambiguity: Ambiguity, rpm: str, units: _Units) -> str:
     one, other = ambiguity.modes
     sentence = f"{one} and {other} cannot be told apart at {rpm}"
-    if found.pair(one, other).simulated:
+    if prediction.pair(one, other).simulated:
         return f"{sentence}; a rub is not simulated at other speeds."
     if ambiguity.opens_at_w is None or ambiguity.open_nats_per_rev is None:
         return f"{sentence}, nor at any speed within 30 % of it."

@@ -234,13 +234,13 @@ class RotorBankDetector:
         elif gap:
             self._begin_anew()
         self._next_index = end_index = first_index + len(samples)
-        said: list[Diagnosis] = []
+        diagnoses: list[Diagnosis] = []
         for begin in range(0, len(samples), self.block):
             part = samples[begin : begin + self.block]
             last_index = first_index + begin + len(part) - 1
             t_ns = window.t_end_ns - round((end_index - 1 - last_index) * window.period_ns)
-            said += self._step(part, last_index + 1 - len(part), t_ns, window.period_ns)
-        return said
+            diagnoses += self._step(part, last_index + 1 - len(part), t_ns, window.period_ns)
+        return diagnoses
 
     def _begin_anew(self, *, keep_speed: bool = False) -> None:
         self._tracker.reset(keep_speed=keep_speed)
@@ -290,18 +290,18 @@ class RotorBankDetector:
         if self._progress_index is None:
             self._progress_index = first_index
         if self._calibration is not None:
-            said = self._calibrate(xy, cos, sin, verdict, end_index, t_ns)
+            diagnosis = self._calibrate(xy, cos, sin, verdict, end_index, t_ns)
             report = self._bank.process(xy * np.nan, cos, sin)  # only time passes
         else:
             report = self._bank.process(xy, cos, sin)
-            said = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
-            said += self._departures(report, verdict, end_index, t_ns, period_ns)
+            diagnosis = self._changes(report, verdict, first_index, len(samples), before, t_ns, period_ns)
+            diagnosis += self._departures(report, verdict, end_index, t_ns, period_ns)
         if math.floor(self._revolutions) > math.floor(before):
             began, self._progress_index = self._progress_index, end_index
-            said.append(
+            diagnosis.append(
                 self._diagnosis(report, verdict, began, end_index, t_ns, self._bank.decision, changed=False)
             )
-        return said
+        return diagnosis
 
     def _changes(
         self,
@@ -314,7 +314,7 @@ class RotorBankDetector:
         period_ns: float,
     ) -> list[Diagnosis]:
         """One statement for every change of the declared mode."""
-        said = []
+        changes = []
         after = self._revolutions
         for change in report.declarations:
             self._decision = self._modes[change.mode].name
@@ -322,9 +322,9 @@ class RotorBankDetector:
             at_ns = t_ns - round((n - 1 - change.sample) * period_ns)
             onset = first_index + min(change.onset, change.sample)
             end = first_index + change.sample + 1
-            said.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
+            changes.append(self._diagnosis(report, verdict, onset, end, at_ns, change.mode, changed=True))
         self._revolutions = after
-        return said
+        return changes
 
     def _departures(
         self, report: BankReport, verdict: RevolutionQuality, end_index: int, t_ns: int, period_ns: float

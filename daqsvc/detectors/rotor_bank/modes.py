@@ -66,8 +66,8 @@ def fault_of(mode: RotorMode, rotor: RotorParameters) -> Fault | Literal["normal
         "unbalance": mode.unbalance_ratio != 1.0,
         "damping_loss": less_damping,
     }
-    told = (fault for fault, does in differs.items() if does)
-    return mode.fault or next(told, None) or "normal"
+    named = (fault for fault, does in differs.items() if does)
+    return mode.fault or next(named, None) or "normal"
 
 
 def bank_modes(

@@ -20,19 +20,19 @@ _LEAD = "lead."
 _MOST_NATS = 200.0
 
 
-def draw_bank(recording: Recording, said: Statements, modes: Iterable[str], prefix: str) -> list[str]:
+def draw_bank(recording: Recording, statements: Statements, modes: Iterable[str], prefix: str) -> list[str]:
     """Write probabilities and evidence of the modes over the revolutions, as a PNG file.
 
     Args:
         recording: the recording.
-        said: all that the bank said.
+        statements: all that the bank said.
         modes: names of its modes.
         prefix: what the file's name begins with, directory included.
 
     Returns:
         The file, or nothing if there was no good statement.
     """
-    good = [one for one in said.diagnoses if one.quality == "good" and one.revolutions is not None]
+    good = [one for one in statements.diagnoses if one.quality == "good" and one.revolutions is not None]
     if not good:
         return []
     figure = Figure(figsize=(9.6, 7.0), layout="constrained")
@@ -44,7 +44,7 @@ def draw_bank(recording: Recording, said: Statements, modes: Iterable[str], pref
         (line,) = upper.step(turns, probability, where="post", linewidth=1.8, label=mode)
         lead = [one.evidence.get(_LEAD + mode, np.nan) for one in good]
         lower.plot(turns, np.minimum(lead, _MOST_NATS), color=line.get_color(), linewidth=1.2)
-    for change in said.changes():
+    for change in statements.changes():
         if change.revolutions is not None and change.quality == "good":
             for axes in (upper, lower):
                 axes.axvline(change.revolutions, color="#8c8c8c", linestyle=":", linewidth=1.2)

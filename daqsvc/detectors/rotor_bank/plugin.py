@@ -33,36 +33,37 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
     predictable = True
     place = 1
 
-    def sampled_together(self, given: RotorBank) -> tuple[str, ...]:
+    def sampled_together(self, settings: RotorBank) -> tuple[str, ...]:
         """See `PipelineTable.sampled_together`."""
-        return given.sampled_together
+        return settings.sampled_together
 
-    def checks(self, draft: MachineFile, given: RotorBank) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: RotorBank) -> Iterator[Iterator[Finding]]:
         """See `PipelineTable.checks`."""
-        return bank_checks(draft, given)
+        return bank_checks(draft, settings)
 
-    def alarm_checks(self, given: RotorBank, at: KeyPath) -> Iterator[Finding]:
+    def alarm_checks(self, settings: RotorBank, at: KeyPath) -> Iterator[Finding]:
         """See `PipelineTable.alarm_checks`."""
-        return check_bank_alarm(given, at)
+        return check_bank_alarm(settings, at)
 
-    def start_up_signals(self, draft: MachineFile, given: RotorBank) -> Mapping[str, tuple[str, ...]]:
+    def start_up_signals(self, draft: MachineFile, settings: RotorBank) -> Mapping[str, tuple[str, ...]]:
         """See `PipelineTable.start_up_signals`."""
-        del draft, given
+        del draft, settings
         return {ROTOR_BANK: ("speed",)}
 
-    def describe(self, machine: MachineFile, given: RotorBank) -> str:
+    def describe(self, machine: MachineFile, settings: RotorBank) -> str:
         """See `PipelineTable.describe`."""
         del machine
         text = (
-            f"{given.probes[0]}, {given.probes[1]} and {given.keyphasor}; noise {given.noise_um:g} um; "
-            f"rule {given.rule}, {_thresholds(given)}; "
+            f"{settings.probes[0]}, {settings.probes[1]} and {settings.keyphasor}; "
+            f"noise {settings.noise_um:g} um; "
+            f"rule {settings.rule}, {_thresholds(settings)}; "
         )
-        if given.calibrate_revolutions:
-            text += f"unbalance and sag from the first {given.calibrate_revolutions} revolutions; "
-        return f"{text}modes {', '.join(map(_mode, given.modes))}"
+        if settings.calibrate_revolutions:
+            text += f"unbalance and sag from the first {settings.calibrate_revolutions} revolutions; "
+        return f"{text}modes {', '.join(map(_mode, settings.modes))}"
 
     def build(
-        self, machine: MachineFile, given: RotorBank, store: Path | None
+        self, machine: MachineFile, settings: RotorBank, store: Path | None
     ) -> tuple[RotorBankDetector, ...]:
         """See `DetectorPlugin.build`."""
         del store
@@ -70,25 +71,25 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
         from daqsvc.detectors.rotor_bank.build import bank_detector  # noqa: PLC0415
 
         try:
-            return (bank_detector(machine, given),)
+            return (bank_detector(machine, settings),)
         except (ValueError, ArithmeticError) as error:
             raise AssemblyError(
                 f"{machine.path}: pipeline.rotor_bank: its observers cannot be made of these figures "
                 f"({error}); correct noise_um, process_noise, modes, or [machine.rotor]"
             ) from error
 
-    def check_files(self, machine: MachineFile, given: RotorBank) -> None:
+    def check_files(self, machine: MachineFile, settings: RotorBank) -> None:
         """See `DetectorPlugin.check_files`: whether observers can be made of the figures."""
-        self.build(machine, given, None)
+        self.build(machine, settings, None)
 
-    def recorded(self, machine: MachineFile, given: RotorBank, options: RecordingOptions) -> RecordedBank:
+    def recorded(self, machine: MachineFile, settings: RotorBank, options: RecordingOptions) -> RecordedBank:
         """See `DetectorPlugin.recorded`."""
         from daqsvc.detectors.rotor_bank.recorded import RecordedBank  # noqa: PLC0415 - brings SciPy
 
-        return RecordedBank(machine, given, options)
+        return RecordedBank(machine, settings, options)
 
     def detectability(
-        self, machine: MachineFile, given: RotorBank, options: DetectabilityOptions
+        self, machine: MachineFile, settings: RotorBank, options: DetectabilityOptions
     ) -> Detectability:
         """See `DetectorPlugin.detectability`."""
         if options.noise_um is not None or options.eccentricity_um is not None:
@@ -98,15 +99,15 @@ class RotorBankPlugin(DetectorPlugin[RotorBank]):
             )
         from daqsvc.detectors.rotor_bank import detectability as bank  # noqa: PLC0415 - brings the compiler
 
-        (detector,) = self.build(machine, given, None)
-        found = bank.bank_detectability(machine, given, detector, options.process_noise)
-        return Detectability(bank.as_json(found, machine), bank.as_text(found, machine))
+        (detector,) = self.build(machine, settings, None)
+        prediction = bank.bank_detectability(machine, settings, detector, options.process_noise)
+        return Detectability(bank.as_json(prediction, machine), bank.as_text(prediction, machine))
 
-    def readings(self, machine: MachineFile, given: RotorBank) -> Iterator[Reading]:
+    def readings(self, machine: MachineFile, settings: RotorBank) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
         del machine
         yield Reading(ROTOR_BANK, "statistics", "speed", "rpm")
-        for mode in given.modes:
+        for mode in settings.modes:
             yield Reading(ROTOR_BANK, "probabilities", mode.name)
 
 

@@ -36,20 +36,20 @@ class RecordedBank(RecordedDetector[RotorBank]):
     @property
     def sensors(self) -> tuple[str, ...]:
         """See `RecordedDetector.sensors`."""
-        return self.given.sensors
+        return self.settings.sensors
 
     def as_recorded(self, sensors: Container[str]) -> RotorBank | None:
         """See `RecordedDetector.as_recorded`."""
-        return self.given if all(name in sensors for name in self.given.sensors) else None
+        return self.settings if all(name in sensors for name in self.settings.sensors) else None
 
     def not_judged(self, recording: str, why: str) -> RotorVerdict:
         """See `RecordedDetector.not_judged`."""
         return RotorVerdict.not_judged(recording, why)
 
-    def evaluate(self, recorded: Recorded, given: RotorBank, progress: Progress | None) -> Evaluated:
+    def evaluate(self, recorded: Recorded, settings: RotorBank, progress: Progress | None) -> Evaluated:
         """See `RecordedDetector.evaluate`."""
         del progress
-        detector = bank_detector(recorded.machine, given)
+        detector = bank_detector(recorded.machine, settings)
         (statements,) = statements_of(detector, recorded)
         return Evaluated(
             (statements,),
@@ -64,23 +64,23 @@ def _draw(recording: Recording, statements: Statements, modes: tuple[str, ...], 
     draw_bank(recording, statements, modes, f"{prefix}-bank")
 
 
-def bank_verdict(recording: Recording, said: Statements, faults: Mapping[str, str]) -> RotorVerdict:
+def bank_verdict(recording: Recording, statements: Statements, faults: Mapping[str, str]) -> RotorVerdict:
     """What a recording says about a rotor by its bank alone.
 
     Modes become the faults that they stand for; levels of one fault are one verdict.
 
     Args:
         recording: the recording.
-        said: all that the bank said.
+        statements: all that the bank said.
         faults: the fault that each mode stands for.
     """
     quality = known_against(recording)
     source = str(recording.source)
-    judged = [one for one in said.diagnoses if one.quality == "good"]
-    poor = [one for one in said.diagnoses if one.quality != "good"]
+    judged = [one for one in statements.diagnoses if one.quality == "good"]
+    poor = [one for one in statements.diagnoses if one.quality != "good"]
     for complaint in complaints(one.reason for one in poor):
         quality = quality.with_problem(complaint.describe())
-    if not said.diagnoses:
+    if not statements.diagnoses:
         return RotorVerdict.not_judged(
             source, "the recording is too short for the rotor bank: not one revolution", quality
         )
@@ -119,9 +119,9 @@ def bank_verdict(recording: Recording, said: Statements, faults: Mapping[str, st
     )
 
 
-def _faults(said: Diagnosis, faults: Mapping[str, str]) -> tuple[RotorFault, ...]:
+def _faults(diagnosis: Diagnosis, faults: Mapping[str, str]) -> tuple[RotorFault, ...]:
     """The faults that a statement leaves, the decision first."""
-    modes = [mode for mode in (said.decision, *said.group) if mode in faults]
+    modes = [mode for mode in (diagnosis.decision, *diagnosis.group) if mode in faults]
     return tuple(dict.fromkeys(cast("RotorFault", faults[mode]) for mode in modes))
 
 
@@ -132,25 +132,25 @@ def _history(
     steps: list[Step] = []
     departed = named = None
     onset: int | None = None
-    for said in judged:
-        group = _faults(said, faults)
+    for diagnosis in judged:
+        group = _faults(diagnosis, faults)
         if not group:
             continue
-        settled = said.decision in faults
+        settled = diagnosis.decision in faults
         if group == ("normal",):
             departed = named = onset = None
         elif departed is None:
-            departed, onset = said, said.first_index
+            departed, onset = diagnosis, diagnosis.first_index
         if settled and group != ("normal",) and (named is None or set(_faults(named, faults)) != set(group)):
-            named = said
-        step = Step(math.floor(said.revolutions or 0.0), group[0], group, settled)
+            named = diagnosis
+        step = Step(math.floor(diagnosis.revolutions or 0.0), group[0], group, settled)
         if not steps or (steps[-1].group, steps[-1].named) != (step.group, step.named):
             steps.append(step)
     return tuple(steps), departed, onset, named
 
 
-def _instant(sample: int, rate_hz: float, said: Diagnosis) -> Instant:
+def _instant(sample: int, rate_hz: float, diagnosis: Diagnosis) -> Instant:
     """A sample, with the revolution counted back from a statement at the speed it knows."""
-    speed_rpm = said.statistics.get("speed", math.nan)
-    turns = (said.revolutions or 0.0) - (said.end_index - sample) / rate_hz * speed_rpm / 60.0
+    speed_rpm = diagnosis.statistics.get("speed", math.nan)
+    turns = (diagnosis.revolutions or 0.0) - (diagnosis.end_index - sample) / rate_hz * speed_rpm / 60.0
     return Instant(sample, sample / rate_hz, math.floor(turns) if math.isfinite(turns) else 0)

@@ -45,8 +45,8 @@ class Mode(Section):
             "static_load_um": (0.0, 0.0),
             "rub": False,
         }
-        told = [key for key, value in ordinary.items() if getattr(self, key) != value]
-        return tuple(["damping_ratio", *told] if self.damping_ratio is not None else told)
+        differing = [key for key, value in ordinary.items() if getattr(self, key) != value]
+        return tuple(["damping_ratio", *differing] if self.damping_ratio is not None else differing)
 
 
 ProcessNoise = Annotated[float, Field(ge=1e-12, le=1e6)]

@@ -33,13 +33,13 @@ log = logging.getLogger(__name__)
 
 
 def healthy_rotor(
-    machine: MachineFile, given: RotorSynchronous, calibration: Path | None = None
+    machine: MachineFile, settings: RotorSynchronous, calibration: Path | None = None
 ) -> tuple[LavalRotor, tuple[Calibration, ...]]:
     """What is known of the calibrated rotor: by its calibration if there is one, else by the machine file.
 
     Args:
         machine: the machine file.
-        given: its calibrated rotor.
+        settings: its calibrated rotor.
         calibration: file to take in place of the one that the machine file names.
 
     Returns:
@@ -50,15 +50,15 @@ def healthy_rotor(
     """
     rotor = machine.machine.rotor
     assert rotor is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]
-    if calibration is None and given.calibration is not None:
-        calibration = machine.resolve(given.calibration)
+    if calibration is None and settings.calibration is not None:
+        calibration = machine.resolve(settings.calibration)
     if calibration is not None:
         return load_healthy(calibration, known(machine.machine.speed_rpm), rotor.clearance_um)
     stated = LavalRotor(
         natural_frequency_hz=rotor.natural_frequency_hz,
         damping_ratio=rotor.damping_ratio,
-        natural_frequency_tolerance=given.natural_frequency_tolerance_percent / 100.0,
-        damping_tolerance=given.damping_tolerance_percent / 100.0,
+        natural_frequency_tolerance=settings.natural_frequency_tolerance_percent / 100.0,
+        damping_tolerance=settings.damping_tolerance_percent / 100.0,
         clearance_um=rotor.clearance_um,
         static_sag_um=rotor.static_sag_um,
     )
@@ -67,7 +67,7 @@ def healthy_rotor(
 
 def rotor_synchronous(
     machine: MachineFile,
-    given: RotorSynchronous,
+    settings: RotorSynchronous,
     known: tuple[LavalRotor, tuple[Calibration, ...]],
     store: Path | None,
 ) -> Detector:
@@ -75,7 +75,7 @@ def rotor_synchronous(
 
     Args:
         machine: the machine file.
-        given: its calibrated rotor.
+        settings: its calibrated rotor.
         known: what `healthy_rotor` says of it.
         store: directory of the state that survives restarts; None to begin without any and leave none.
     """
@@ -84,25 +84,25 @@ def rotor_synchronous(
     if calibration is None and store is not None:
         kept = store / f"{ROTOR_SYNCHRONOUS}.toml"
         calibration = _kept_calibration(kept, machine.machine.speed_rpm, rotor)
-    grid = machine.grid(given.sampled_together)
+    grid = machine.grid(settings.sampled_together)
     reference: SpeedReference
-    if given.reference == "keyphasor":
-        assert given.keyphasor is not None  # noqa: S101 - and then the keyphasor
-        reference = keyphasor(machine, grid, given.keyphasor)
+    if settings.reference == "keyphasor":
+        assert settings.keyphasor is not None  # noqa: S101 - and then the keyphasor
+        reference = keyphasor(machine, grid, settings.keyphasor)
     else:
-        reference = given.reference
+        reference = settings.reference
     return RotorSynchronousDetector(
         machine=machine.machine.name,
         stream=grid.name,
         rate_hz=grid.rate_hz,
         speed_rpm=machine.machine.speed_rpm,
-        probes=probes(machine, grid, given.probes),
+        probes=probes(machine, grid, settings.probes),
         reference=reference,
         rotor=rotor,
         rules=WatchRules(
-            calibrate_revolutions=given.calibrate_revolutions,
-            false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
-            probe_drift_um=given.probe_drift_um,
+            calibrate_revolutions=settings.calibrate_revolutions,
+            false_alarms_per_1000_rev=settings.false_alarms_per_1000_rev,
+            probe_drift_um=settings.probe_drift_um,
         ),
         calibration=calibration,
         ac_coupled=machine.ac_coupled,

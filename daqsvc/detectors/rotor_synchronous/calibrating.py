@@ -138,13 +138,13 @@ def _baseline(recording: Recording, taken: RotorSetup) -> Calibration:
         raise RefusedError(first.refused or "no revolution can be used")
     usable = len(first.trace.vectors) - LEAST_JUDGED
     if usable <= LEAST_REVOLUTIONS:
-        found = first
+        baseline = first
     else:
-        found = analyse(recording, _with_revolutions(taken, usable))
-        if found.refused is not None:
-            raise RefusedError(found.refused)
-    assert found.calibration is not None  # noqa: S101 - not refused
-    return found.calibration
+        baseline = analyse(recording, _with_revolutions(taken, usable))
+        if baseline.refused is not None:
+            raise RefusedError(baseline.refused)
+    assert baseline.calibration is not None  # noqa: S101 - not refused
+    return baseline.calibration
 
 
 def _with_revolutions(taken: RotorSetup, revolutions: int) -> RotorSetup:
@@ -174,10 +174,10 @@ def _sweep(recording: Recording, taken: RotorSetup, sweep_rpm: tuple[float, floa
         sweep = _even_sweep(recording, taken, samples, sweep_rpm)
         period = 120.0 * recording.rate_hz / sum(sweep_rpm)
     else:
-        found = _keyphasor_sweep(recording, taken, samples)
-        if found is None:
+        keyphasor_sweep = _keyphasor_sweep(recording, taken, samples)
+        if keyphasor_sweep is None:
             return None
-        sweep, period = found
+        sweep, period = keyphasor_sweep
     refuse_size(samples[:, :2], taken.rotor.clearance_um, taken.unit)
     checks.refuse_stuck(checks.count_bad(taken.probes, samples[:, :2]), taken.probes, samples[:, :2], period)
     return sweep

@@ -26,7 +26,7 @@ _QUANTITIES = {
 
 def synchronous_detectability(
     machine: MachineFile,
-    given: RotorSynchronous,
+    settings: RotorSynchronous,
     *,
     noise_um: float | None,
     eccentricity_um: float | None,
@@ -35,7 +35,7 @@ def synchronous_detectability(
 
     Args:
         machine: the machine file.
-        given: the table of its calibrated rotor.
+        settings: the table of its calibrated rotor.
         noise_um: standard deviation of one probe's noise, where no calibration tells it.
         eccentricity_um: mass eccentricity, where neither calibration nor machine file tells it.
 
@@ -44,8 +44,8 @@ def synchronous_detectability(
     """
     rotor_table = machine.machine.rotor
     assert rotor_table is not None  # noqa: S101 - detectors/shaft/checks.py: it needs [machine.rotor]
-    threshold_nats = threshold_for(given.false_alarms_per_1000_rev)
-    rotor, calibrations = healthy_rotor(machine, given)
+    threshold_nats = threshold_for(settings.false_alarms_per_1000_rev)
+    rotor, calibrations = healthy_rotor(machine, settings)
     if calibrations:
         calibration = calibrations[0]
     else:
@@ -61,29 +61,31 @@ def synchronous_detectability(
                 f"{' and '.join(lacking)}, or calibrate the machine and name the file as "
                 "pipeline.rotor_synchronous.calibration"
             )
-        rate_hz = machine.grid(given.sampled_together).rate_hz
+        rate_hz = machine.grid(settings.sampled_together).rate_hz
         calibration = stated_calibration(
             rotor,
             speed_rpm=machine.machine.speed_rpm,
             samples_per_rev=60.0 * rate_hz / abs(machine.machine.speed_rpm),
             noise_um=noise_um,
             eccentricity_um=eccentricity_um,
-            revolutions=given.calibrate_revolutions,
+            revolutions=settings.calibrate_revolutions,
         )
     return vector_detectability(
-        calibration, threshold_nats, probe_drift_um=given.probe_drift_um, ac_coupled=machine.ac_coupled
+        calibration, threshold_nats, probe_drift_um=settings.probe_drift_um, ac_coupled=machine.ac_coupled
     )
 
 
-def as_json(found: VectorDetectability, machine: MachineFile, given: RotorSynchronous) -> dict[str, Any]:
+def as_json(
+    prediction: VectorDetectability, machine: MachineFile, settings: RotorSynchronous
+) -> dict[str, Any]:
     """The figures; what is never reached is null.
 
     Args:
-        found: the figures.
+        prediction: the figures.
         machine: the machine file that they are for.
-        given: the table of its calibrated rotor.
+        settings: the table of its calibrated rotor.
     """
-    was = found.calibration
+    was = prediction.calibration
     return {
         "machine": machine.machine.name,
         "speed_rpm": math.copysign(was.speed_rpm, machine.machine.speed_rpm),
@@ -91,11 +93,11 @@ def as_json(found: VectorDetectability, machine: MachineFile, given: RotorSynchr
         "noise_um": was.noise_um,
         "amplitude_um": was.amplitude_um,
         "calibration_rev": was.revolutions,
-        "false_alarms_per_1000_rev": given.false_alarms_per_1000_rev,
-        "threshold_nats": found.threshold_nats,
+        "false_alarms_per_1000_rev": settings.false_alarms_per_1000_rev,
+        "threshold_nats": prediction.threshold_nats,
         "smallest_um": {
             str(order): value if math.isfinite(value) else None
-            for order, value in zip(HARMONICS, found.smallest_um.tolist(), strict=True)
+            for order, value in zip(HARMONICS, prediction.smallest_um.tolist(), strict=True)
         },
         "smallest_change": [
             {
@@ -107,48 +109,48 @@ def as_json(found: VectorDetectability, machine: MachineFile, given: RotorSynchr
                 "change_um": one.change_um,
                 "delays": [{"size": delay.size, "delay_rev": delay.revolutions} for delay in one.delays],
             }
-            for one in found.faults
+            for one in prediction.faults
         ],
         "ambiguous": [
             {
                 "modes": ["unbalance", "damping_loss"],
-                "misfit_nats": found.misfit_nats,
-                "opens_at_rpm": found.opens_at_rpm,
-                "told_by_transient": found.told_by_transient,
+                "misfit_nats": prediction.misfit_nats,
+                "opens_at_rpm": prediction.opens_at_rpm,
+                "told_by_transient": prediction.told_by_transient,
             }
         ]
-        if found.one_group
+        if prediction.one_group
         else [],
     }
 
 
-def as_text(found: VectorDetectability, machine: MachineFile) -> str:
+def as_text(prediction: VectorDetectability, machine: MachineFile) -> str:
     """Tables and sentences for a person.
 
     Args:
-        found: the figures.
+        prediction: the figures.
         machine: the machine file that they are for.
     """
-    was = found.calibration
+    was = prediction.calibration
     head = (
         f"{machine.machine.name} at {was.speed_rpm:.6g} rpm, by its synchronous vector: 1X "
         f"{was.amplitude_um:.4g} um, {was.samples_per_rev:.4g} samples a revolution,\n"
         f"noise {was.noise_um:.3g} um, {was.revolutions} revolutions of calibration; a change is an alarm at "
-        f"{found.threshold_nats:.3g} nats"
+        f"{prediction.threshold_nats:.3g} nats"
     )
     components = [
         "Smallest change of a component that can be seen",
         *(
             f"{name:>34}{f'{value:.3g} um' if math.isfinite(value) else 'never':>12}"
-            for name, value in zip(_COMPONENTS, found.smallest_um.tolist(), strict=True)
+            for name, value in zip(_COMPONENTS, prediction.smallest_um.tolist(), strict=True)
         ),
     ]
     faults = [
         "Smallest change of every kind, and revolutions until larger ones are an alarm",
         f"{'':>34}{'healthy':>12}{'smallest':>12}   larger ones",
-        *(_row(one) for one in found.faults),
+        *(_row(one) for one in prediction.faults),
     ]
-    return "\n\n".join([head, "\n".join(components), "\n".join(faults), _ambiguity(found)])
+    return "\n\n".join([head, "\n".join(components), "\n".join(faults), _ambiguity(prediction)])
 
 
 def _row(one: VisibleFault) -> str:
@@ -161,24 +163,24 @@ def _row(one: VisibleFault) -> str:
     return f"{quantity:>34}{f'{one.healthy:.3g}{unit}':>12}{smallest:>12}   {larger}".rstrip()
 
 
-def _ambiguity(found: VectorDetectability) -> str:
-    was = found.calibration
-    if not found.one_group:
-        said = (
+def _ambiguity(prediction: VectorDetectability) -> str:
+    was = prediction.calibration
+    if not prediction.one_group:
+        sentence = (
             f"At {was.speed_rpm:.6g} rpm no loss of damping moves 1X as unbalance does: a grown unbalance is "
             "told from it. What a loss of damping does, another unbalance can do as well"
         )
     else:
-        said = f"Unbalance and loss of damping are one group at {was.speed_rpm:.6g} rpm"
-        said += (
+        sentence = f"Unbalance and loss of damping are one group at {was.speed_rpm:.6g} rpm"
+        sentence += (
             ", and at any speed within 30 % of it"
-            if found.opens_at_rpm is None
-            else f"; at {found.opens_at_rpm:.6g} rpm a grown unbalance is told from it"
+            if prediction.opens_at_rpm is None
+            else f"; at {prediction.opens_at_rpm:.6g} rpm a grown unbalance is told from it"
         )
     transient = (
         "The transient of an abrupt change tells them apart, too."
-        if found.told_by_transient
+        if prediction.told_by_transient
         else "A rotor known within 5 % would tell them apart by the transient of an abrupt change: calibrate "
         "with a run-up."
     )
-    return f"{said}.\n{transient}"
+    return f"{sentence}.\n{transient}"

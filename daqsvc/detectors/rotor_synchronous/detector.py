@@ -192,12 +192,12 @@ class RotorSynchronousDetector:
         if broken or abs(window.first_index - self._turns.end_index) > self._turns.period:
             self._judge.reset()
             self._checks.reset()
-        said = [
+        diagnoses = [
             self._revolution(revolution)
             for revolution in self._turns.process(window.samples, window.first_index, broken=broken)
         ]
-        said.append(self._blind())
-        return [diagnosis for diagnosis in said if diagnosis is not None]
+        diagnoses.append(self._blind())
+        return [diagnosis for diagnosis in diagnoses if diagnosis is not None]
 
     def _look_at_volts(self, window: Window) -> None:
         """Whether the keyphasor reads what no sensor measures; revolutions come some time after it."""
@@ -218,14 +218,14 @@ class RotorSynchronousDetector:
         self._taken += gap + len(window.samples)
         self._missing += gap + int((~np.isfinite(window.samples[:, columns])).any(axis=1).sum())
 
-    def _stating(self, said: Diagnosis | None) -> Diagnosis | None:
+    def _stating(self, diagnosis: Diagnosis | None) -> Diagnosis | None:
         """A statement with the share of samples that are missing since the last one."""
-        if said is None:
+        if diagnosis is None:
             return None
         if self._taken:
             self._missing_share = self._missing / self._taken
             self._taken = self._missing = 0
-        return replace(said, missing_share=self._missing_share)
+        return replace(diagnosis, missing_share=self._missing_share)
 
     def silent(self, silence_s: float, t_ns: int) -> Sequence[Diagnosis]:
         """See `Detector.silent`."""
@@ -236,8 +236,8 @@ class RotorSynchronousDetector:
         """A last look, at the end of a recording; None if there was no revolution to look at."""
         if self._report is None:
             return None
-        found = self._watch.finish()
-        self._report = replace(self._report, identification=found, looked=found is not None)
+        reports = self._watch.finish()
+        self._report = replace(self._report, identification=reports, looked=reports is not None)
         return self._stater.state(self._standing(), self._verdict(), *self._end(self._ends[-1]))
 
     def _new_watch(self, rotor: LavalRotor, calibration: Calibration | None) -> RotorWatch:

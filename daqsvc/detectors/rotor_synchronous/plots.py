@@ -147,8 +147,8 @@ def draw(recording: Recording, setup: RotorSetup, analysis: RotorVerdict, prefix
 
 def _figure(subject: _Subject, title: str, size: tuple[float, float]) -> Figure:
     figure = Figure(figsize=size, layout="constrained")
-    said = " or ".join(name.replace("_", " ") for name in subject.analysis.group) or "not judged"
-    figure.suptitle(f"{title}: {shortened(subject.name)}\n{said}", fontsize=11)
+    finding = " or ".join(name.replace("_", " ") for name in subject.analysis.group) or "not judged"
+    figure.suptitle(f"{title}: {shortened(subject.name)}\n{finding}", fontsize=11)
     return figure
 
 

@@ -35,45 +35,47 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
     predictable = True
     place = 2
 
-    def sampled_together(self, given: RotorSynchronous) -> tuple[str, ...]:
+    def sampled_together(self, settings: RotorSynchronous) -> tuple[str, ...]:
         """See `PipelineTable.sampled_together`."""
-        return given.sampled_together
+        return settings.sampled_together
 
-    def checks(self, draft: MachineFile, given: RotorSynchronous) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: RotorSynchronous) -> Iterator[Iterator[Finding]]:
         """See `PipelineTable.checks`."""
-        return synchronous_checks(draft, given)
+        return synchronous_checks(draft, settings)
 
-    def start_up_signals(self, draft: MachineFile, given: RotorSynchronous) -> Mapping[str, tuple[str, ...]]:
+    def start_up_signals(
+        self, draft: MachineFile, settings: RotorSynchronous
+    ) -> Mapping[str, tuple[str, ...]]:
         """See `PipelineTable.start_up_signals`."""
-        del draft, given
+        del draft, settings
         return {ROTOR_SYNCHRONOUS: ("speed", "1x.amplitude")}
 
-    def describe(self, machine: MachineFile, given: RotorSynchronous) -> str:
+    def describe(self, machine: MachineFile, settings: RotorSynchronous) -> str:
         """See `PipelineTable.describe`."""
-        return _described(machine, given)
+        return _described(machine, settings)
 
     def build(
-        self, machine: MachineFile, given: RotorSynchronous, store: Path | None
+        self, machine: MachineFile, settings: RotorSynchronous, store: Path | None
     ) -> tuple[Detector, ...]:
         """See `DetectorPlugin.build`."""
         from daqsvc.detectors.rotor_synchronous.build import rotor_synchronous  # noqa: PLC0415 - brings SciPy
 
-        return (rotor_synchronous(machine, given, _healthy_rotor(machine, given), store),)
+        return (rotor_synchronous(machine, settings, _healthy_rotor(machine, settings), store),)
 
-    def check_files(self, machine: MachineFile, given: RotorSynchronous) -> None:
+    def check_files(self, machine: MachineFile, settings: RotorSynchronous) -> None:
         """See `DetectorPlugin.check_files`: whether its calibration can be used."""
-        _healthy_rotor(machine, given)
+        _healthy_rotor(machine, settings)
 
     def recorded(
-        self, machine: MachineFile, given: RotorSynchronous, options: RecordingOptions
+        self, machine: MachineFile, settings: RotorSynchronous, options: RecordingOptions
     ) -> RecordedRotor:
         """See `DetectorPlugin.recorded`."""
         from daqsvc.detectors.rotor_synchronous.recorded import RecordedRotor  # noqa: PLC0415 - brings SciPy
 
-        return RecordedRotor(machine, given, options)
+        return RecordedRotor(machine, settings, options)
 
     def detectability(
-        self, machine: MachineFile, given: RotorSynchronous, options: DetectabilityOptions
+        self, machine: MachineFile, settings: RotorSynchronous, options: DetectabilityOptions
     ) -> Detectability:
         """See `DetectorPlugin.detectability`."""
         if options.process_noise is not None:
@@ -82,16 +84,18 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
             )
         from daqsvc.detectors.rotor_synchronous import detectability as vector  # noqa: PLC0415 - brings NumPy
 
-        found = vector.synchronous_detectability(
-            machine, given, noise_um=options.noise_um, eccentricity_um=options.eccentricity_um
+        prediction = vector.synchronous_detectability(
+            machine, settings, noise_um=options.noise_um, eccentricity_um=options.eccentricity_um
         )
-        return Detectability(vector.as_json(found, machine, given), vector.as_text(found, machine))
+        return Detectability(
+            vector.as_json(prediction, machine, settings), vector.as_text(prediction, machine)
+        )
 
-    def readings(self, machine: MachineFile, given: RotorSynchronous) -> Iterator[Reading]:
+    def readings(self, machine: MachineFile, settings: RotorSynchronous) -> Iterator[Reading]:
         """See `DetectorPlugin.readings`."""
         from daqsvc.rotor.synchronous.signatures import RotorFault  # noqa: PLC0415 - brings NumPy's solvers
 
-        del machine, given
+        del machine, settings
         yield Reading(ROTOR_SYNCHRONOUS, "statistics", "speed", "rpm")
         yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.amplitude", "um")
         yield Reading(ROTOR_SYNCHRONOUS, "statistics", "1x.phase", "deg")
@@ -100,16 +104,16 @@ class RotorSynchronousPlugin(DetectorPlugin[RotorSynchronous]):
 
 
 def _healthy_rotor(
-    machine: MachineFile, given: RotorSynchronous
+    machine: MachineFile, settings: RotorSynchronous
 ) -> tuple[LavalRotor, tuple[Calibration, ...]]:
     from daqsvc.detectors.rotor_synchronous.build import healthy_rotor  # noqa: PLC0415 - brings SciPy
     from daqsvc.rotor.calibration.file import CalibrationFileError  # noqa: PLC0415 - likewise
 
     try:
-        return healthy_rotor(machine, given)
+        return healthy_rotor(machine, settings)
     except CalibrationFileError as error:
         raise AssemblyError(
-            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(given.calibration)!r}: {error}"
+            f"{machine.path}: pipeline.rotor_synchronous.calibration = {str(settings.calibration)!r}: {error}"
         ) from error
 
 

@@ -80,19 +80,19 @@ class RecordedRotor(RecordedDetector[RotorSynchronous]):
 
     part = "rotor"
 
-    def __init__(self, machine: MachineFile, given: RotorSynchronous, options: RecordingOptions) -> None:
-        super().__init__(machine, given, options)
-        self.setup = _setup(machine, given, options)
+    def __init__(self, machine: MachineFile, settings: RotorSynchronous, options: RecordingOptions) -> None:
+        super().__init__(machine, settings, options)
+        self.setup = _setup(machine, settings, options)
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """See `RecordedDetector.sensors`."""
-        return self.given.sensors
+        return self.settings.sensors
 
     def as_recorded(self, sensors: Container[str]) -> RotorSynchronous:
         """See `RecordedDetector.as_recorded`: without one of its sensors a recording is refused."""
         del sensors
-        return self.given
+        return self.settings
 
     def not_judged(self, recording: str, why: str) -> RotorVerdict:
         """See `RecordedDetector.not_judged`."""
@@ -102,9 +102,11 @@ class RecordedRotor(RecordedDetector[RotorSynchronous]):
             return verdict
         return replace(verdict, false_alarms_per_1000_rev=rate, threshold_nats=threshold_for(rate))
 
-    def evaluate(self, recorded: Recorded, given: RotorSynchronous, progress: Progress | None) -> Evaluated:
+    def evaluate(
+        self, recorded: Recorded, settings: RotorSynchronous, progress: Progress | None
+    ) -> Evaluated:
         """See `RecordedDetector.evaluate`."""
-        del given
+        del settings
         setup = replace(self.setup, ac_coupled=recorded.machine.ac_coupled)
         verdict = analyse(recorded.recording, setup, progress)
         draw = None if verdict.trace is None else partial(_draw, recorded.recording, setup, verdict)
@@ -117,27 +119,27 @@ def _draw(recording: Recording, setup: RotorSetup, verdict: RotorVerdict, prefix
     draw(recording, setup, verdict, prefix)
 
 
-def _setup(machine: MachineFile, given: RotorSynchronous, options: RecordingOptions) -> RotorSetup:
+def _setup(machine: MachineFile, settings: RotorSynchronous, options: RecordingOptions) -> RotorSetup:
     """The calibrated rotor of a machine file, as `analyse` wants it.
 
     Raises:
         ValueError: its figures contradict each other, or its calibration cannot be used.
     """
-    x, y = (cast("ProximityProbe", machine.sensor(name)) for name in given.probes)
+    x, y = (cast("ProximityProbe", machine.sensor(name)) for name in settings.probes)
     keyphasor = None
-    if given.reference == "keyphasor" and given.keyphasor is not None:
-        sensor = cast("Keyphasor", machine.sensor(given.keyphasor))
+    if settings.reference == "keyphasor" and settings.keyphasor is not None:
+        sensor = cast("Keyphasor", machine.sensor(settings.keyphasor))
         keyphasor = KeyphasorChannel(
             sensor.name, known(sensor.threshold_v), sensor.edge, known(sensor.hysteresis_v)
         )
     rules = WatchRules(
-        calibrate_revolutions=given.calibrate_revolutions,
-        false_alarms_per_1000_rev=given.false_alarms_per_1000_rev,
-        probe_drift_um=given.probe_drift_um,
+        calibrate_revolutions=settings.calibrate_revolutions,
+        false_alarms_per_1000_rev=settings.false_alarms_per_1000_rev,
+        probe_drift_um=settings.probe_drift_um,
         retry=False,
     )
     threshold_for(rules.false_alarms_per_1000_rev)
-    rotor, calibrations = healthy_rotor(machine, given, options.calibration)
+    rotor, calibrations = healthy_rotor(machine, settings, options.calibration)
     return RotorSetup(
         probes=(x.name, y.name),
         probe_angles_deg=(x.angle_deg or 0.0, 90.0 if y.angle_deg is None else y.angle_deg),
@@ -146,7 +148,7 @@ def _setup(machine: MachineFile, given: RotorSynchronous, options: RecordingOpti
         speed_step_rpm=options.speed_step_rpm,
         unit=cast("LengthUnit", options.unit or x.unit),
         keyphasor=keyphasor,
-        follow_orbit=given.reference == "orbit",
+        follow_orbit=settings.reference == "orbit",
         rules=rules,
         calibrations=calibrations,
         ac_coupled=machine.ac_coupled,
@@ -289,8 +291,8 @@ def _feed(
     for begin in range(0, len(samples), length):
         part = samples[begin : begin + length].astype(np.float32)
         end = begin + len(part)
-        said = detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns))
-        reasons += [one.reason for one in said if one.quality != "good"]
+        diagnoses = detector.process(Window(begin, part, round((end - 1) * period_ns), period_ns))
+        reasons += [one.reason for one in diagnoses if one.quality != "good"]
         if progress is not None:
             progress(end, len(samples))
         if detector.refused:
@@ -371,13 +373,13 @@ class _Conclusion:
 
     def _departed(self) -> WatchReport | None:
         """The report that raised the alarm which is still up."""
-        found = None
+        departed = None
         for report in self.reports:
             if report.state != "departed":
-                found = None
-            elif report.departed and found is None:
-                found = report
-        return found
+                departed = None
+            elif report.departed and departed is None:
+                departed = report
+        return departed
 
     def _last_look(self) -> Identification | None:
         """The last look; one more at the end of the recording, unless the last revolution had one."""
@@ -418,26 +420,34 @@ def history(reports: Sequence[WatchReport], last: Identification | None) -> tupl
     steps: list[Step] = []
     for report in reports:
         before = steps[-1] if steps else None
-        said = report.identification
+        identification = report.identification
         if report.departed and (before is None or before.verdict == "normal"):
             steps.append(Step(report.revolution, None))
         elif report.state == "watching" and before is not None and before.verdict != "normal":
             steps.append(Step(report.revolution, "normal", ("normal",), named=True))
-        elif report.looked and said is not None:
-            _add_look(steps, report.revolution, said)
+        elif report.looked and identification is not None:
+            _add_look(steps, report.revolution, identification)
     if last is not None and reports:
         _add_look(steps, reports[-1].revolution, last)
     return tuple(steps)
 
 
-def _add_look(steps: list[Step], revolution: int, said: Identification) -> None:
+def _add_look(steps: list[Step], revolution: int, identification: Identification) -> None:
     before = steps[-1] if steps else None
     if before is None or (before.verdict, before.group, before.named) != (
-        said.verdict,
-        said.group,
-        said.named,
+        identification.verdict,
+        identification.group,
+        identification.named,
     ):
-        steps.append(Step(revolution, said.verdict, said.group, said.named, said.probabilities))
+        steps.append(
+            Step(
+                revolution,
+                identification.verdict,
+                identification.group,
+                identification.named,
+                identification.probabilities,
+            )
+        )
 
 
 def posterior(evidence: Mapping[RotorFault, float]) -> dict[RotorFault, float]:
@@ -529,8 +539,13 @@ def declared_at(
     if last is None or not last.named:
         return None
     for report in reports:
-        said = report.identification
-        if report.looked and said is not None and said.named and set(said.group) == set(last.group):
+        identification = report.identification
+        if (
+            report.looked
+            and identification is not None
+            and identification.named
+            and set(identification.group) == set(last.group)
+        ):
             return places.end_of(report)
     return places.end_of(places.reports[-1])
 

@@ -228,36 +228,38 @@ def _fixed_speed(
     begin = math.ceil(calibrating * 60.0 * recording.rate_hz / abs(stated_rpm))
     first = samples[:begin, :2]
     try:
-        found = estimate_speed(first, recording.rate_hz, stated_rpm)
+        estimate = estimate_speed(first, recording.rate_hz, stated_rpm)
     except ValueError as error:
         _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
         refuse_elsewhere(first, recording.rate_hz, stated_rpm, None)
         raise RefusedError(f"{error} (looked for in the first {calibrating} revolutions)") from None
-    off = found.speed_rpm / stated_rpm - 1.0
-    significant = abs(found.speed_rpm - stated_rpm) > _SIGNIFICANT * found.uncertainty_rpm
+    off = estimate.speed_rpm / stated_rpm - 1.0
+    significant = abs(estimate.speed_rpm - stated_rpm) > _SIGNIFICANT * estimate.uncertainty_rpm
     wrong = significant and abs(off) * calibrating > _FIXED_SPEED_TURN
     if wrong:
         _refuse_trend(trend_of_orbit(samples[:, :2], recording.rate_hz))
     refuse_elsewhere(
-        first, recording.rate_hz, stated_rpm, None if abs(off) > AT_THE_EDGE else found.speed_rpm
+        first, recording.rate_hz, stated_rpm, None if abs(off) > AT_THE_EDGE else estimate.speed_rpm
     )
     if wrong:
         raise RefusedError(
-            f"the shaft turns at {abs(found.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
+            f"the shaft turns at {abs(estimate.speed_rpm):.2f} rpm and not at {abs(stated_rpm):.2f} rpm "
             f"({100.0 * off:+.2f} %): 1X is not locked to the angle; correct the speed, use a keyphasor, or "
             "follow the orbit (--speed-rpm orbit:N)"
         )
     revolutions = len(samples) * abs(stated_rpm) / 60.0 / recording.rate_hz
     if significant and abs(off) * revolutions > _RELEVANT_TURN:
         quality = quality.with_problem(
-            f"the speed is {abs(found.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
+            f"the speed is {abs(estimate.speed_rpm):.3f} rpm by the orbit, not {abs(stated_rpm):.3f} rpm; "
             "the former is used"
         )
-        return Speed(found.speed_rpm, uncertainty=found.uncertainty_rpm / abs(found.speed_rpm)), quality
+        return Speed(
+            estimate.speed_rpm, uncertainty=estimate.uncertainty_rpm / abs(estimate.speed_rpm)
+        ), quality
     # A rounded figure and an estimate with its own uncertainty, weighed.
     stated = (setup.speed_step_rpm / math.sqrt(12.0)) ** 2
-    weight = stated / (stated + found.uncertainty_rpm**2) if stated > 0.0 else 0.0
-    rpm = stated_rpm + weight * (found.speed_rpm - stated_rpm)
+    weight = stated / (stated + estimate.uncertainty_rpm**2) if stated > 0.0 else 0.0
+    rpm = stated_rpm + weight * (estimate.speed_rpm - stated_rpm)
     return Speed(rpm, uncertainty=math.sqrt((1.0 - weight) * stated) / abs(rpm)), quality
 
 

@@ -148,8 +148,10 @@ class Stater:
         if first_index is None:
             first_index = end_index if self._said_index is None else self._said_index
         self._decision, self._group = decision, group
-        found = None if standing.report is None else standing.report.identification
-        self._large = found is not None and found.severity > (_NO_LONGER_LARGE if self._large else _LARGE)
+        identification = None if standing.report is None else standing.report.identification
+        self._large = identification is not None and identification.severity > (
+            _NO_LONGER_LARGE if self._large else _LARGE
+        )
         self._quality, self._said_index = verdict.quality, end_index
         return self._diagnosis(
             standing, verdict, first_index=min(first_index, end_index), end_index=end_index, t_ns=t_ns,
@@ -168,17 +170,17 @@ class Stater:
         if report is None or report.state == "calibrating":
             # A baseline that is sought anew is no reason to forget what was found.
             return self._decision, self._group
-        found = report.identification
+        identification = report.identification
         if report.state == "watching":
             return "normal", ()
-        if found is None:
+        if identification is None:
             return DEPARTURE, ()
-        group = found.group if len(found.group) > 1 else ()
-        if not found.named:
-            return DEPARTURE, found.group
+        group = identification.group if len(identification.group) > 1 else ()
+        if not identification.named:
+            return DEPARTURE, identification.group
         if self._decision in group:
             return self._decision, group
-        return found.verdict, group
+        return identification.verdict, group
 
     def _severity(self) -> Severity:
         if self._decision in {UNDETERMINED, "normal"}:
@@ -196,7 +198,7 @@ class Stater:
         changed: bool,
     ) -> Diagnosis:
         report = standing.report
-        found = None if report is None else report.identification
+        identification = None if report is None else report.identification
         statistics = self._statistics(standing)
         return Diagnosis(
             machine=self._machine,
@@ -208,12 +210,16 @@ class Stater:
             decision=self._decision,
             changed=changed,
             severity=self._severity(),
-            probabilities={} if found is None else {str(k): p for k, p in found.probabilities.items()},
+            probabilities={}
+            if identification is None
+            else {str(k): p for k, p in identification.probabilities.items()},
             group=self._group,
             statistics=statistics,
             units=_units(statistics),
             thresholds=self._thresholds,
-            evidence={} if found is None else {str(k): nats for k, nats in found.evidence.items()},
+            evidence={}
+            if identification is None
+            else {str(k): nats for k, nats in identification.evidence.items()},
             revolutions=float(standing.revolutions),
             quality=verdict.quality,
             reason=verdict.reason,
@@ -244,10 +250,10 @@ class Stater:
                 statistics |= self._levels(report.identification, calibration)
         return statistics
 
-    def _levels(self, found: Identification, calibration: Calibration) -> dict[str, float]:
+    def _levels(self, identification: Identification, calibration: Calibration) -> dict[str, float]:
         """How large the fault is, for every member of the group: `levels`, angles as in `_unmirrored`."""
         figures = {}
-        for fault, level in levels(found, calibration).items():
+        for fault, level in levels(identification, calibration).items():
             for name, value in level.items():
                 mirrored = self._clockwise and name in _DIRECTIONS
                 figures[f"{fault}.{name}"] = (180.0 - value) % 360.0 if mirrored else value

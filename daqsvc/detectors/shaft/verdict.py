@@ -69,10 +69,10 @@ class RotorAlarm:
             "declaration": self.declaration,
             "returned": self.returned,
         }
-        found: dict[str, Any] = {
+        document: dict[str, Any] = {
             name: None if instant is None else instant.as_json() for name, instant in instants.items()
         }
-        return found | {"verdict": self.verdict, "group": list(self.group)}
+        return document | {"verdict": self.verdict, "group": list(self.group)}
 
     def describe(self) -> str:
         """One line for a person."""
@@ -187,7 +187,7 @@ class RotorVerdict(Verdict):
     def as_json(self) -> dict[str, Any]:
         """A JSON object: all figures finite, lengths in um."""
         change = None if self.identification is None else self.identification.change
-        found: dict[str, Any] = finite(
+        document: dict[str, Any] = finite(
             {
                 "recording": self.recording,
                 "verdict": self.verdict,
@@ -221,7 +221,7 @@ class RotorVerdict(Verdict):
                 "history": [step.as_json() for step in self.history],
             }
         )
-        return found
+        return document
 
     def describe(self) -> str:
         """A few lines for a person."""
@@ -265,7 +265,7 @@ class RotorVerdict(Verdict):
             return "no detector of a rotor fault in the machine file"
         if self.verdict is None:
             return "changed, but no revolution after the change can be judged"
-        said = " or ".join(words(name) for name in self.group)
+        modes = " or ".join(words(name) for name in self.group)
         chance = self.probabilities.get(self.verdict, 0.0)
         if self.verdict == "normal" and self.alarms:
             count = len(self.alarms)
@@ -276,12 +276,12 @@ class RotorVerdict(Verdict):
         if self.verdict == "normal":
             return f"normal through {self.revolutions} revolutions"
         if not self.named:
-            said += " (not yet settled)"
+            modes += " (not yet settled)"
         elif len(self.group) > 1:
-            said += f" (cannot be told apart; {words(self.verdict)} {_percent(chance)})"
+            modes += f" (cannot be told apart; {words(self.verdict)} {_percent(chance)})"
         else:
-            said += f" ({_percent(chance)})"
-        return said
+            modes += f" ({_percent(chance)})"
+        return modes
 
     def _named(self) -> str:
         return f"; named at {told(self.declaration)}" if self.declaration is not None else "; not named"

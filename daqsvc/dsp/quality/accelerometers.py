@@ -134,14 +134,14 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
     if not missing and not held.any():
         return x, [], [], []
     lost = ~good | held
-    told = []
+    sentences = []
     if held.any():
         dropped = runs(np.flatnonzero(held), 1)
         first_s = dropped[0][0] / rate_hz
         what = f"{len(dropped)} times ({held.mean():.1%} of its samples), first at {first_s:.4g} s"
         if lost.mean() > ACCELEROMETER_SHARE:
             raise UnfitError("channel", f"stands still {what}", "check what drops its samples out")
-        told.append(f"the channel stands still {what}: bridged; check what drops its samples out")
+        sentences.append(f"the channel stands still {what}: bridged; check what drops its samples out")
         x = _interpolated(x, ~held)
     long = [(first, last) for first, last in runs(np.flatnonzero(lost), 1) if last - first > BRIDGED]
     taper = round(GAP_TAPER_S * rate_hz)
@@ -152,7 +152,7 @@ def _bridged(x: Real, rate_hz: float) -> tuple[Real, list[Stretch], list[str], l
         if missing
         else []
     )
-    return x, long, notes, told
+    return x, long, notes, sentences
 
 
 def _interpolated(x: Real, good: NDArray[np.bool_]) -> Real:
@@ -216,17 +216,17 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
             values, whitened = clean.values, whitening(clean.values)
             spikes.update(clean.spikes)
             steps += clean.steps
-        values, told = _steadied(values, revolution)
-        wandered = wandered or told
-        found = merged(
+        values, sentences = _steadied(values, revolution)
+        wandered = wandered or sentences
+        events = merged(
             [
                 *find_transients(whitened, rate_hz, revolution),
                 *find_transients(_unit(values), rate_hz, revolution),
             ]
         )
-        if not found:
+        if not events:
             break
-        stretches = merged([*stretches, *found])
+        stretches = merged([*stretches, *events])
         lost = sum(last - first for first, last in stretches) / len(samples)
         if lost > MOST_BLANKED:
             _refuse_empty_band(samples, rate_hz, band_hz)
@@ -236,7 +236,7 @@ def repaired(samples: Real, rate_hz: float, revolution: int, band_hz: tuple[floa
                 "than the machine is otherwise",
                 "give a recording of steady running without knocks, and check cable and mounting",
             )
-        values = blanked(values, found, rate_hz)
+        values = blanked(values, events, rate_hz)
     if len(spikes) > MOST_SPIKES * len(samples):
         _refuse_empty_band(samples, rate_hz, band_hz)
         raise UnfitError(
@@ -283,11 +283,11 @@ def _steadied(samples: Real, revolution: int) -> tuple[Real, str]:
     middles = (np.arange(count) + 0.5) * revolution
     drift = np.interp(np.arange(len(samples)), middles, means)
     first, last = means[np.sort([means.argmin(), means.argmax()])]
-    told = (
+    sentences = (
         f"the channel's mean moves from {first:.4g} to {last:.4g}, slowly (it vibrates with {usual:.3g} "
         "r.m.s.): followed and subtracted; check the sensor's supply and temperature"
     )
-    return samples - drift, told
+    return samples - drift, sentences
 
 
 def _unit(samples: Real) -> Real:

@@ -101,7 +101,7 @@ def lacking(name: str, signal: Floats, effect: str = "") -> str:
 
 
 def level_bounds(
-    found: SignalLevels, lowest: float, highest: float, share: float
+    measured: SignalLevels, lowest: float, highest: float, share: float
 ) -> dict[str, tuple[float, float]]:
     """Between what the levels of a window surely lie; empty while so few samples are missing that they count.
 
@@ -111,7 +111,7 @@ def level_bounds(
     what was seen.
 
     Args:
-        found: levels of the samples that are there.
+        measured: levels of the samples that are there.
         lowest: the lowest of these.
         highest: the highest of these.
         share: of the window's samples, how many are missing.
@@ -120,8 +120,8 @@ def level_bounds(
         return {}
     off = share * (highest - lowest)
     return {
-        "mean": (found.mean - off, found.mean + off),
-        "rms": (found.rms * math.sqrt(1.0 - share), math.inf),
+        "mean": (measured.mean - off, measured.mean + off),
+        "rms": (measured.rms * math.sqrt(1.0 - share), math.inf),
         "peak": (0.5 * (highest - lowest), math.inf),
         "peak_to_peak": (highest - lowest, math.inf),
         "crest_factor": (0.0, math.inf),

@@ -143,13 +143,13 @@ def despiked(samples: Real, whitened: Real, whitening: Prewhitening, revolution:
     for _ in range(ROUNDS):
         events = loud_places(whitened, LEAST_DEVIATIONS, int(LOOKED_AT * whitening.half))
         shapes = shapes or _Shapes(whitening)
-        found = shapes.explain(whitened, events) or shapes.locate(
+        located = shapes.explain(whitened, events) or shapes.locate(
             whitened, _jumps(values, revolution, 2 * whitening.half)
         )
-        if not found:
+        if not located:
             break
         values = values.copy()
-        for place, height, step in found:
+        for place, height, step in located:
             if step:
                 values[place:] -= height
                 steps[place] = steps.get(place, 0.0) + height
@@ -239,7 +239,7 @@ class _Shapes:
         """The exact place of each jump whose height is known."""
         steps = slice(2 * SPIKE_REACH + 1, None)
         reach = len(self._window) // 2
-        found = []
+        events = []
         for jump, height in jumps:
             tries = np.arange(max(jump - reach, reach), min(jump + reach, len(whitened) - reach))
             if not len(tries):
@@ -248,8 +248,8 @@ class _Shapes:
             # The height is known: what is left is least where height * fit - height^2 * energy / 2 is most.
             gain = height * fit - 0.5 * height**2 * self._energy[steps]
             row, shape = np.unravel_index(int(np.argmax(gain)), gain.shape)
-            found.append((int(tries[row]) + self._places[steps][shape][0], height, True))
-        return found
+            events.append((int(tries[row]) + self._places[steps][shape][0], height, True))
+        return events
 
 
 LOUD_DEVIATIONS, LOUD_FACTOR = 15.0, 4.0

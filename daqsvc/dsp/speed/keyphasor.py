@@ -146,16 +146,16 @@ class EdgeFinder:
         word = (signal >= self._threshold).astype(np.int8) - (signal < self._rearm).astype(np.int8)
         spoken = np.flatnonzero(word)
         previous = np.concatenate(([-1 if self._armed else 1], word[spoken]))
-        found = []
+        edges = []
         for sample in spoken[(previous[1:] > 0) & (previous[:-1] < 0)].tolist():
             low, high = float(before[sample]), float(signal[sample])
             # Without the sample before it the edge could lie anywhere in the gap: it marks nothing.
             if low < self._threshold:
-                found.append((sample, max(-(high - self._threshold) / (high - low), _ABOVE_MINUS_ONE)))
+                edges.append((sample, max(-(high - self._threshold) / (high - low), _ABOVE_MINUS_ONE)))
         if len(signal):
             self._armed = bool(previous[-1] < 0)
             self._last = float(signal[-1])
-        return found
+        return edges
 
 
 class EdgeLine:

@@ -131,8 +131,8 @@ class _Spectrum:
         below = np.minimum(place.astype(np.int64), len(self.power) - 2)
         share = (place - below)[:, np.newaxis]
         power = (1.0 - share) * self.power[below] + share * self.power[below + 1]
-        found: Floats = (power / noise).sum(axis=1)
-        return found
+        nats: Floats = (power / noise).sum(axis=1)
+        return nats
 
 
 def _refuse_other_speed(spectrum: _Spectrum, nominal_hz: float) -> None:
@@ -150,12 +150,12 @@ def _refuse_other_speed(spectrum: _Spectrum, nominal_hz: float) -> None:
     line = int(np.flatnonzero(other)[np.argmax(velocity[other])])
     if velocity[line] < _OTHER_POWER * velocity[at_orders].max():
         return
-    found = float(hz[line])
+    line_hz = float(hz[line])
     for order in ORDERS:
-        near = order * found + np.linspace(-1.0, 1.0, 33) * spectrum.resolution_hz
-        if spectrum.nats(near, order * found).max() < spectrum.line_nats:
+        near = order * line_hz + np.linspace(-1.0, 1.0, 33) * spectrum.resolution_hz
+        if spectrum.nats(near, order * line_hz).max() < spectrum.line_nats:
             return
-    raise _other_speed(found, nominal_hz)
+    raise _other_speed(line_hz, nominal_hz)
 
 
 def _refuse_next_speed(spectrum: _Spectrum, nominal_hz: float) -> None:

@@ -112,22 +112,22 @@ class Discovery:
                 message counts as none.
         """
         try:
-            told = json.loads(earlier)
+            payload = json.loads(earlier)
         except (ValueError, RecursionError):
             return {}
-        entities = told.get("components") if isinstance(told, dict) else None
+        entities = payload.get("components") if isinstance(payload, dict) else None
         if not isinstance(entities, dict):
             return {}
         now = self._components()
-        found: dict[str, dict[str, str]] = {}
+        removals: dict[str, dict[str, str]] = {}
         for name, entity in entities.items():
             platform = entity.get("platform") if isinstance(entity, dict) else None
             # Whoever may write there may have retained anything: only what a box can have said is repeated.
             if name in now or not (isinstance(platform, str) and _PLATFORM.fullmatch(platform)):
                 continue
-            if _ENTITY.fullmatch(name) and len(found) < MOST_REMOVED:
-                found[name] = {"platform": platform}
-        return found
+            if _ENTITY.fullmatch(name) and len(removals) < MOST_REMOVED:
+                removals[name] = {"platform": platform}
+        return removals
 
     @property
     def _id(self) -> str:
@@ -181,7 +181,7 @@ class Discovery:
             "options": [level.label for level in Level],
             "state_topic": self.topics.summary(self.watched.machine),
             # The level of an alarm that is covered, or that nobody can judge, is not "normal" but unknown.
-            "value_template": _pick("alarms", alarm, "level", given="problem"),
+            "value_template": _pick("alarms", alarm, "level", default="problem"),
         }
 
     def _state(self, alarm: str) -> dict[str, Any]:
@@ -239,7 +239,7 @@ class Discovery:
 
 def _safe_id(name: str) -> str:
     """The name in the letters, digits, "_" and "-" that Home Assistant allows in ids; no two become one."""
-    return re.sub(r"[^A-Za-z0-9-]", lambda found: f"_{ord(found[0]):02x}", name)
+    return re.sub(r"[^A-Za-z0-9-]", lambda match: f"_{ord(match[0]):02x}", name)
 
 
 def _in_home_assistant(unit: str) -> Mapping[str, str]:
@@ -250,17 +250,17 @@ def _in_home_assistant(unit: str) -> Mapping[str, str]:
     return {**named, "device_class": _CLASSES[unit]} if unit in _CLASSES else named
 
 
-def _pick(*keys: str, as_json: bool = False, given: str = "") -> str:
+def _pick(*keys: str, as_json: bool = False, default: str = "") -> str:
     """A template for one key below others; ``None`` where there is none, which is shown as unknown.
 
     Args:
         keys: the way to it.
         as_json: pick what is a group of keys itself.
-        given: a key beside it without which there is nothing to show.
+        default: a key beside it without which there is nothing to show.
     """
     *above, last = keys
     group = "value_json" + "".join(f"[{_quoted(key)}]" for key in above)
-    condition = f" if {group}.get({_quoted(given)}) else None" if given else ""
+    condition = f" if {group}.get({_quoted(default)}) else None" if default else ""
     return f"{{{{ {group}.get({_quoted(last)}){' | tojson' if as_json else ''}{condition} }}}}"
 
 

@@ -115,8 +115,8 @@ class LeftOver(MqttLink):
     def _read(self) -> frozenset[str]:
         try:
             with self._path.open("rb") as file:
-                told = json.loads(file.read(_MOST_BYTES))
-            return frozenset(topic for topic in told["topics"] if isinstance(topic, str) and topic)
+                note = json.loads(file.read(_MOST_BYTES))
+            return frozenset(topic for topic in note["topics"] if isinstance(topic, str) and topic)
         except FileNotFoundError:
             return frozenset()
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:

@@ -178,9 +178,9 @@ class HomeAssistantLink(MqttLink):
         await connection.unsubscribe(self._discovery.topic)
         removals = self._discovery.removals(earlier)
         if removals:
-            told = self._discovery.payload()
-            told["components"] |= removals
-            await connection.deliver(self._discovery.topic, _json(told), retain=True)
+            payload = self._discovery.payload()
+            payload["components"] |= removals
+            await connection.deliver(self._discovery.topic, _json(payload), retain=True)
 
     async def _tell(self, connection: Connection) -> None:
         self._readings.forget()
@@ -194,5 +194,5 @@ class HomeAssistantLink(MqttLink):
         await connection.deliver(self._topics.summary(self._machine), summary, retain=True)
 
 
-def _json(told: object) -> bytes:
-    return json.dumps(told, ensure_ascii=False).encode()
+def _json(value: object) -> bytes:
+    return json.dumps(value, ensure_ascii=False).encode()

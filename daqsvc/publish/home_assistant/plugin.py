@@ -21,14 +21,14 @@ class HomeAssistantPlugin(MqttLinkPlugin[HomeAssistant]):
     about = "discovery by Home Assistant"
     place = 2
 
-    def describe(self, machine: MachineFile, given: HomeAssistant) -> str:
+    def describe(self, machine: MachineFile, settings: HomeAssistant) -> str:
         """See `OutputTable.describe`."""
         del machine
-        return f"tells Home Assistant below {given.prefix}/" if given.enabled else ""
+        return f"tells Home Assistant below {settings.prefix}/" if settings.enabled else ""
 
-    def link(self, given: HomeAssistant | None, mqtt: Mqtt, port: OutputPort) -> MqttLink:
+    def link(self, settings: HomeAssistant | None, mqtt: Mqtt, port: OutputPort) -> MqttLink:
         """See `MqttLinkPlugin.link`."""
         from daqsvc.publish.home_assistant.left_over import LeftOver  # noqa: PLC0415 - brings paho
         from daqsvc.publish.home_assistant.link import HomeAssistantLink  # noqa: PLC0415 - likewise
 
-        return LeftOver(port.store) if given is None else HomeAssistantLink(given, mqtt.commands, port)
+        return LeftOver(port.store) if settings is None else HomeAssistantLink(settings, mqtt.commands, port)

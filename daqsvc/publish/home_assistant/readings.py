@@ -125,13 +125,15 @@ class Readings:
         return any(self._moved(shown, reading, now) for reading in shown.readings)
 
     def _moved(self, shown: _Shown, reading: Reading, now: Mapping[tuple[str, str], float | None]) -> bool:
-        value, told = now[reading.kind, reading.key], shown.told[reading.kind, reading.key]
-        if value is None or told is None:
-            return value is not told
+        value, shown_value = now[reading.kind, reading.key], shown.told[reading.kind, reading.key]
+        if value is None or shown_value is None:
+            return value is not shown_value
         if reading.kind == "probabilities":
-            return abs(value - told) > PROBABILITY_STEP
+            return abs(value - shown_value) > PROBABILITY_STEP
         coarse = 2.0 * 10.0 ** -digits_of(reading.unit)
-        return abs(value - told) > max(self._settings.deadband_percent / 100.0 * abs(told), coarse)
+        return abs(value - shown_value) > max(
+            self._settings.deadband_percent / 100.0 * abs(shown_value), coarse
+        )
 
     def _tell(self, shown: _Shown) -> bytes:
         assert shown.latest is not None  # noqa: S101 - asked for by `due` only where there is one
@@ -161,8 +163,10 @@ def _finding(shown: _Shown) -> str | None:
     diagnosis = shown.latest
     if not shown.finds or diagnosis is None or diagnosis.quality != "good":
         return None
-    found = " or ".join(diagnosis.group) if len(diagnosis.group) > 1 else diagnosis.decision
-    return f"{found} at {diagnosis.where}" if diagnosis.where and diagnosis.severity != "normal" else found
+    finding = " or ".join(diagnosis.group) if len(diagnosis.group) > 1 else diagnosis.decision
+    return (
+        f"{finding} at {diagnosis.where}" if diagnosis.where and diagnosis.severity != "normal" else finding
+    )
 
 
 def _figures(shown: _Shown) -> dict[tuple[str, str], float | None]:

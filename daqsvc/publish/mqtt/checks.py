@@ -36,10 +36,10 @@ def _credential_files(draft: MachineFile, mqtt: Mqtt) -> Iterator[Finding]:
     A file that is missing, or that this user must not read, may be there when the service runs.
     """
     for key in FILES:
-        given: Path | None = getattr(mqtt, key)
-        if given is None:
+        credential: Path | None = getattr(mqtt, key)
+        if credential is None:
             continue
-        path = draft.resolve(given)
+        path = draft.resolve(credential)
         try:
             mode = path.stat().st_mode
         except OSError:
@@ -109,17 +109,17 @@ def _credentials(mqtt: Mqtt) -> Iterator[Finding]:
             yield Finding(
                 ("mqtt", key), "is a key without a certificate", "add cert_file to [mqtt], or remove it"
             )
-    given = [key for key in ("password_file", "password_credential") if getattr(mqtt, key) is not None]
-    if not given:
+    keys = [key for key in ("password_file", "password_credential") if getattr(mqtt, key) is not None]
+    if not keys:
         return
     host = mqtt.host  # not usable if the user stands in the url: that has been said, with what to do
     if mqtt.username is None:
         yield Finding(
-            ("mqtt", given[0]), "is a password without a user", "add username to [mqtt], or remove it"
+            ("mqtt", keys[0]), "is a password without a user", "add username to [mqtt], or remove it"
         )
     if not mqtt.tls and not _is_this_host(host):
         yield Finding(
-            ("mqtt", given[0]),
+            ("mqtt", keys[0]),
             f"the password would go to {host} unencrypted",
             "write mqtts:// in the url",
             fatal=False,

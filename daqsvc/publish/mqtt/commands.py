@@ -171,11 +171,11 @@ class CommandIntake:
         Returns:
             The answer; None if the message is no command to this box, or the answer to one.
         """
-        told = self._topics.command_of(message.topic)
-        if told is None or told.is_answer:
+        machine = self._topics.command_of(message.topic)
+        if machine is None or machine.is_answer:
             return None
         try:
-            command = await self._command(told, message)
+            command = await self._command(machine, message)
         except CommandRefusedError as refusal:
             self._log(message.topic, refusal)
             outcome = CommandOutcome(accepted=False, reason=str(refusal))
@@ -188,8 +188,8 @@ class CommandIntake:
         response = ResponsePayload(
             **stamp_now(self._topics.site, self._topics.box, self._clock),
             id=_id_of(message.payload[: self._settings.max_bytes]),
-            machine=told.machine[:_SHOWN_TOPIC],
-            verb=told.verb[:_SHOWN_TOPIC],
+            machine=machine.machine[:_SHOWN_TOPIC],
+            verb=machine.verb[:_SHOWN_TOPIC],
             accepted=outcome.accepted,
             reason=outcome.reason,
             events=outcome.events,
@@ -231,16 +231,16 @@ class CommandIntake:
                 f"{verb!r} is not allowed over MQTT; allowed: {allowed}. Add it to mqtt.commands.allow in "
                 "the machine file, or do it at the box"
             )
-        told = self._read(message.payload)
+        request = self._read(message.payload)
         if message.retain:
             self.counters.stale += 1
             raise CommandRefusedError(
                 "it is retained at the broker and would come again with every connection; send it without "
                 "retain"
             )
-        self._check_age(told)
-        await self._check_new(machine, told)
-        return told.command(Verb(verb))
+        self._check_age(request)
+        await self._check_new(machine, request)
+        return request.command(Verb(verb))
 
     def _read(self, asked: bytes) -> CommandPayload:
         if len(asked) > self._settings.max_bytes:
@@ -253,18 +253,18 @@ class CommandIntake:
         except ValidationError as error:
             self.counters.malformed += 1
             # The names of unknown keys are the sender's: nothing of them may write a line into a log.
-            found = "; ".join(faults_of(error, "payload")[:5])
-            shown = re.sub(r"[^ -~]", "?", found)[:_SHOWN_FAULTS]
+            faults = "; ".join(faults_of(error, "payload")[:5])
+            shown = re.sub(r"[^ -~]", "?", faults)[:_SHOWN_FAULTS]
             raise CommandRefusedError(f"it is no command of schema daqsvc.command/1: {shown}") from error
         except ValueError as error:
             self.counters.malformed += 1
             raise CommandRefusedError(f"{error}") from error
 
-    def _check_age(self, told: CommandPayload) -> None:
+    def _check_age(self, message: CommandPayload) -> None:
         now_ns = self._clock.wall_ns()
-        age_s = now_ns / NS_PER_S - told.issued_at.timestamp()
+        age_s = now_ns / NS_PER_S - message.issued_at.timestamp()
         limit_s = self._settings.max_age_s
-        oldest_s = min(told.expires_s or limit_s, limit_s)
+        oldest_s = min(message.expires_s or limit_s, limit_s)
         if -limit_s <= age_s <= oldest_s:
             return
         self.counters.stale += 1
@@ -275,20 +275,20 @@ class CommandIntake:
             "send it again, or set the clocks"
         )
 
-    async def _check_new(self, machine: str, told: CommandPayload) -> None:
+    async def _check_new(self, machine: str, message: CommandPayload) -> None:
         """Write down that this command has come; before it is obeyed, for afterwards may be too late."""
-        if self._ids.is_from_before(round(told.issued_at.timestamp() * NS_PER_S)):
+        if self._ids.is_from_before(round(message.issued_at.timestamp() * NS_PER_S)):
             self.counters.stale += 1
             raise CommandRefusedError(
                 "it was issued before the service started, and the list of commands that had come by then is "
                 "lost, so it might be obeyed twice: look at the alarm, and ask again with a new id"
             )
-        too_old_s = told.issued_at.timestamp() + self._settings.max_age_s
+        too_old_s = message.issued_at.timestamp() + self._settings.max_age_s
         try:
             known = await asyncio.to_thread(
                 self._ids.remember,
                 machine,
-                told.id,
+                message.id,
                 until_ns=round(too_old_s * NS_PER_S),
                 now_ns=self._clock.wall_ns(),
             )
@@ -301,7 +301,7 @@ class CommandIntake:
         if known == "known":
             self.counters.stale += 1
             raise CommandRefusedError(
-                f"a command with id {told.id!r} has come before; give every command its own id"
+                f"a command with id {message.id!r} has come before; give every command its own id"
             )
         if known == "full":
             self.counters.stale += 1
@@ -332,10 +332,10 @@ def _remedy(error: OSError) -> str:
 def _id_of(asked: bytes) -> str | None:
     """The id of a command that may be malformed, so that its sender knows which one was refused."""
     try:
-        told = json.loads(asked)
+        message = json.loads(asked)
     except (ValueError, RecursionError):
         return None
-    identifier = told.get("id") if isinstance(told, dict) else None
+    identifier = message.get("id") if isinstance(message, dict) else None
     if not isinstance(identifier, str):
         return None
     # JSON can say what no UTF-8 can: halves of surrogate pairs.

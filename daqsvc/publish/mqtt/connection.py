@@ -209,7 +209,9 @@ class Connection:
             self._client.username_pw_set(username, password)
         if will is not None:
             self._client.will_set(will.topic, will.payload, will.qos, will.retain)
-        self._client.on_connect = lambda _client, _data, _flags, code, told: self._answered(code, told)
+        self._client.on_connect = lambda _client, _data, _flags, code, properties: self._answered(
+            code, properties
+        )
         self._client.on_disconnect = lambda _client, _data, _flags, code, _told: self._disconnected(code)
         self._client.on_message = lambda _client, _data, message: self._arrived(message)
         self._client.on_publish = lambda _client, _data, mid, code, _told: self._acknowledged(mid, code)
@@ -442,11 +444,13 @@ class Connection:
 
     def _reach(self, reached: asyncio.Future[Exception | None]) -> None:
         """The blocking part, on a thread of its own."""
-        told = _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
+        properties = (
+            _properties(PacketTypes.CONNECT, MaximumPacketSize=LARGEST_PACKET) if self.is_mqtt5 else None
+        )
         # Said unless something else is known: whatever ends the thread, nobody waits for it in vain.
         error: Exception | None = OSError("the thread that connects was lost")
         try:
-            self._client.connect(*self._address, properties=told)
+            self._client.connect(*self._address, properties=properties)
             error = None
         except OSError as failure:  # before ValueError, which unverified certificates are, too
             error = failure
@@ -579,12 +583,12 @@ class Connection:
             self._finish(MqttError(f"what the broker sent makes no sense ({type(error).__name__}: {error})"))
             self._shut()
 
-    def _answered(self, code: ReasonCode, told: Properties | None) -> None:
+    def _answered(self, code: ReasonCode, properties: Properties | None) -> None:
         if self._consent.done():
             return
         # paho does not keep to the broker's limits, and the broker ends a connection that exceeds them.
-        self._largest_packet = getattr(told, "MaximumPacketSize", None)
-        self._most_in_flight = max(getattr(told, "ReceiveMaximum", RECEIVE_MAXIMUM), 1)
+        self._largest_packet = getattr(properties, "MaximumPacketSize", None)
+        self._most_in_flight = max(getattr(properties, "ReceiveMaximum", RECEIVE_MAXIMUM), 1)
         if self._most_in_flight < self._in_flight:
             self._in_flight = self._most_in_flight
             self._window = asyncio.Semaphore(self._in_flight)
@@ -601,9 +605,9 @@ class Connection:
         if not topic or not self._consent.done():
             self._on_ignored()
             return
-        told = message.properties
-        answer = getattr(told, "ResponseTopic", None)
-        correlation = getattr(told, "CorrelationData", None)
+        properties = message.properties
+        answer = getattr(properties, "ResponseTopic", None)
+        correlation = getattr(properties, "CorrelationData", None)
         try:
             self._queue.put_nowait(
                 Incoming(
@@ -655,12 +659,12 @@ class Connection:
         """What MQTT 5 can say about a message."""
         if not self.is_mqtt5 or (expiry_s is None and correlation is None):
             return None
-        told: dict[str, Any] = {}
+        statements: dict[str, Any] = {}
         if expiry_s is not None:
-            told["MessageExpiryInterval"] = max(math.ceil(expiry_s), 1)
+            statements["MessageExpiryInterval"] = max(math.ceil(expiry_s), 1)
         if correlation is not None:
-            told["CorrelationData"] = correlation
-        return _properties(PacketTypes.PUBLISH, **told)
+            statements["CorrelationData"] = correlation
+        return _properties(PacketTypes.PUBLISH, **statements)
 
     def _finish(self, error: Exception | None) -> None:
         """The connection has ended: nothing that is under way will be acknowledged any more."""

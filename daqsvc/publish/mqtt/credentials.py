@@ -242,13 +242,13 @@ def _is_exposed(path: Path) -> bool:
 
 def _secrets(settings: Mqtt) -> list[Path]:
     """The files of password and key, as far as there are any."""
-    found = []
+    secrets = []
     for wanted in (_password_file, _key_file) if settings.tls else (_password_file,):
         with contextlib.suppress(FileNotFoundError):  # said when it is read
             path = wanted(settings)
             if path is not None:
-                found.append(path)
-    return found
+                secrets.append(path)
+    return secrets
 
 
 def _password_file(settings: Mqtt) -> Path | None:

@@ -103,7 +103,7 @@ class Outage:
             until: what is going on about it.
         """
         reason = in_words(error)
-        still = "still " if any(told == broker for told, _ in self._told) else ""
+        still = "still " if any(sentence == broker for sentence, _ in self._told) else ""
         if self.note(broker, reason):
             self._log.warning("%s is %saway: %s; %s", broker, still, reason, until)
 
@@ -152,12 +152,12 @@ def in_words(error: Exception | None) -> str:
 
 
 def _unverified(error: ssl.SSLCertVerificationError) -> str:
-    found = error.verify_message.rstrip(".")
+    problem = error.verify_message.rstrip(".")
     if error.verify_code in _OTHER_HOST:
-        return f"its certificate is for another host: {found}"
+        return f"its certificate is for another host: {problem}"
     if error.verify_code in _UNKNOWN_AUTHORITY:
-        return f"nobody in ca_file vouches for its certificate: {found}"
-    return _VERIFICATION.get(error.verify_code, f"its certificate is refused: {found}")
+        return f"nobody in ca_file vouches for its certificate: {problem}"
+    return _VERIFICATION.get(error.verify_code, f"its certificate is refused: {problem}")
 
 
 def _coded(error: MqttCodeError) -> str:
@@ -197,11 +197,11 @@ class Faults:
 async def unless(stopping: asyncio.Event, work: Coroutine[Any, Any, _T]) -> _T | None:
     """The result of ``work``; None, and ``work`` cancelled, if ``stopping`` is set before."""
     task = asyncio.ensure_future(work)
-    told = asyncio.ensure_future(stopping.wait())
+    stopped = asyncio.ensure_future(stopping.wait())
     try:
-        await asyncio.wait({task, told}, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)
         return task.result() if task.done() else None
     finally:
-        for each in (task, told):
+        for each in (task, stopped):
             each.cancel()
-        await asyncio.gather(task, told, return_exceptions=True)
+        await asyncio.gather(task, stopped, return_exceptions=True)

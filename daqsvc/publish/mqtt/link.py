@@ -56,16 +56,16 @@ class MqttLinkPlugin(OutputPlugin[SettingsT]):
     """An output whose table stands below ``[mqtt]`` and that speaks over that connection."""
 
     @may_raise(AssemblyError)
-    def link(self, given: SettingsT | None, mqtt: Mqtt, port: OutputPort) -> MqttLink | None:
+    def link(self, settings: SettingsT | None, mqtt: Mqtt, port: OutputPort) -> MqttLink | None:
         """What speaks; None for nothing.
 
         Args:
-            given: the table; None if the machine file has none, for what an earlier run has left.
+            settings: the table; None if the machine file has none, for what an earlier run has left.
             mqtt: the connection.
             port: what outputs work with.
         """
         raise NotImplementedError
 
-    def build(self, machine: MachineFile, given: SettingsT, port: OutputPort) -> None:
+    def build(self, machine: MachineFile, settings: SettingsT, port: OutputPort) -> None:
         """See `OutputPlugin.build`: the broker's output takes it with it."""
-        del machine, given, port
+        del machine, settings, port

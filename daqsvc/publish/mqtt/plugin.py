@@ -35,26 +35,30 @@ class MqttPlugin(OutputPlugin[Mqtt]):
     status_key = "mqtt"
     outdated = MappingProxyType({REFUSED: "there is no broker any more", CERTIFICATE: UNUSED})
 
-    def checks(self, draft: MachineFile, given: Mqtt) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: Mqtt) -> Iterator[Iterator[Finding]]:
         """See `OutputTable.checks`."""
-        return checks(draft, given)
+        return checks(draft, settings)
 
-    def describe(self, machine: MachineFile, given: Mqtt) -> str:
+    def describe(self, machine: MachineFile, settings: Mqtt) -> str:
         """See `OutputTable.describe`."""
-        return "; ".join(_described(machine, given))
+        return "; ".join(_described(machine, settings))
 
-    def conditions(self, given: Mqtt) -> Iterator[str]:
+    def conditions(self, settings: Mqtt) -> Iterator[str]:
         """See `OutputPlugin.conditions`."""
         yield REFUSED
-        if given.tls:
-            files = {BROKER: True, "ca": given.ca_file is not None, "client": given.cert_file is not None}
+        if settings.tls:
+            files = {
+                BROKER: True,
+                "ca": settings.ca_file is not None,
+                "client": settings.cert_file is not None,
+            }
             yield from (f"{CERTIFICATE}{name}" for name, is_looked_at in files.items() if is_looked_at)
 
-    def build(self, machine: MachineFile, given: Mqtt, port: OutputPort) -> Output:
+    def build(self, machine: MachineFile, settings: Mqtt, port: OutputPort) -> Output:
         """See `OutputPlugin.build`."""
         from daqsvc.publish.mqtt.publisher import MqttPublisher  # noqa: PLC0415 - paho and cryptography
 
-        mqtt = given.on(machine)
+        mqtt = settings.on(machine)
         links = []
         for path, plugin in output_tables().items():
             if isinstance(plugin, MqttLinkPlugin):

@@ -168,7 +168,7 @@ class MqttPublisher(Output):
         payload = status_payload(self.topics.site, self.topics.box, figures, self._clock)
         self.telemetry("status", payload.to_json())
 
-    def conditions(self, told: frozenset[str]) -> Iterator[Condition]:
+    def conditions(self, raised: frozenset[str]) -> Iterator[Condition]:
         """See `Output.conditions`."""
         return self._check.look(
             BrokerVitals(
@@ -178,17 +178,17 @@ class MqttPublisher(Output):
                 connected=self.counters.connected,
                 refused=self.refused,
                 is_refused_known=self.is_refused_known,
-                told=told,
+                told=raised,
             )
         )
 
     @property
     def refused(self) -> Mapping[str, str]:
         """By topic, why the broker will not take messages that must not be lost, or any at all."""
-        found = dict(self._outbox.dead_letters.reasons)
+        reasons = dict(self._outbox.dead_letters.reasons)
         if self._not_available:
-            found[self.topics.availability] = self._not_available
-        return self._suspects.barred(time.monotonic()) | found
+            reasons[self.topics.availability] = self._not_available
+        return self._suspects.barred(time.monotonic()) | reasons
 
     @property
     def is_refused_known(self) -> bool:

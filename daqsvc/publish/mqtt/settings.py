@@ -181,8 +181,8 @@ class Mqtt(Section):
     def on(self, machine: MachineFile) -> Mqtt:
         """The same, with the client id of the box and with absolute paths."""
         paths = {key: getattr(self, key) for key in FILES}
-        found = {key: machine.resolve(path) for key, path in paths.items() if path is not None}
-        return self.model_copy(update={"client_id": self.client_id_of(machine), **found})
+        resolved = {key: machine.resolve(path) for key, path in paths.items() if path is not None}
+        return self.model_copy(update={"client_id": self.client_id_of(machine), **resolved})
 
 
 def first_line(file: Path) -> bytes:

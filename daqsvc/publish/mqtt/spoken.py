@@ -64,9 +64,9 @@ class Spoken:
         self._read = True
         try:
             with self._path.open("rb") as file:
-                told = json.loads(file.read(_MOST_BYTES))
-            age_ns = self._wall_ns() - int(told["wall_ns"])
-            if told["broker"] == self._broker and told["version"] == "3.1.1" and 0 <= age_ns < REMEMBERED_NS:
+                note = json.loads(file.read(_MOST_BYTES))
+            age_ns = self._wall_ns() - int(note["wall_ns"])
+            if note["broker"] == self._broker and note["version"] == "3.1.1" and 0 <= age_ns < REMEMBERED_NS:
                 self.mqtt5, self._known = False, True
         except FileNotFoundError:
             return
@@ -92,9 +92,9 @@ class Spoken:
             with contextlib.suppress(OSError):  # it would only cost time at the next start
                 self._path.unlink(missing_ok=True)
             return
-        told = {"broker": self._broker, "version": "3.1.1", "wall_ns": self._wall_ns()}
+        note = {"broker": self._broker, "version": "3.1.1", "wall_ns": self._wall_ns()}
         try:
-            replace_durably(self._path, json.dumps(told).encode())
+            replace_durably(self._path, json.dumps(note).encode())
         except OSError as error:
             log.info(
                 "%s cannot be written: %s; the version is found out anew after a restart", self._path, error

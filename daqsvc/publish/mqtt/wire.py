@@ -251,9 +251,9 @@ class WireContext:
 
 def _encoded(length: int) -> bytes:
     """A remaining length (MQTT 5, section 1.5.5)."""
-    found = bytearray()
+    encoded = bytearray()
     while True:
         length, digit = length >> 7, length & 0x7F
-        found.append(digit | (0x80 if length else 0))
+        encoded.append(digit | (0x80 if length else 0))
         if not length:
-            return bytes(found)
+            return bytes(encoded)

@@ -117,10 +117,10 @@ class AlarmCommands:
         answer = await self._intake.take(command)
         if answer is None:
             return False
-        told = json.loads(answer.payload)
-        if not told["accepted"]:
-            log.info("%s of %s by Sparkplug is refused: %s", wish.verb, wish.alarm[:200], told["reason"])
-        return bool(told["accepted"])
+        answered = json.loads(answer.payload)
+        if not answered["accepted"]:
+            log.info("%s of %s by Sparkplug is refused: %s", wish.verb, wish.alarm[:200], answered["reason"])
+        return bool(answered["accepted"])
 
     async def _execute(self, command: AlarmCommand, source: str) -> CommandOutcome:  # noqa: ARG002  it came another way
         return await self._handler(command, f"sparkplug {self._topic}")

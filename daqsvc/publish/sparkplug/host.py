@@ -51,8 +51,8 @@ class PrimaryHost:
         if topic != self.topics[0]:
             return self._take_word(payload)
         try:
-            told = json.loads(payload)
-            online, sent_ms = told["online"], told["timestamp"]
+            state = json.loads(payload)
+            online, sent_ms = state["online"], state["timestamp"]
         except (ValueError, KeyError, TypeError, RecursionError):
             raise PayloadError(f"STATE of {self.host_id}: no JSON with online and timestamp") from None
         if not isinstance(online, bool) or isinstance(sent_ms, bool) or not isinstance(sent_ms, int):

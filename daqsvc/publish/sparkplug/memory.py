@@ -75,8 +75,8 @@ class Memory:
 
 
 def _understood(raw: bytes) -> tuple[int, int | None]:
-    told = json.loads(raw)
-    bd_seq, cursor = told["bd_seq"], told["cursor"]
+    numbers = json.loads(raw)
+    bd_seq, cursor = numbers["bd_seq"], numbers["cursor"]
     if not (isinstance(bd_seq, int) and 0 <= bd_seq < NUMBERS and isinstance(cursor, int | None)):
         raise ValueError(f"bd_seq {bd_seq!r} and cursor {cursor!r}")
     return bd_seq, cursor

@@ -55,9 +55,10 @@ class Board:
 
 def node_properties(version: str, site: str, box: str) -> list[Metric]:
     """What a host should know about the box."""
-    told = {"Software": f"daqsvc {version}", "Site": site, "Box": box}
+    properties = {"Software": f"daqsvc {version}", "Site": site, "Box": box}
     return [
-        Metric(name=f"Properties/{name}", datatype=DataType.STRING, value=text) for name, text in told.items()
+        Metric(name=f"Properties/{name}", datatype=DataType.STRING, value=text)
+        for name, text in properties.items()
     ]
 
 
@@ -67,11 +68,11 @@ def alarm_metrics(payload: bytes) -> list[Metric]:
     Raises:
         ValueError: it is no alarm payload.
     """
-    told = AlarmPayload.model_validate_json(payload)
-    state, level = AlarmState(told.state), Level.of(told.level)
-    own = AlarmState(told.covered) if told.covered is not None else state
-    words = (told.message, told.occurrence, told.id)
-    return _alarm(f"{told.machine}/{told.alarm}", (state, own), level, words, told.wall_ns // NS_PER_MS)
+    alarm = AlarmPayload.model_validate_json(payload)
+    state, level = AlarmState(alarm.state), Level.of(alarm.level)
+    own = AlarmState(alarm.covered) if alarm.covered is not None else state
+    words = (alarm.message, alarm.occurrence, alarm.id)
+    return _alarm(f"{alarm.machine}/{alarm.alarm}", (state, own), level, words, alarm.wall_ns // NS_PER_MS)
 
 
 def quiet_alarm(machine: str, alarm: str) -> list[Metric]:

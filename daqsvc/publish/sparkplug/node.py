@@ -56,8 +56,8 @@ class EdgeNode:
     """
 
     def __init__(self, group: str, name: str) -> None:
-        for what, given in (("group", group), ("edge node", name)):
-            _check(what, given)
+        for what, word in (("group", group), ("edge node", name)):
+            _check(what, word)
         self._group = group
         self._name = name
         self._seq = 0
@@ -170,8 +170,8 @@ class EdgeNode:
         Raises:
             PayloadError: it is no payload, or an alias stands for no metric.
         """
-        told = decode(payload)
-        return replace(told, metrics=tuple(self._by_name(device, metric) for metric in told.metrics))
+        metrics = decode(payload)
+        return replace(metrics, metrics=tuple(self._by_name(device, metric) for metric in metrics.metrics))
 
     def wants_rebirth(self, asked: Sequence[Metric]) -> bool:
         """Whether metrics of the node that a host has written ask for new births.

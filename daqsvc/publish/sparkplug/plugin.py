@@ -24,39 +24,39 @@ class SparkplugPlugin(OutputPlugin[Sparkplug]):
     place = 3
     status_key = "sparkplug"
 
-    def checks(self, draft: MachineFile, given: Sparkplug) -> Iterator[Iterator[Finding]]:
+    def checks(self, draft: MachineFile, settings: Sparkplug) -> Iterator[Iterator[Finding]]:
         """See `OutputTable.checks`."""
-        yield _beside_mqtt(draft, given)
+        yield _beside_mqtt(draft, settings)
 
-    def describe(self, machine: MachineFile, given: Sparkplug) -> str:
+    def describe(self, machine: MachineFile, settings: Sparkplug) -> str:
         """See `OutputTable.describe`."""
-        group, node = given.group or machine.site, given.edge_node or machine.box
-        host = given.primary_host
+        group, node = settings.group or machine.site, settings.edge_node or machine.box
+        host = settings.primary_host
         return f"Sparkplug B edge node {group}/{node}{f', waits for host {host}' if host is not None else ''}"
 
-    def build(self, machine: MachineFile, given: Sparkplug, port: OutputPort) -> Output:
+    def build(self, machine: MachineFile, settings: Sparkplug, port: OutputPort) -> Output:
         """See `OutputPlugin.build`."""
         from daqsvc.publish.sparkplug.edge import SparkplugEdge  # noqa: PLC0415 - paho and protobuf
 
         mqtt = machine.output(Mqtt)
         assert mqtt is not None  # noqa: S101 - its table is below that one
-        return SparkplugEdge(given, mqtt.on(machine), port)
+        return SparkplugEdge(settings, mqtt.on(machine), port)
 
 
-def _beside_mqtt(draft: MachineFile, given: Sparkplug) -> Iterator[Finding]:
+def _beside_mqtt(draft: MachineFile, settings: Sparkplug) -> Iterator[Finding]:
     mqtt = draft.output(Mqtt)
     if mqtt is None:
         return
-    for number, server in enumerate(given.servers):
+    for number, server in enumerate(settings.servers):
         if is_tls(server) != mqtt.tls:
             yield Finding(
                 ("mqtt", "sparkplug", "servers", number),
                 "has other encryption than mqtt.url, whose credentials it would get",
                 f"write {'mqtts' if mqtt.tls else 'mqtt'}:// in both",
             )
-    if given.client_id is not None and given.client_id == mqtt.client_id_of(draft):
+    if settings.client_id is not None and settings.client_id == mqtt.client_id_of(draft):
         yield Finding(
             ("mqtt", "sparkplug", "client_id"),
-            f'is "{given.client_id}" like that of [mqtt]: a broker ends one connection for the other',
+            f'is "{settings.client_id}" like that of [mqtt]: a broker ends one connection for the other',
             "remove it, or write another",
         )

@@ -267,10 +267,10 @@ class EdgeSession:
         closed = [topic for topic in self._ungranted if topic in wanted]
         there = ", ".join(repr(name) for name in sorted(others))
         barred = f" (the broker lets this client not listen to {' and '.join(closed)})" if closed else ""
-        found = f"hosts at this broker are {there}" if there else "there is no other host at this broker"
+        hosts = f"hosts at this broker are {there}" if there else "there is no other host at this broker"
         self._reports.missing(
             f"Sparkplug tells nothing yet: primary host {self._host.host_id} {word} on "
-            f"{' or '.join(wanted)}{barred}; {found}. Correct primary_host in [mqtt.sparkplug], or have that "
+            f"{' or '.join(wanted)}{barred}; {hosts}. Correct primary_host in [mqtt.sparkplug], or have that "
             "host connect to this broker"
         )
 
@@ -434,21 +434,23 @@ class EdgeSession:
         Raises:
             PayloadError: it cannot be read, or asks for too much at a time.
         """
-        told = self._node.command(device, payload)
+        commands = self._node.command(device, payload)
         if self._commands is None:
-            return list(told.metrics)
-        if len(told.metrics) > MOST_AT_A_TIME:
-            raise PayloadError(f"it writes {len(told.metrics)} metrics; {MOST_AT_A_TIME} at a time are taken")
+            return list(commands.metrics)
+        if len(commands.metrics) > MOST_AT_A_TIME:
+            raise PayloadError(
+                f"it writes {len(commands.metrics)} metrics; {MOST_AT_A_TIME} at a time are taken"
+            )
         rest = []
-        for metric in told.metrics:
-            wish = self._commands.meant(topic, metric, told.timestamp_ms, of_node=device is None)
+        for metric in commands.metrics:
+            wish = self._commands.meant(topic, metric, commands.timestamp_ms, of_node=device is None)
             if wish is None:
                 rest.append(metric)
             elif self._wishes.full():
                 self._counters.commands_refused += 1
             else:
                 self._wishes.put_nowait(wish)
-        return rest if rest or not told.metrics else None
+        return rest if rest or not commands.metrics else None
 
     def _all_metrics_of(self, message: OutboxMessage) -> list[Metric]:
         """The metrics of an alarm event, and those by which hosts may ask something of the alarm."""

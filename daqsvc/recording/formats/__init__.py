@@ -89,8 +89,10 @@ def read(path: Path, limits: ResourceLimits) -> Contents:
     except TooLargeError as error:
         raise RecordingError(f"{path} is too large: {error}") from None
     except OSError as error:
-        told = error.strerror or _one_line(error)
-        raise RecordingError(f"{path} cannot be read: {told}; copy it anew, or give another file") from error
+        reason = error.strerror or _one_line(error)
+        raise RecordingError(
+            f"{path} cannot be read: {reason}; copy it anew, or give another file"
+        ) from error
     except RecursionError as error:
         raise RecordingError(
             f"{path} cannot be read: what it holds is nested too deep; save the channels themselves"

@@ -112,11 +112,11 @@ def check_mat_structure(path: Path, budget: Budget) -> None:
 def _unpacked(body: memoryview, budget: Budget) -> bytes:
     """A compressed variable, no more of it than the file may hold."""
     unpacking = zlib.decompressobj()
-    found = unpacking.decompress(body, budget.left_bytes + 1)
-    budget.spend(len(found))
+    content = unpacking.decompress(body, budget.left_bytes + 1)
+    budget.spend(len(content))
     if not unpacking.eof:
         raise _DamageError("a compressed variable is cut short")
-    return found
+    return content
 
 
 def _elements(content: memoryview, order: str) -> Iterator[_Element]:

@@ -51,9 +51,9 @@ def read_parquet(path: Path, budget: Budget) -> Contents:
                 piece.append(column)
     pieces.reverse()
     # Taken away one by one, so that a column is held twice and not the table.
-    found = {i: _array(pa.chunked_array(pieces.pop(), schema.types[i])) for i in numbers}
+    arrays_by_index = {i: _array(pa.chunked_array(pieces.pop(), schema.types[i])) for i in numbers}
     entries = {
-        name: found[i] if i in found else np.empty(rows and 1, dtype=object)
+        name: arrays_by_index[i] if i in arrays_by_index else np.empty(rows and 1, dtype=object)
         for i, name in enumerate(column_names(schema.names))
     }
     for key, value in (schema.metadata or {}).items():

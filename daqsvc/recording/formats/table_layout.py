@@ -164,7 +164,7 @@ def _header_above(rows: Sequence[Sequence[str]], first: int, width: int) -> int 
 
 def _stated(lines: Sequence[str], decimal_comma: bool) -> dict[str, float]:  # noqa: FBT001
     """Numbers that lines of a preamble state, by their names in small letters with ``_`` for blanks."""
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for line in lines:
         stated = STATED.fullmatch(line.strip())
         if stated is None or not is_number(stated["number"], decimal_comma=decimal_comma):
@@ -172,8 +172,8 @@ def _stated(lines: Sequence[str], decimal_comma: bool) -> dict[str, float]:  # n
         number = float(stated["number"].replace(",", ".") if decimal_comma else stated["number"])
         unit = stated["unit"] or stated["in_name"] or ""
         name = re.sub(r"[\s.-]+", "_", stated["name"].strip().lower())
-        found.setdefault(name, number * (1e3 if unit.lower() == "khz" else 1.0))
-    return found
+        values.setdefault(name, number * (1e3 if unit.lower() == "khz" else 1.0))
+    return values
 
 
 def _header_lines(numbers: Sequence[Sequence[bool]]) -> int:
