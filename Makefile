@@ -15,9 +15,9 @@
 # Each sets up what it needs in .venv; nothing else on the machine is touched.
 
 PYTHON ?= python3.11
-# Tests run side by side, one process a core, each from its end of the list until one helps the other. Of the long ones many wait.
-WORKERS ?= auto
-LONG_WORKERS ?= 3
+# Tests run side by side, in one process more than there are cores, as many of them wait; each from its end of the
+# list until one helps the other.
+WORKERS ?= $(shell expr $$(nproc) + 1)
 # Without ROOM all of them.
 ROOMS = $(sort $(patsubst tests/%/,%,$(dir $(wildcard tests/*/test_*.py tests/*/*/test_*.py))))
 TESTS = $(if $(ROOM),$(if $(filter $(ROOMS),$(ROOM)),tests/$(ROOM),$(error there is no room '$(ROOM)' in tests/; there are $(ROOMS))))
@@ -54,7 +54,7 @@ test: $(READY)
 
 # Property tests are tried with all their examples here, with a third of them in `make test`.
 test-long: $(READY)
-	@DAQSVC_EXAMPLES=all $(BIN)/python -m pytest --numprocesses $(LONG_WORKERS) --dist worksteal -m "long or hypothesis" $(TESTS) $(ARGS)
+	@DAQSVC_EXAMPLES=all $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "long or hypothesis" $(TESTS) $(ARGS)
 
 hil: $(READY)
 	@tests/hil/run.sh $(ARGS)
