@@ -167,7 +167,7 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
         "modbus": modbus,
     }
     sent = dict.fromkeys(devices, 0)
-    async with running(machine, tmp_path / "store", QuickClock(10)) as service:
+    async with running(machine, tmp_path / "store", QuickClock(4)) as service:
         modbus.serve(service)
 
         async def sample(seconds: float) -> None:
