@@ -38,6 +38,8 @@ TIME_NAME = re.compile(
 
 PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9}
 
+_BACKWARDS = "go backwards, row by row"
+
 MOST_STRETCHED = 4
 """A recording is given up whose gaps make it so many times as long."""
 
@@ -133,7 +135,7 @@ def timing_of(path: Path, contents: Contents, length: int, given_hz: float | Non
         )
     _refuse_contradictions(path, stated, column, given_hz)
     if column is None:
-        return Timing(float(rate_hz), source)
+        return Timing(float(rate_hz), source, notes=_reversed(contents, length))
     return Timing(float(rate_hz), source, column.stamps.rows, column.notes())
 
 
@@ -162,7 +164,9 @@ def place_at(
             "which is taken: correct the one that is wrong"
         )
         return None, (note,)
-    return (None, ()) if column is None else (column.stamps.rows, column.notes())
+    if column is None:
+        return None, _reversed(contents, length)
+    return column.stamps.rows, column.notes()
 
 
 def _stated(contents: Contents) -> dict[str, float]:
@@ -284,6 +288,18 @@ def _seconds(name: str, values: NDArray[np.generic]) -> tuple[Floats, str, bool]
     return since_first, "seconds", unit is not None
 
 
+def _reversed(contents: Contents, length: int) -> tuple[str, ...]:
+    """A note on a column of time that goes backwards from row to row, if there is one."""
+    why = _why_not(contents, length)
+    if _BACKWARDS not in why:
+        return ()
+    note = (
+        f"{why.removeprefix(', and ')}: the samples are taken in the order of the file; check whether its "
+        "rows stand upside down"
+    )
+    return (note,)
+
+
 def _why_not(contents: Contents, length: int) -> str:
     """Why a column that looks like time is of no use."""
     for name in _candidates(contents, length):
@@ -295,7 +311,7 @@ def _why_not(contents: Contents, length: int) -> str:
                 return f", and its time column {name!r} has no two times in a row"
             backward = int((known < 0.0).sum())
             if backward == len(known):
-                return f", and the times of its column {name!r} go backwards, row by row"
+                return f", and the times of its column {name!r} {_BACKWARDS}"
             some = f", and {backward:,} of them go back" if backward else ""
             return (
                 f", and the steps of its time column {name!r} are uneven "

@@ -25,7 +25,7 @@ from daqsvc.detectors.rotor_synchronous.recorded_speed import RotorSetup
 from daqsvc.recording.recording import Recording
 from daqsvc.rotor.laval import LavalRotor
 
-pytestmark = [pytest.mark.data, pytest.mark.statistical, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.data, pytest.mark.statistical, pytest.mark.timeout(1800)]
 
 SEEDS = 20
 SNRS_DB = (20, 10, 0)

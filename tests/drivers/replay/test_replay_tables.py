@@ -181,6 +181,19 @@ async def test_a_table_that_tells_another_rate_is_played_at_that_of_its_stream_a
     np.testing.assert_array_equal(np.concatenate(played["t"]), with_gap)
 
 
+async def test_a_table_whose_times_go_backwards_is_played_as_it_stands_and_it_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, x=X, t=np.arange(len(X))[::-1] / RATE_HZ)
+    with caplog.at_level(logging.WARNING):
+        _, blocks = await play(path, [StreamSpec("s", table_layout(("x", "x", 1.0, 0.0)), RATE_HZ)])
+    words = "the times of its column 't' go backwards, row by row: the samples are taken in the order"
+    assert words in caplog.text
+    np.testing.assert_array_equal(np.concatenate([block.samples[:, 0] for block in blocks]), X)
+    assert load_recording(path, rate_hz=RATE_HZ).notes[0].startswith(words)
+
+
 async def test_streams_of_one_table_may_last_for_different_times(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", x=X, y=Y[:20])
     streams = [
