@@ -6,7 +6,7 @@ guarded, wherever it is called from, so that a new hook needs no guard of its ow
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
@@ -25,6 +25,14 @@ if TYPE_CHECKING:
 
 ClassT = TypeVar("ClassT", bound="type[Hooks]")
 CallableT = TypeVar("CallableT", bound="Callable[..., Any]")
+
+_KINDS: Mapping[str, type[Any]] = {
+    # Whoever writes a list where one by one would do is understood.
+    **dict.fromkeys(("Iterator", "Iterable", "Collection", "Sequence", "tuple", "list"), Iterable),
+    "Mapping": Mapping,
+    "str": str,
+}
+"""What an answer must be at least, by the head of its annotation."""
 
 _collected: ContextVar[list[PluginFailedError] | None] = ContextVar("collected", default=None)
 
@@ -53,11 +61,15 @@ class _Declared(NamedTuple):
 
     Attributes:
         may_raise: what it raises by intention.
+        answer: what it returns, as it is annotated.
+        kind: what an answer is an instance of at least; None if that is not checked.
         may_be_none: whether it may have no answer.
         at: which of its arguments is a place in the machine file; None if none is.
     """
 
     may_raise: tuple[type[Exception], ...]
+    answer: str
+    kind: type[Any] | None
     may_be_none: bool
     at: int | None
 
@@ -146,7 +158,9 @@ def _called(by: Hooks, name: str, hook: Callable[..., Any], *args: Any, **kwargs
     with _guarded(by, name, at):
         got = hook(*args, **kwargs)
         if got is None and not declared.may_be_none:
-            raise TypeError("it returns None")
+            raise TypeError(f"it returns None, not {declared.answer}")
+        if got is not None and declared.kind is not None and not isinstance(got, declared.kind):
+            raise TypeError(f"it returns {got!r:.80}, not {declared.answer}")
     return _each(by, name, at, got) if isinstance(got, Iterator) else got
 
 
@@ -184,8 +198,10 @@ def _declared_of(kind: type[Any], name: str) -> _Declared:
     """As the first class from the top declares it."""
     hook = next(vars(one)[name] for one in reversed(kind.__mro__) if name in vars(one).get("__hooks__", ()))
     if isinstance(hook, property):
-        return _Declared((), may_be_none=True, at=None)
-    returned = set(str(hook.__annotations__["return"]).split(" | "))
+        return _Declared((), "", None, may_be_none=True, at=None)
+    answer = str(hook.__annotations__["return"])
+    returned = set(answer.split(" | "))
     arguments = list(signature(hook).parameters)[1:]
     at = arguments.index("at") if "at" in arguments else None
-    return _Declared(getattr(hook, "may_raise", ()), bool(returned & {"None", "Any"}), at)
+    least = _KINDS.get(answer.partition("[")[0])
+    return _Declared(getattr(hook, "may_raise", ()), answer, least, bool(returned & {"None", "Any"}), at)

@@ -232,10 +232,15 @@ def test_a_validator_that_fails_is_one_finding_and_the_others_go_on(monkeypatch:
     assert problems["pipeline.crest"].remedy == "have the authors of daqsvc-crest 1.0 mend it"
 
 
-def test_a_hook_that_forgets_to_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", lambda *_: None)
+@pytest.mark.parametrize("answer", [None, 42])
+def test_a_hook_that_answers_nothing_or_something_else_is_named(
+    monkeypatch: pytest.MonkeyPatch, answer: object
+) -> None:
+    monkeypatch.setattr(class_at("crest.CrestPlugin"), "checks", lambda *_: answer)
     [problem] = problems_of(TABLES, MACHINE)
-    assert "checks of crest.CrestPlugin has failed: TypeError: it returns None (" in problem.message
+    words = f"checks of crest.CrestPlugin has failed: TypeError: it returns {answer}, not Iterator["
+    assert words in problem.message
+    assert problem.remedy == "have the authors of daqsvc-crest 1.0 mend it, or remove [pipeline.crest]"
 
 
 @pytest.mark.parametrize(
