@@ -193,12 +193,32 @@ def is_possessed(path: Path) -> bool:
         path: the lock file.
     """
     try:
-        inode = path.stat().st_ino
+        handle = os.open(path, os.O_PATH | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            place = f" {_device_of(handle)}:{os.fstat(handle).st_ino} "
+        finally:
+            os.close(handle)
         locks = Path("/proc/locks").read_text(encoding="ascii").splitlines()
     except OSError:
         return False
     # "1: FLOCK  ADVISORY  WRITE 4711 08:01:131075 0 EOF"
-    return any(" FLOCK " in lock and f":{inode} " in lock for lock in locks)
+    return any(" FLOCK " in lock and place in lock for lock in locks)
+
+
+def _device_of(handle: int) -> str:
+    """The device of an open file as ``/proc/locks`` writes it, which is that of its mount.
+
+    Files of one inode number lie on any number of file systems; `os.fstat` tells other devices on some.
+    """
+    about = Path(f"/proc/self/fdinfo/{handle}").read_text(encoding="ascii").splitlines()
+    mount = next((line.split()[1] for line in about if line.startswith("mnt_id:")), "")
+    for line in Path("/proc/self/mountinfo").read_text(errors="replace").splitlines():
+        number, _, device, *_ = line.split()
+        if number == mount:
+            major, minor = map(int, device.split(":"))
+            return f"{major:02x}:{minor:02x}"
+    device_number = os.fstat(handle).st_dev
+    return f"{os.major(device_number):02x}:{os.minor(device_number):02x}"
 
 
 def is_read_only(directory: Path) -> bool:

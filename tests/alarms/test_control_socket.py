@@ -30,6 +30,7 @@ from daqsvc.control import (
     events_waiting,
     request_of,
 )
+from daqsvc.outbox.files import is_possessed, take_possession
 from daqsvc.outbox.limits import OutboxLimits
 from daqsvc.outbox.store import Outbox
 
@@ -405,6 +406,17 @@ def test_what_cannot_be_asked_is_said_in_our_words_only() -> None:
     with pytest.raises(ControlError) as refused:
         request_of(AlarmCommand(verb=Verb.ACKNOWLEDGE, alarm="\udcff", by="Ada"), None)
     assert f"{refused.value}".startswith("that cannot be asked, alarm: must be printable")
+
+
+def test_a_lock_of_the_same_inode_number_on_another_disk_is_somebody_elses(tmp_path: Path) -> None:
+    with mounted(tmp_path / "one", "1m") as one, mounted(tmp_path / "other", "1m") as other:
+        locks = [disk.directory / "outbox.sqlite.lock" for disk in (one, other)]
+        for lock in locks:
+            lock.touch()
+        assert locks[0].stat().st_ino == locks[1].stat().st_ino
+        with take_possession(locks[0]):
+            assert [is_possessed(lock) for lock in locks] == [True, False]
+        assert not is_possessed(locks[0])
 
 
 async def test_a_service_without_its_socket_is_not_said_to_be_away(
