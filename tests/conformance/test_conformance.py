@@ -393,7 +393,8 @@ async def test_a_driver_ends_wherever_it_is_cancelled(transport: Transport, pres
         await fresh.until_up()
         await fresh.send(5)
     fresh.check_books()
-    assert fresh.counters.samples_received == 5 * transport.samples_per_frame
+    # A device with a queue may hold what a driver that was cancelled has not fetched.
+    assert fresh.counters.samples_received >= 5 * transport.samples_per_frame
 
 
 async def _cancelled_after(rig: Rig, turns: int) -> None:
