@@ -187,6 +187,7 @@ class ReplayDriver:
         self._to_its_end = False
         self._shift_ns: int | None = None
         self._newest_ns: int | None = None
+        self._at_end_ns: int | None = None
         self._said: set[str] = set()
 
     @property
@@ -261,6 +262,7 @@ class ReplayDriver:
             self._begin_anew(recording)
         try:
             while True:
+                asked_ns = self._port.clock.monotonic_ns()
                 piece = await in_thread(recording.read, SPAN_NS if self._paced else UNPACED_SPAN_NS)
                 if piece is None:
                     self.counters.passes += 1
@@ -271,6 +273,8 @@ class ReplayDriver:
                         f"what is no frame in {self._path} is counted (frames_malformed) and left out, first "
                         f"{recording.first_malformed}"
                     )
+                if not (piece.frames or piece.unknown or piece.wrong_length or any(piece.notes.values())):
+                    self._at_end_ns = asked_ns
                 await self._accept(piece)
         except RecordedLogError as error:
             if self._at_end != "wait":
@@ -327,7 +331,7 @@ class ReplayDriver:
         last_ns = max(int(frames.arrival_ns.max()) for frames in piece.frames.values())
         if (
             self._shift_ns is None
-            or (self._at_end == "wait" and abs(first_ns + self._shift_ns - now_ns) > REMAP_NS)
+            or (self._at_end == "wait" and self._is_of_another_clock(first_ns + self._shift_ns, now_ns))
             or self._leaps(first_ns + self._shift_ns)
         ):
             self._shift_ns = self._next_ns(now_ns) - first_ns
@@ -341,6 +345,16 @@ class ReplayDriver:
             # Logs of several interfaces may step back a little; an arrival never does.
             arrival_ns = np.maximum.accumulate(np.maximum(frames.arrival_ns + self._shift_ns, floor_ns))
             self._assemblers[stream].accept(*frames._replace(arrival_ns=arrival_ns))
+
+    def _is_of_another_clock(self, due_ns: int, now_ns: int) -> bool:
+        """Whether a growing log goes on with times of another clock: of the future, or before it was written.
+
+        That it is read late, because the process stood still, tells nothing of its clock.
+        """
+        if self._newest_ns is None:
+            return False
+        written_ns = max(self._newest_ns, self._at_end_ns or self._newest_ns)
+        return due_ns > now_ns + REMAP_NS or due_ns < written_ns - REMAP_NS
 
     def _leaps(self, due_ns: int) -> bool:
         """Whether the recorded time has leapt, and what comes now is to be played at once."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 RATE_HZ = 1000
 OUTAGES = 20
+STALL_S = 2.2
+"""So long the machine stands still once: longer than a device may without having restarted."""
 CHANNELS = '[{ name = "x", type = "int16", scale = 1.0 }, { name = "y", type = "int16", scale = 1.0 }]'
 CAN_LAYOUT = f"""
 id = 0x101
@@ -191,6 +194,9 @@ async def test_losing_all_buses_at_once_ends_with_exact_books(tmp_path: Path) ->
                 await sample(0.05)
             for outage in range(OUTAGES):
                 await sample(rng.uniform(0.02, 0.3))
+                if outage == OUTAGES // 2:
+                    time.sleep(STALL_S)  # noqa: ASYNC251 - as a busy machine does
+                    await asyncio.sleep(0.1)  # whoever reads may come before the devices
                 for device in devices.values():
                     device.go_away()
                 while any(driver.link.losses == outage for driver in service.drivers):

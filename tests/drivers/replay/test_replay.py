@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from daqsvc.acquisition.samples import SampleBlock
 
 pytestmark = pytest.mark.integration
@@ -190,6 +192,74 @@ async def test_lines_that_are_no_frames_are_counted_while_a_log_is_written(tmp_p
         await task
     np.testing.assert_array_equal(played.x, np.arange(9 * PER_FRAME))
     assert played.driver.counters.frames_malformed == 3
+
+
+class GrowingLog:
+    """A log of 1000 frames that is written line by line while it is played."""
+
+    def __init__(self, folder: Path) -> None:
+        self._lines = write(folder / "whole.log", messages(1000)).read_text().splitlines(keepends=True)
+        self._path = folder / "growing.log"
+        self._path.touch()
+        self._written = 0
+        self.played = Played(self._path, at_end="wait")
+        self._begun_ns = self.played.clock.monotonic_ns()
+
+    def log(self, *, clock_off_s: float = 0.0) -> None:
+        """Write the frames that the device has sent by now, stamped by a clock that is off by so much."""
+        now_ns = self.played.clock.monotonic_ns()
+        sent = (now_ns - self._begun_ns) * round(RATE_HZ) // NS_PER_S // PER_FRAME
+        with self._path.open("a") as file:
+            for line in self._lines[self._written : sent]:
+                seconds, rest = line[1:].split(")", 1)
+                file.write(f"({float(seconds) + clock_off_s:.6f}){rest}")
+        self._written = sent
+
+    async def play(self, seconds: float, *, clock_off_s: float = 0.0) -> None:
+        """Let it be written and played for a while."""
+        until_ns = self.played.clock.monotonic_ns() + round(seconds * NS_PER_S)
+        async with asyncio.timeout(20):
+            while self.played.clock.monotonic_ns() < until_ns:
+                self.log(clock_off_s=clock_off_s)
+                await self.played.step()
+            while self.played.driver.streams["shaft"][0].frames_received < self._written:
+                await self.played.step()
+
+    def lateness_s(self) -> NDArray[np.float64]:
+        """How late each block is by its time stamp, against when its device has sampled it."""
+        blocks = self.played.blocks
+        t_ns = np.array([block.t_first_ns - self._begun_ns for block in blocks])
+        return t_ns / NS_PER_S - np.array([block.first_index for block in blocks]) / RATE_HZ
+
+
+async def test_a_growing_log_that_is_read_late_keeps_its_times(tmp_path: Path) -> None:
+    log = GrowingLog(tmp_path)
+    task = asyncio.create_task(log.played.driver.run())
+    await log.play(1.0)
+    # The process stands still, and the log is written on.
+    log.played.clock.advance_to(log.played.clock.monotonic_ns() + 3 * NS_PER_S)
+    await log.play(1.0)
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    counters, time_base = log.played.driver.streams["shaft"]
+    assert (counters.samples_lost, counters.frames_rejected, time_base.restarts) == (0, 0, 0)
+    np.testing.assert_array_equal(log.played.x, np.arange(len(log.played.x)))
+    assert np.ptp(log.lateness_s()) < 0.06
+
+
+@pytest.mark.parametrize("step_s", [-3600.0, -5.0, 5.0, 3600.0])
+async def test_a_growing_log_is_played_on_when_its_clock_is_set(tmp_path: Path, step_s: float) -> None:
+    log = GrowingLog(tmp_path)
+    task = asyncio.create_task(log.played.driver.run())
+    await log.play(1.0)
+    await log.play(1.0, clock_off_s=step_s)
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    counters, time_base = log.played.driver.streams["shaft"]
+    assert (counters.samples_lost, counters.frames_rejected, time_base.restarts) == (0, 0, 0)
+    assert np.ptp(log.lateness_s()) < 0.12
 
 
 @pytest.mark.parametrize(
