@@ -148,6 +148,7 @@ class Service:
             patience={grid.name: patience(machine, grid.name, grid.rate_hz) for grid in grids},
             supervisor=self.supervisor,
             fall_silent=self._fall_silent,
+            why_over=self._why_over,
         )
         self.alarms = AlarmService(
             self._identity,
@@ -303,6 +304,12 @@ class Service:
         if stream in self._standings:
             self._stand(stream, standing)
 
+    def _why_over(self, stream: str) -> str:
+        """Why nothing more can come of a stream or grid, e.g. that its recording has ended; else empty."""
+        streams = next(grid.streams for grid in self._grids if grid.name == stream)
+        over = (one.link.over for one in self.drivers if not one.streams.keys().isdisjoint(streams))
+        return next(filter(None, over), "")
+
     def _report(self, diagnosis: Diagnosis) -> None:
         with self.supervisor.sparing_others(
             f"alarms by {diagnosis.detector}", "one of its statements is lost"
@@ -401,7 +408,7 @@ def _has_heard(driver: Driver) -> bool:
 
 
 def _has_ended(driver: Driver) -> bool:
-    return driver.link.over
+    return bool(driver.link.over)
 
 
 class _Deadline:

@@ -102,14 +102,14 @@ class Link:
         state: up or down.
         losses: how often it went down after it had been up.
         reason: why it is down.
-        over: whether it is down for good, and nobody tries it again.
+        over: why nothing more comes over it, in a clause with its name; empty while it is up or tried again.
     """
 
     name: str
     state: LinkState = "down"
     losses: int = 0
     reason: str = ""
-    over: bool = False
+    over: str = ""
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)
@@ -127,7 +127,7 @@ class Link:
             logger.info("%s is up", self.name)
         self._sparing.may_take_back()
         self.state, self.reason, self._said_down, self._ever_up = "up", "", False, True
-        self.over = False
+        self.over = ""
 
     def down(self, reason: str) -> None:
         """The link does not work, because of ``reason``, and is tried again; repeated calls are silent."""
@@ -142,17 +142,15 @@ class Link:
 
     def leave_out(self, reason: str) -> None:
         """The link does not work at start, because of ``reason``, and is not tried again."""
-        logger.warning(
-            "%s: %s; it is left out until the service starts again, as start = 'ignore' says",
-            self.name,
-            reason,
-        )
-        self.state, self.reason, self._said_down, self.over = "down", reason, False, True
+        left_out = f"{self.name}: {reason}; it is left out until the service starts again"
+        logger.warning("%s, as start = 'ignore' says", left_out)
+        self.state, self.reason, self._said_down, self.over = "down", reason, False, left_out
 
     def end(self, reason: str) -> None:
         """There is nothing more to come over the link, because of ``reason``; it is not tried again."""
-        logger.info("%s has ended: %s", self.name, reason)
-        self.state, self.reason, self._said_down, self.over = "down", reason, False, True
+        ended = f"{self.name} has ended: {reason}"
+        logger.info("%s", ended)
+        self.state, self.reason, self._said_down, self.over = "down", reason, False, ended
 
     def stop(self) -> None:
         """Nobody keeps the link up any more: its driver was stopped. That is no loss."""

@@ -214,6 +214,7 @@ class Pipeline:
         supervisor: keeps the detectors' tasks going; None for one of its own.
         fall_silent: called with the name and the standing of a stream in doubt of which nothing comes any
             more; whoever tells the pipeline how streams stand passes it on. None: it is passed on at once.
+        why_over: why nothing more can come of a stream, in a clause; empty if something may.
     """
 
     def __init__(
@@ -227,6 +228,7 @@ class Pipeline:
         patience: Mapping[str, Patience] | None = None,
         supervisor: Supervisor | None = None,
         fall_silent: Tell | None = None,
+        why_over: Callable[[str], str] = lambda _stream: "",
     ) -> None:
         self.counters = {detector.name: DetectorCounters() for detector in detectors}
         self.detectors = tuple(detectors)
@@ -237,6 +239,7 @@ class Pipeline:
         self._silent_until_ns = dict.fromkeys(rings, -1)
         self._standings = dict.fromkeys(rings, StreamState())
         self._fall_silent = fall_silent or self.stand
+        self._why_over = why_over
         self._doubts_told = dict.fromkeys(rings, 0)
         self._changes = dict.fromkeys(rings, 0)
         self._held: dict[str, deque[Diagnosis]] = {name: deque(maxlen=MOST_HELD) for name in rings}
@@ -367,23 +370,23 @@ class Pipeline:
     def _say_nothing_comes(self, stream: str, silence_ns: int, now_ns: int) -> None:
         silence_s = silence_ns / NS_PER_S
         standing = self._standings[stream]
+        over = self._why_over(stream)
+        reason = f"no more samples of {stream}: {over}" if over else silence_reason(stream, silence_s)
         if standing.doubt:
             # What the stream was doubted for is no longer what is wrong.
-            reason = silence_reason(stream, silence_s)
             self._fall_silent(stream, StreamState(reason, standing.proven, silent=True))
             return
         self._let_go(stream)
         self._silent_until_ns[stream] = now_ns
         if not any(detector.stream == stream for detector in self.detectors):
-            logger.warning("%s; no detector reads them", silence_reason(stream, silence_s))
+            logger.warning("%s; no detector reads them", reason)
         for detector in self.detectors:
             if detector.stream == stream:
-                self._say_silent(detector, silence_s, now_ns)
-
-    def _say_silent(self, detector: Detector, silence_s: float, now_ns: int) -> None:
-        with self._supervisor.sparing_others(_part(detector), "the other detectors say that nothing comes"):
-            for diagnosis in detector.silent(silence_s, now_ns):
-                self._report(diagnosis)
+                with self._supervisor.sparing_others(
+                    _part(detector), "the other detectors say that nothing comes"
+                ):
+                    for diagnosis in detector.silent(silence_s, now_ns):
+                        self._report(replace(diagnosis, reason=reason) if over else diagnosis)
 
     async def _follow(self, detector: Detector, kernels: KernelThreads) -> None:
         while True:

@@ -12,8 +12,10 @@ from support.brokers import Consumer, free_port
 from support.live_service import play, running
 from support.waiting import eventually
 
+from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.recording.recording import Recording
 from daqsvc.service import Service
+from daqsvc.settings import load_machine_file
 from sim_hw.demo.broker import EmbeddedBroker
 from sim_hw.demo.machines import for_recording, laval_rig
 from sim_hw.demo.session import DemoSession, Script
@@ -26,6 +28,41 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.integration
 RATE_HZ = 2000.0
+REPLAYED = """
+schema_version = 1
+site = "lab"
+box = "edge-1"
+
+[machine]
+name = "replayed"
+speed_rpm = 1500.0
+
+[buses.tape]
+driver = "replay"
+file = "run.npz"
+
+[streams.housing]
+bus = "tape"
+rate_hz = 2000.0
+layout = { columns = [{ name = "accel", column = "accel" }] }
+
+[[sensors]]
+name = "accel"
+type = "accelerometer"
+stream = "housing"
+channel = "accel"
+unit = "g"
+
+[pipeline.levels]
+window_s = 0.1
+velocity_band_hz = [10.0, 800.0]
+
+[[alarms]]
+name = "vibration"
+sensor = "accel"
+measure = "rms"
+alert = 0.5
+"""
 
 
 def shaking(seconds: float) -> Recording:
@@ -133,3 +170,21 @@ async def test_a_stop_does_not_wait_for_kernels_that_compile(
     assert not service.ready.is_set()
     assert not compiled.is_set()
     compiled.set()
+
+
+async def test_a_recording_that_has_been_played_holds_the_alarm_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daqsvc.dsp.quality.missing.SILENCE_NS", NS_PER_S // 10)
+    np.savez(tmp_path / "run.npz", accel=shaking(0.5).samples[:, 0])
+    path = tmp_path / "machine.toml"
+    path.write_text(REPLAYED, encoding="utf-8")
+    async with running(load_machine_file(path), tmp_path / "store") as service:
+        alarms = service.alarms.manager.alarms
+        await eventually(lambda: "sensor-ok/accel" in alarms, "the end of the recording is an alarm")
+        file = tmp_path / "run.npz"
+        assert alarms["sensor-ok/accel"].message == (
+            "sensor-ok/accel alert: accel cannot be judged: no more samples of housing: "
+            f"replayed bus 'tape' ({file}) has ended: end of file"
+        )
+        assert alarms["vibration"].level.label == "alert", "the end of a recording clears nothing"
