@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from daqsvc.acquisition.arrival_count import SURE_FRAMES
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.counter import SURE_FRAMES
 from daqsvc.acquisition.counter_sense import CounterSense
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.acquisition.standing import QUIET_NS, StreamStanding, tell_nobody

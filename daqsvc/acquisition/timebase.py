@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.clock_line import PARTS, Bucket, ClockLine, clock_line
-from daqsvc.acquisition.counter import ArrivalCount, CounterUnwrapper
+from daqsvc.acquisition.counter import CounterUnwrapper
 from daqsvc.dsp.quality.rate import AS_BEFORE, FITS, PLAUSIBLE
 
 if TYPE_CHECKING:

@@ -338,7 +338,7 @@ class Journal:
         self._tidy()
 
     def damage_is_told(self) -> None:
-        """The alarms have told what has befallen the journal: a crash need not have it told again."""
+        """The alarms have reported the damage of the journal: not again after a crash."""
         self._was_ahead = False
         self._mark.drift(ahead=self._shows)
         try:

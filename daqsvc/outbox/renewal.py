@@ -6,7 +6,7 @@
 4. The saved one becomes the journal.
 
 Until the second step the corrupt journal is as it was, so that a start begins anew; from there on, a start
-goes on. What has happened is kept in ``<journal>.damage`` until the alarms have told of it.
+goes on. What has happened is kept in ``<journal>.damage`` until an alarm has reported it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _INSERT = "INSERT OR IGNORE INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)"
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What has befallen a journal and is not told yet.
+    """Damage to a journal that no alarm has reported yet.
 
     Attributes:
         quarantined: corrupt files set aside.
@@ -130,7 +130,7 @@ class Renewal:
         """Put what was saved in the place of the corrupt journal.
 
         Args:
-            damage: what is to be told of it.
+            damage: what is to be reported of it.
 
         Returns:
             Where the corrupt file is by now.

@@ -135,7 +135,7 @@ class Outbox:
         return self._journal.was_ahead
 
     def damage_is_told(self) -> None:
-        """What has befallen the journal is told: it need not be told again after a restart."""
+        """The damage of the journal is reported: not again after a restart."""
         self._put(Batch(reads=[(self._journal.damage_is_told, asyncio.get_running_loop().create_future())]))
 
     async def append(self, topic: str, payload_of_sequence: Callable[[int], bytes], *, retain: bool) -> int:

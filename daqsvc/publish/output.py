@@ -112,7 +112,7 @@ class Output:
         """How things stand with it, as far as that is known; each is an alarm. Asked for once a second.
 
         Args:
-            raised: names of conditions that were ever told of, also before a restart.
+            raised: names of conditions that were ever reported, also before a restart.
         """
         del raised
         return ()

@@ -227,7 +227,7 @@ def alarm_event(payload: bytes) -> AlarmEvent:
     kind = EventKind(message.kind)
     holds, covered = tuple(map(AlarmState, message.holds)), message.covered and AlarmState(message.covered)
     if kind is EventKind.SUPPRESSED and not holds:
-        # Before holds were told of one by one there was this one only, laid over the state before.
+        # Before holds were reported one by one there was this one only, laid over the state before.
         holds, covered = (AlarmState.SUPPRESSED,), previous
     shown = holds[0] if holds else state
     if (

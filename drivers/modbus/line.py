@@ -55,7 +55,7 @@ class UnitSetAsideError(NoReplyError):
 
 @dataclass(frozen=True, slots=True)
 class RetryPolicy:
-    """How long to bear with a line and its units.
+    """How long to wait for a line and its units.
 
     Attributes:
         quiet_ns: silence kept on a serial line after a request that failed; at least the response time-out.
@@ -163,7 +163,7 @@ class UnitSilence:
 
     Args:
         unit: its address.
-        patience: how long to bear with it.
+        patience: how long to wait for it.
         counters: of the bus.
         sparing: what has been said of it, also while the line was open before.
     """

@@ -271,7 +271,7 @@ class ModbusCounters(BusCounters):
         blocks_torn: waveform blocks that the device replaced while they were read.
         blocks_missed: waveform blocks that were over before they could be read.
         ring_overruns: how often a ring was overwritten before it was read.
-        counts_doubted: write counters and block ids that another look did not bear out.
+        counts_doubted: write counters and block ids that another look did not confirm.
     """
 
     requests: int = 0

@@ -98,7 +98,7 @@ class DeviceRingReader(CountedReader[RingLayout]):
         return first
 
     async def _read_until(self, look: _Look, line: ModbusLine) -> bool:
-        """Read what has been written until a look; returns whether the next look bears that out."""
+        """Read what has been written until a look; returns whether the next look confirms that."""
         self._place(look)
         assert self._next is not None  # noqa: S101 - `_place` has set it
         layout, start = self._layout, self._next

@@ -61,7 +61,7 @@ class ReplayBus(Bus):
 
     @property
     def summary(self) -> str:
-        """What a person is told of it."""
+        """The sentence that describes it to a person."""
         end = {"stop": "once", "loop": "again and again", "wait": "as it is written"}[self.at_end]
         channel = "" if self.channel is None else f", channel {self.channel}"
         return f"replay of {self.file}{channel}, {end}{', unpaced' if self.pace == 'unpaced' else ''}"
@@ -107,5 +107,5 @@ class TableLayout(Layout):
 
     @property
     def summary(self) -> str:
-        """What a person is told of it."""
+        """The sentence that describes it to a person."""
         return f"columns {', '.join(column.column for column in self.columns)}"

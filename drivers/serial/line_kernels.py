@@ -1,6 +1,6 @@
 """Compiled loops over lines of text: checksums, numbers, and counts from time stamps.
 
-A number is what Python's `float` and `int` make of it, to the last bit. Where that takes more than the
+A number is read as Python's `float` and `int` read it, to the last bit. Where that takes more than the
 arithmetic of doubles (more than 15 digits or so, an exponent beyond 22), the line is left to them.
 
 Read by `re` and `float`, by the same grammar, what a UART brings at 12 Mbit/s takes 6 % of a core in lines

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.machine_files import MACHINES, only_problem, parsed
 
+from daqsvc.acquisition.arrival_count import ArrivalCount
 from daqsvc.acquisition.assembler import StreamAssembler
-from daqsvc.acquisition.counter import ArrivalCount
 from daqsvc.acquisition.samples import Quality, SampleBlock
 from daqsvc.settings import describe, load_machine_file
 from drivers.can.dbc import layout_from_dbc

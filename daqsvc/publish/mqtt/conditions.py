@@ -41,7 +41,7 @@ class BrokerVitals:
         refused: by topic, why the broker will not take messages.
         is_refused_known: whether these are all there are: what an earlier run has left was read, and the
             broker was asked.
-        told: conditions that were ever told of, also before a restart.
+        told: conditions that were ever reported, also before a restart.
     """
 
     wall_ns: int

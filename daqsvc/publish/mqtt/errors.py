@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 MOST_REASONS = 8
-"""Reasons that are told of in one outage: one that has a number in it must not fill the log."""
+"""Reasons that are logged in one outage: one with a number in it must not fill the log."""
 
 _EXPIRED = 10
 _VERIFICATION = {
