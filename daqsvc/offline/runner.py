@@ -315,6 +315,9 @@ class Runner:
         missing = [name for name in _needs(self.detectors) if name not in columns]
         if missing or not columns:
             missing = missing or [sensor.name for sensor in self.machine.sensors]
+            lacking = [sensor for sensor in self.machine.sensors if sensor.name in missing]
+            # A variable of that name may be there and be no channel: then the reader says why.
+            list_channels(recording, [name for sensor in lacking for name in (sensor.name, sensor.channel)])
             raise RefusedError(
                 f"{recording} has no channel for {', '.join(missing)} of {self.machine.path}; name its "
                 f"variable, e.g. --map {missing[0]}=VARIABLE. It holds {', '.join(there) or 'no channel'}"

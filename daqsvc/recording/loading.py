@@ -89,14 +89,20 @@ def load_streams(
     return notes, loaded
 
 
-def channels_of(path: str, memory_bytes: int) -> tuple[dict[str, int], tuple[()]]:
+def channels_of(
+    path: str, expected: Sequence[str], memory_bytes: int
+) -> tuple[dict[str, int], tuple[()]]:
     """See `daqsvc.recording.recording.list_channels`.
 
     Raises:
         RecordingError: see there.
     """
-    vectors = read(Path(path), ResourceLimits(memory_bytes)).vectors()
-    return {name: len(values) for name, values in vectors.items() if len(values) > 1}, ()
+    file = Path(path)
+    contents = read(file, ResourceLimits(memory_bytes))
+    for name in expected:
+        if name in contents.entries:
+            _channels(file, contents, {name: name})
+    return {name: len(values) for name, values in contents.vectors().items() if len(values) > 1}, ()
 
 
 def _longest(path: Path, contents: Contents) -> tuple[dict[str, str], dict[str, int]]:

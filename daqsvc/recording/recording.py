@@ -144,13 +144,17 @@ def load_streams(
     return list(zip(samples, notes, strict=True))
 
 
-def list_channels(path: Path | str) -> dict[str, int]:
+def list_channels(path: Path | str, expected: Sequence[str] = ()) -> dict[str, int]:
     """What can be loaded from a file: the number of samples of each numeric channel, by name.
 
+    Args:
+        path: the file.
+        expected: names that are channels if the file has them.
+
     Raises:
-        RecordingError: the file cannot be read.
+        RecordingError: the file cannot be read, or has one that is expected, and it is no channel.
     """
-    lengths: dict[str, int] = _there("channels_of", Path(path), {}).found
+    lengths: dict[str, int] = _there("channels_of", Path(path), {"expected": list(expected)}).found
     return lengths
 
 

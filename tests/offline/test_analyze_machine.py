@@ -13,7 +13,8 @@ from support.paths import ROOT
 from daqsvc.cli import main
 from daqsvc.detectors.rotor_synchronous.recorded import analyse
 from daqsvc.detectors.rotor_synchronous.recorded_speed import KeyphasorChannel, RotorSetup
-from daqsvc.recording.recording import Recording
+from daqsvc.recording import RecordingError
+from daqsvc.recording.recording import Recording, load_recording
 from daqsvc.rotor.calibration.file import save_calibration
 from daqsvc.rotor.laval import LavalRotor
 from daqsvc.settings import load as settings_load
@@ -138,6 +139,27 @@ def test_a_machine_file_says_what_is_known(
     assert code == 3
     assert "has no channel for keyphasor" in found["refused"]
     assert "--map keyphasor=VARIABLE" in found["refused"]
+
+
+@pytest.mark.parametrize(
+    ("pulses", "what"),
+    [
+        (np.array([None, {}], object), "not numeric"),
+        (np.array([]), "empty, not a channel"),
+        (3.0, "a single number, not a channel"),
+        (np.ones(1), "a single number, not a channel"),
+    ],
+)
+def test_a_variable_that_is_no_channel_is_refused_as_the_reader_of_files_does(
+    analyze: Callable[..., Any], machine: Path, tmp_path: Path, pulses: object, what: str
+) -> None:
+    orbit = Orbit(30)
+    file = tmp_path / "a.npz"
+    np.savez(file, x=orbit.x, y=orbit.y, keyphasor=pulses, fs=RATE_HZ)  # type: ignore[arg-type]
+    code, (found,), _ = analyze(machine, file)
+    with pytest.raises(RecordingError, match=what) as refused:
+        load_recording(file, {"keyphasor": "keyphasor"}, RATE_HZ)
+    assert (code, found["refused"]) == (3, str(refused.value))
 
 
 def test_a_rotor_bank_judges_recordings_too(analyze: Callable[..., Any], tmp_path: Path) -> None:

@@ -77,6 +77,8 @@ FILES: dict[str, tuple[str, bytes | Callable[[Path], Any]]] = {
     "rows that are missing": ("a.csv", stamped(1 / RATE_HZ, slice(10, 14))),
     "channels of a WAV file": ("a.wav", wav),
     "Python objects": ("a.npz", npz(x=np.array([None, {}], object), y=Y)),
+    "an empty array": ("a.npz", npz(x=X[:0], y=Y)),
+    "a single number": ("a.npz", npz(x=3.0, y=Y)),
     "texts": ("a.npz", npz(x=np.array(["a", "b"]), y=Y)),
     "a matrix": ("a.npz", npz(x=np.ones((40, 2)), y=Y)),
     "different lengths": ("a.npz", npz(x=X, y=Y[1:])),
@@ -95,7 +97,7 @@ FILES: dict[str, tuple[str, bytes | Callable[[Path], Any]]] = {
     "a folder": ("a.csv", lambda path: path.mkdir()),
     "no file": ("a.csv", lambda path: None),
 }
-REFUSED = 18
+REFUSED = 20
 """As many of them, from the end, are refused."""
 
 
