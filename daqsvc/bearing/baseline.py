@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_type_h
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
+from daqsvc.bearing.geometry import BearingOrders
 from daqsvc.bearing.identify import (
     BANDS,
     HIGHEST,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from daqsvc.bearing.geometry import BearingOrders
     from daqsvc.bearing.race.verdict import Part
     from daqsvc.bearing.two_sensors import PairModel
 
@@ -157,7 +157,7 @@ _PREAMBLE = """\
 # A machine in good order, as its bearings' detectors remember it.
 # [[residual]]: innovations model of one accelerometer, or of several together, and how large the innovations
 # are, in dB, window by window: all bands together, then each.
-# [[race]]: what spoke for each part of a bearing although it was in good order.
+# [[race]]: what spoke for each part of a bearing although it was in good order; its fault orders.
 # [[pair]]: cross-spectra of the residual of accelerometers on rotor and housing, with these masses (kg),
 # springs (N/m) and dampers (N s/m). A line holds the power of either race's component, and their cross-power.
 """
@@ -221,9 +221,17 @@ _Part = create_model("_Part", __base__=_FileTable, **_part_fields)
 """A table with the fields of `PartEvidence`, whatever these are."""
 
 
+class _Orders(_FileTable):
+    inner: float
+    outer: float
+    ball: float
+    cage: float
+
+
 class _Race(_FileTable):
     channel: str
     speed_rpm: Positive
+    orders: _Orders | None = None
     edges_hz: Annotated[list[Positive], Field(min_length=2)]
     power: list[float]
     evidence: Mapping[Literal["inner", "outer", "ball"], _Part]
@@ -232,14 +240,16 @@ class _Race(_FileTable):
         """The healthy bearing of this table.
 
         Raises:
-            ValueError: a part or a band is missing.
+            ValueError: a part or a band is missing, or the orders are not those of a bearing.
         """
         if set(self.evidence) != set(PARTS) or len(self.power) != len(self.edges_hz) - 1:
             raise ValueError("a part or a band is missing")
         evidence: dict[Part, PartEvidence] = {
             part: PartEvidence(**self.evidence[part].model_dump()) for part in PARTS
         }
-        return RaceBaseline(evidence, BandLevels(tuple(self.edges_hz), tuple(self.power)), self.speed_rpm)
+        orders = None if self.orders is None else BearingOrders(**self.orders.model_dump())
+        levels = BandLevels(tuple(self.edges_hz), tuple(self.power))
+        return RaceBaseline(evidence, levels, self.speed_rpm, orders)
 
 
 class _SpectrumTable(_FileTable):
@@ -399,6 +409,9 @@ def _lines(baseline: BearingBaseline) -> Iterator[str]:
         yield "\n[[race]]"
         yield f"channel = {_value(channel)}"
         yield f"speed_rpm = {_value(float(race.speed_rpm))}"
+        if race.orders is not None:
+            orders = ", ".join(f"{name} = {_value(value)}" for name, value in asdict(race.orders).items())
+            yield f"orders = {{ {orders} }}"
         yield f"edges_hz = {_value([float(edge) for edge in race.levels.edges_hz])}"
         yield f"power = {_value([float(power) for power in race.levels.power])}"
         for part, evidence in race.evidence.items():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 SUM_TOLERANCE = 0.05
 """Relative departure of stated orders from the kinematic laws at which they are refused."""
+
+ROUNDED = 2e-3
+"""Orders that differ by no larger a share are the same; races slip by ten times as much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,19 @@ class BearingOrders:
     def ball_pass(self) -> float:
         """2 BSF: strikes of a spot on a ball per revolution of the shaft."""
         return 2.0 * self.ball
+
+    def __str__(self) -> str:
+        """Its designations in the catalogue, e.g. ``"6205"``, or else the four orders."""
+        names = [name for name, known in catalogue().items() if self.same_as(known)]
+        orders = f"BPFI {self.inner:.5g}, BPFO {self.outer:.5g}, BSF {self.ball:.5g}, FTF {self.cage:.4g}"
+        return " or ".join(names) or orders
+
+    def same_as(self, other: BearingOrders) -> bool:
+        """Whether all four are those of ``other``, but for how they were rounded."""
+        return all(
+            math.isclose(mine, its, rel_tol=ROUNDED)
+            for mine, its in zip(astuple(self), astuple(other), strict=True)
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,9 +89,7 @@ def load_streams(
     return notes, loaded
 
 
-def channels_of(
-    path: str, expected: Sequence[str], memory_bytes: int
-) -> tuple[dict[str, int], tuple[()]]:
+def channels_of(path: str, expected: Sequence[str], memory_bytes: int) -> tuple[dict[str, int], tuple[()]]:
     """See `daqsvc.recording.recording.list_channels`.
 
     Raises:

@@ -385,6 +385,7 @@ def test_what_calibrate_wrote_by_options_is_read_by_options(verb: Run, tmp_path:
         ("--channels", "other", "has no channel 'other'"),
         ("--fs", "10000", "is sampled at 12000 Hz, not sampled at 10000 Hz; calibrate as it is watched"),
         ("--speed-rpm", "900", "is of a machine at 1797 rpm, not of a machine at 900 rpm"),
+        ("--bearing", "6203", "of another bearing (6205) than is watched there (6203 or 6204"),
     ):
         code, (found,), _ = verb("analyze", run, *both, option, value, "--calibration", out)
         assert (code, found["verdict"]) == (3, None)

@@ -131,7 +131,7 @@ def race_baseline(
 ) -> RaceBaseline:
     """Remember a bearing in good order; arguments and errors as of `race_test`."""
     features = race_features(samples, rate_hz, speed_rpm, bearing, rules or RaceRules())
-    return RaceBaseline(features.evidence, features.levels, features.speed_rpm)
+    return RaceBaseline(features.evidence, features.levels, features.speed_rpm, bearing)
 
 
 def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline | None) -> RaceVerdict:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from daqsvc.bearing.geometry import BearingOrders
+
     Complex = NDArray[np.complex128]
 
 
@@ -266,11 +268,13 @@ class RaceBaseline:
         evidence: what spoke for each part although it was in good order.
         levels: mean square in octave bands.
         speed_rpm: of the shaft.
+        orders: of the bearing; None if not known.
     """
 
     evidence: Mapping[Part, PartEvidence]
     levels: BandLevels
     speed_rpm: float
+    orders: BearingOrders | None = None
 
 
 def band_levels(spectrum: Complex, samples: int, rate_hz: float) -> BandLevels:

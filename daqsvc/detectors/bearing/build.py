@@ -192,7 +192,7 @@ def orders_of(settings: WatchedBearing, index: int) -> BearingOrders:
 def _fitting(
     path: Path, bearings: list[HousedBearing], rate_hz: float, speed_rpm: float | None
 ) -> BearingBaseline:
-    """The healthy machine of a file, if it is that of these accelerometers at this rate and speed.
+    """The healthy machine of a file, if it is that of these bearings at this rate and speed.
 
     Args:
         path: the file.
@@ -224,22 +224,43 @@ def _fitting(
                 f"{path}: is {what.format(value)}, not {what.format(wanted)}; calibrate as it is watched"
             )
     for bearing in bearings:
-        if bearing.two is None:
-            continue
-        pair = baseline.pairs.get(bearing.sensors)
-        names = " and ".join(bearing.sensors)
-        if pair is None:
-            raise BaselineFileError(f"{path}: holds nothing of {names} together; calibrate with both")
-        if pair.parameters != bearing.two.model.parameters:
-            raise BaselineFileError(
-                f"{path}: was learnt with other masses, springs or dampers of {bearing.name} than "
-                "pipeline.bearing.bearings has now; calibrate again, or restore them"
-            )
-        try:
-            TwoSensorMonitor(pair)
-        except ValueError as error:
-            raise BaselineFileError(f"{path}: pair of {names}: {error}; calibrate again") from None
+        _refuse_other_bearing(path, baseline, bearing)
     return baseline
+
+
+def _refuse_other_bearing(path: Path, baseline: BearingBaseline, bearing: HousedBearing) -> None:
+    """Refuse the healthy machine of a file whose bearing at this place is another one.
+
+    Raises:
+        BaselineFileError: it has other orders, masses, springs or dampers.
+    """
+    learnt = baseline.races[bearing.sensor].orders
+    if learnt is None:
+        log.warning(
+            "%s: does not say of which bearing it was learnt at %s; calibrate again, and that is checked",
+            path,
+            bearing.sensor,
+        )
+    elif not learnt.same_as(bearing.orders):
+        raise BaselineFileError(
+            f"{path}: was learnt at {bearing.sensor} of another bearing ({learnt}) than is watched there "
+            f"({bearing.orders}); calibrate with this bearing, or restore the other"
+        )
+    if bearing.two is None:
+        return
+    pair = baseline.pairs.get(bearing.sensors)
+    names = " and ".join(bearing.sensors)
+    if pair is None:
+        raise BaselineFileError(f"{path}: holds nothing of {names} together; calibrate with both")
+    if pair.parameters != bearing.two.model.parameters:
+        raise BaselineFileError(
+            f"{path}: was learnt with other masses, springs or dampers of {bearing.name} than "
+            "pipeline.bearing.bearings has now; calibrate again, or restore them"
+        )
+    try:
+        TwoSensorMonitor(pair)
+    except ValueError as error:
+        raise BaselineFileError(f"{path}: pair of {names}: {error}; calibrate again") from None
 
 
 def _kept(

@@ -12,7 +12,7 @@ from support.bearing_signals import healthy
 from support.machine_files import MACHINES, changed, only_problem, parsed, problems_of
 
 from daqsvc.bearing.baseline import learn_baseline, save_bearing_baseline
-from daqsvc.bearing.geometry import bearing_orders
+from daqsvc.bearing.geometry import BearingOrders, bearing_orders
 from daqsvc.cli import main
 from daqsvc.detectors.bearing.build import pair_models
 from daqsvc.detectors.bearing.detector import BearingDetector
@@ -163,12 +163,11 @@ def test_a_rate_too_low_for_the_rolling_elements_stops_it() -> None:
 def test_a_calibration_of_other_masses_or_without_the_pair_stops_it(right, tmp_path) -> None:
     pair, path = f'{TYPE}\nrotor_sensor = "accel-fe"\n{MODEL}', tmp_path / "motor.toml"
     given = machine((TYPE, pair))
-    names, orders = ("accel-fe", "accel-de"), bearing_orders("6205")
+    names = ("accel-fe", "accel-de")
     samples = dict(zip(names, (healthy(8.0, seed, rate_hz=25_600.0) for seed in (1, 2)), strict=True))
-    bearings = {"accel-de": orders, "accel-fe": orders}
     together = [names, ("accel-fe",)]
     models = pair_models(given, given.pipeline.bearing)
-    learnt = learn_baseline(samples, 25_600.0, 1772.0, bearings, together, pairs=models)
+    learnt = learn_baseline(samples, 25_600.0, 1772.0, ORDERS, together, pairs=models)
     named = ("calibrate_s = 30.0", f'calibration = "{path}"')
     save_bearing_baseline(learnt, path)
     kept = detector(machine((TYPE, pair), named)).baseline.pairs[names]
@@ -247,9 +246,15 @@ def test_a_bearing_that_nobody_knows_stops_the_assembly() -> None:
         detector(machine(("bpfi = 4.9469", "bpfi = 7.0")))
 
 
+ORDERS = {
+    "accel-de": bearing_orders("6205"),
+    "accel-fe": BearingOrders(inner=4.9469, outer=3.0530, ball=1.9940, cage=0.3817),
+}
+
+
 def baseline(rate_hz, speed_rpm, *sensors):
     samples = dict(zip(sensors, (healthy(8.0, seed, rate_hz=rate_hz) for seed in (1, 2)), strict=False))
-    orders = dict.fromkeys(sensors, bearing_orders("6205"))
+    orders = {name: ORDERS[name] for name in sensors}
     return learn_baseline(samples, rate_hz, speed_rpm, orders, [(name,) for name in sensors])
 
 
@@ -279,6 +284,25 @@ def test_a_calibration_that_does_not_fit_stops_it(tmp_path, rate_hz, speed_rpm, 
     key = rf"pipeline\.bearing\.calibration = '.*motor\.toml': .*{said}"
     with pytest.raises(AssemblyError, match=key):
         detector(machine(("calibrate_s = 30.0", f'calibration = "{path}"')))
+
+
+def test_a_calibration_of_another_bearing_stops_it_and_one_that_names_none_is_taken(
+    right, tmp_path, caplog
+) -> None:
+    path = tmp_path / "motor.toml"
+    save_bearing_baseline(right, path)
+    named = ("calibrate_s = 30.0", f'calibration = "{path}"')
+    other = r"motor.toml: was learnt at accel-de of another bearing \(6205\) than is watched there \(6206\)"
+    with pytest.raises(AssemblyError, match=other):
+        detector(machine((TYPE, 'type = "6206-2RS"'), named))
+    with pytest.raises(AssemblyError, match=r"\(6203 or 6204 .* is watched there \(BPFI 5.2, BPFO 3.2, BSF "):
+        detector(machine(("bpfi = 4.9469, bpfo = 3.0530", "bpfi = 5.2, bpfo = 3.2"), named))
+    assert detector(machine(("bpfi = 4.9469", "bpfi = 4.95"), named)).baseline.races == right.races
+    assert not caplog.text, "it is another bearing by no more than how its orders are rounded"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line for line in lines if not line.startswith("orders = ")))
+    assert detector(machine((TYPE, 'type = "6206-2RS"'), named)).baseline.races["accel-fe"].orders is None
+    assert "motor.toml: does not say of which bearing it was learnt at accel-de" in caplog.text
 
 
 def test_a_kept_state_is_taken_up_or_learnt_anew(right, tmp_path, caplog) -> None:
