@@ -28,7 +28,7 @@ from daqsvc.publish.output import output_name
 from daqsvc.publish.payloads import Figures
 from daqsvc.self_check import BusHealth, conditions
 from daqsvc.settings.streams import Grid
-from daqsvc.supervision import EssentialLostError, Supervisor, over, stop_all
+from daqsvc.supervision import EssentialLostError, Progress, Supervisor, over, stop_all
 from daqsvc.threads import CallThreads
 from drivers.base import DeviceAbsentError
 from drivers.make import bus_drivers, bus_self_checks
@@ -332,6 +332,35 @@ class Service:
                 _has_heard(driver),
             )
         return health
+
+    def awaited(self, *, patient: bool = True) -> dict[str, str]:
+        """The buses that keep the service from being ready, and what each is waited for.
+
+        One with ``start = "error"`` must deliver samples. Any other must have been tried once, for then the
+        service goes on without it as the machine file says.
+
+        Args:
+            patient: whether to wait for the latter at all.
+        """
+        awaited: dict[str, str] = {}
+        for driver in self.drivers:
+            link = driver.link
+            if self.machine.buses[driver.name].start == "error":
+                if not any(self.rings[stream].started for stream in driver.streams):
+                    awaited[driver.name] = "no samples have come yet"
+            elif patient and not (link.ever_up or link.reason or link.over):
+                awaited[driver.name] = "it is being opened"
+        return awaited
+
+    def progress(self) -> dict[str, Progress]:
+        """How far each part has come that can stall: readers of buses, detectors, the journal's writer."""
+        readers = {
+            f"driver {driver.name}": Progress(
+                link.turns if (link := driver.link).state == "up" and link.turns else None
+            )
+            for driver in self.drivers
+        }
+        return {**readers, **self.pipeline.progress(), "outbox": self.alarms.outbox.progress}
 
     async def _tell_status(self) -> None:
         while True:

@@ -12,14 +12,16 @@ import logging
 import threading
 import time
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.link import Backoff
+from daqsvc.threads import kept_waiting_s, where_is
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 
     Work = Callable[[], Coroutine[Any, Any, None]]
 
@@ -225,6 +227,79 @@ class Part:
     def _finish(self) -> None:
         if not self.over.done():
             self.over.set_result(None)
+
+
+MOST_LOOK_S = 2.0
+"""What counts of the time between two looks at most: a process that was suspended has not stalled."""
+
+
+class Progress(NamedTuple):
+    """How far a part has come.
+
+    Attributes:
+        step: other after every step of it; None while it has nothing to do.
+        thread: what it works in, if that is known.
+    """
+
+    step: object
+    thread: threading.Thread | None = None
+
+
+@dataclass(slots=True)
+class _Standstill:
+    step: object
+    still_s: float = 0.0
+    waited_s: float = 0.0
+    said: bool = False
+
+
+class StallWatch:
+    """Finds parts that have something to do and get nowhere.
+
+    Time is counted from look to look, and without what a part's thread has waited for a processor: where the
+    whole process gets on slowly, or not at all for a while, no part of it has stalled.
+
+    Args:
+        limit_s: without a step for so long, a part has stalled.
+        then: what follows, for the log, e.g. ``"the service is started again"``.
+    """
+
+    def __init__(self, limit_s: float, then: str) -> None:
+        self._limit_s = limit_s
+        self._then = then
+        self._looked_s: float | None = None
+        self._parts: dict[str, _Standstill] = {}
+
+    def look(self, parts: Mapping[str, Progress], now_s: float) -> list[str]:
+        """The parts that have stalled; each is said once.
+
+        Args:
+            parts: by name, how far each has come.
+            now_s: monotonic clock.
+        """
+        passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, MOST_LOOK_S)
+        self._looked_s = now_s
+        stalled: list[str] = []
+        for name, (step, thread) in parts.items():
+            waited_s = 0.0 if thread is None else kept_waiting_s(thread)
+            before = self._parts.get(name)
+            if before is None or step is None or step != before.step:
+                if before is not None and before.said:
+                    logger.warning("%s gets on again", name)
+                self._parts[name] = _Standstill(step, waited_s=waited_s)
+                continue
+            before.still_s += max(0.0, passed_s - max(0.0, waited_s - before.waited_s))
+            before.waited_s = waited_s
+            if before.still_s < self._limit_s:
+                continue
+            stalled.append(name)
+            if not before.said:
+                before.said = True
+                where = "" if thread is None else f"; its thread is in {where_is(thread.ident)}"
+                logger.critical(
+                    "%s has stalled, without a step for %g s: %s%s", name, self._limit_s, self._then, where
+                )
+        return stalled
 
 
 async def stop_all(parts: Iterable[Part], patience_s: float) -> None:

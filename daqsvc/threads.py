@@ -6,7 +6,10 @@ disk that is gone, would keep the process from ending. And a pool that has lost 
 
 from __future__ import annotations
 
+import sys
+import traceback
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
@@ -49,6 +52,31 @@ def call_in_thread(call: Callable[[], T], *, name: str) -> Future[T]:
     outcome.set_running_or_notify_cancel()
     Thread(target=_settle, args=(outcome, call), name=f"blocking {name}", daemon=True).start()
     return outcome
+
+
+def where_is(ident: int | None) -> str:
+    """Where in the program a thread is, innermost first: ``"read (x.py:12), called from drain (y.py:3)"``."""
+    frame = sys._current_frames().get(ident or 0)  # noqa: SLF001 - there is no other way to look
+    steps = [f"{s.name} ({Path(s.filename).name}:{s.lineno})" for s in traceback.extract_stack(frame)[-3:]]
+    return ", called from ".join(reversed(steps)) if frame is not None else "a thread that is gone"
+
+
+def kept_waiting_s(thread: Thread) -> float:
+    """How long a thread has waited for a processor so far; 0 where the kernel does not count that."""
+    try:
+        _, waited_ns, _ = Path(f"/proc/self/task/{thread.native_id}/schedstat").read_text().split()
+    except (OSError, ValueError):
+        return 0.0
+    return int(waited_ns) / 1e9
+
+
+def bytes_moved(thread: Thread) -> int:
+    """What a thread has read and written so far; 0 where the kernel does not count that."""
+    try:
+        lines = Path(f"/proc/self/task/{thread.native_id}/io").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in lines if line.startswith(("rchar", "wchar")))
 
 
 def _settle(outcome: Future[T], call: Callable[[], T]) -> None:

@@ -103,6 +103,8 @@ class Link:
         losses: how often it went down after it had been up.
         reason: why it is down.
         over: why nothing more comes over it, in a clause with its name; empty while it is up or tried again.
+        turns: how often the thread that reads it has come round, whether there was anything or not; it does
+            so several times a second. 0 where the event loop reads.
     """
 
     name: str
@@ -110,6 +112,7 @@ class Link:
     losses: int = 0
     reason: str = ""
     over: str = ""
+    turns: int = 0
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)
@@ -151,6 +154,10 @@ class Link:
         ended = f"{self.name} has ended: {reason}"
         logger.info("%s", ended)
         self.state, self.reason, self._said_down, self.over = "down", reason, False, ended
+
+    def turn(self) -> None:
+        """The thread that reads has come round once more; called on it."""
+        self.turns += 1
 
     def stop(self) -> None:
         """Nobody keeps the link up any more: its driver was stopped. That is no loss."""

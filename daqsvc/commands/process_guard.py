@@ -12,13 +12,11 @@ import logging
 import os
 import select
 import signal
-import sys
 import threading
-import traceback
-from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from daqsvc.commands.arguments import EXIT_HUNG, EXIT_STUCK
+from daqsvc.threads import where_is
 
 if TYPE_CHECKING:
     import asyncio
@@ -54,13 +52,18 @@ class ProcessGuard:
 
     Args:
         flush: waits for the log to be written, at most so many seconds.
+        on_stopping: called once when the service begins to stop, on any thread.
         end: ends the process with an exit code.
     """
 
     def __init__(
-        self, flush: Callable[[float], None] = lambda _: None, end: Callable[[int], object] = os._exit
+        self,
+        flush: Callable[[float], None] = lambda _: None,
+        on_stopping: Callable[[], object] = lambda: None,
+        end: Callable[[int], object] = os._exit,
     ) -> None:
         self._flush = flush
+        self._on_stopping = on_stopping
         self._end_process = end
         self._stop: Callable[[], None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -71,6 +74,7 @@ class ProcessGuard:
         self._heard, self._tell = os.pipe()
         self._turns_stopping: int | None = None
         self._turns_still: int | None = None
+        self._turns_said: int | None = None
         self._answered = True
         self._over = False
         self._outlives_terminal = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -120,14 +124,21 @@ class ProcessGuard:
         """
         self._close = close
 
-    def expect_turns(self) -> None:
-        """From now on the event loop turns; one that stands still is ended."""
+    def expect_turns(self, say_after_s: float | None = None) -> None:
+        """From now on the event loop turns; one that stands still is ended.
+
+        Args:
+            say_after_s: after so long it is said, as whoever watches the process from outside may end it
+                before the guard does.
+        """
+        self._turns_said = None if say_after_s is None else max(1, round(say_after_s / TURN_S))
         self._turns_still = 0
 
     def stopping(self) -> None:
         """The service has begun to stop, for whatever reason; from any thread."""
         if self._turns_stopping is None:
             self._turns_stopping = 0
+            self._on_stopping()
 
     def lose_terminal(self, reason: str) -> None:
         """Stop because whoever watched the process is gone; from any thread."""
@@ -163,6 +174,9 @@ class ProcessGuard:
                 loop.call_soon_threadsafe(self._answer)
             return
         self._turns_still = (self._turns_still or 0) + 1
+        if self._turns_still == self._turns_said:
+            still_s = self._turns_said * TURN_S
+            self._say(f"the event loop has stood still for {still_s:g} s: {self._where_loop_is()}")
         if self._turns_still > STUCK_TURNS:
             still_s = STUCK_TURNS * TURN_S
             self._end(
@@ -207,13 +221,16 @@ class ProcessGuard:
     def _end(self, code: int, sentence: str) -> None:
         closed = self._close is None or self._close(CLOSE_S)
         journal = "" if closed else "; the journal could not be closed"
+        self._say(f"{sentence}{journal}")
+        self._over = True
+        self._end_process(code)
+
+    def _say(self, sentence: str) -> None:
         # The log's lock may be held by what hangs.
-        saying = threading.Thread(target=log.critical, args=("%s%s", sentence, journal), daemon=True)
+        saying = threading.Thread(target=log.critical, args=("%s", sentence), daemon=True)
         saying.start()
         saying.join(SAY_S)
         self._flush(SAY_S)
-        self._over = True
-        self._end_process(code)
 
     def _what_hangs(self) -> str:
         threads = [t.name for t in threading.enumerate() if not t.daemon and t not in self._others]
@@ -221,10 +238,7 @@ class ProcessGuard:
         return f"{hanging}{self._where_loop_is()}"
 
     def _where_loop_is(self) -> str:
-        frame = sys._current_frames().get(self._main)  # noqa: SLF001 - there is no other way to look
-        stack = traceback.extract_stack(frame)[-3:]
-        steps = [f"{step.name} ({Path(step.filename).name}:{step.lineno})" for step in reversed(stack)]
-        return f"the event loop is in {', called from '.join(steps)}"
+        return f"the event loop is in {where_is(self._main)}"
 
     def _end_soon(self, lingering: list[threading.Thread]) -> None:
         for thread in lingering:

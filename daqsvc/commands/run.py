@@ -6,6 +6,7 @@ import asyncio
 import gc
 import logging
 import os
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from daqsvc import kernel_cache
 from daqsvc.commands.arguments import EXIT_FAILED, EXIT_HUNG, EXIT_LOST, EXIT_OK, EXIT_STUCK, EXIT_USAGE
 from daqsvc.commands.log_thread import LogThread
 from daqsvc.commands.process_guard import ProcessGuard
+from daqsvc.commands.service_manager import ServiceManager
 from daqsvc.commands.store_argument import StoreNotFoundError, store_directory
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ class RunCommand:
 
     def run(self, arguments: argparse.Namespace) -> int:
         """See `daqsvc.cli.Command.run`."""
+        manager = ServiceManager.of_environment()
         handler = LogThread(STDERR)
         self._start_logging(verbose=arguments.verbose, handler=handler)
         try:
@@ -75,15 +78,16 @@ class RunCommand:
             if machine is None:
                 return EXIT_USAGE
             kernel_cache.prepare()
-            with ProcessGuard(handler.flush_within) as guard:
+            with ProcessGuard(handler.flush_within, manager.stopping) as guard:
                 # Under systemd its journal reads the log, whose restart is no reason to stop.
                 handler.on_gone = None if "JOURNAL_STREAM" in os.environ else guard.lose_terminal
-                return _run(machine, arguments.store, guard)
+                return _run(machine, arguments.store, guard, manager)
         finally:
+            manager.close()
             handler.flush_within(LOG_S)
 
 
-def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard) -> int:
+def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
     from daqsvc.outbox.store import OutboxError  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
@@ -91,8 +95,11 @@ def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard) -> int:
     from drivers.frames import LayoutError  # noqa: PLC0415
 
     try:
-        asyncio.run(_run_until_stopped(machine, store or store_directory(machine), guard))
-    except (AssemblyError, DeviceAbsentError, LayoutError, OutboxError, StoreNotFoundError) as error:
+        asyncio.run(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
+    except (AssemblyError, LayoutError) as error:
+        log.critical("%s", error)
+        return EXIT_USAGE
+    except (DeviceAbsentError, OutboxError, StoreNotFoundError) as error:
         log.critical("%s", error)
         return EXIT_FAILED
     except EssentialLostError as error:
@@ -104,19 +111,24 @@ def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard) -> int:
     return EXIT_OK
 
 
-async def _run_until_stopped(machine: MachineFile, store: Path, guard: ProcessGuard) -> None:
+async def _run_until_stopped(
+    machine: MachineFile, store: Path, guard: ProcessGuard, manager: ServiceManager
+) -> None:
     from daqsvc.service import Service  # noqa: PLC0415
+    from daqsvc.supervision import stop_all  # noqa: PLC0415
 
     stop = asyncio.Event()
     service = Service(machine, store, on_ending=guard.stopping)
     guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)
     running = asyncio.create_task(service.run(stop), name="service")
+    follow = partial(manager.follow, service)
+    following = [service.supervisor.keep("service manager", follow, may_end=lambda: True)]
     ready = asyncio.create_task(service.ready.wait(), name="ready")
     try:
         await asyncio.wait({running, ready}, return_when=asyncio.FIRST_COMPLETED)
         if service.ready.is_set():
-            guard.expect_turns()
+            guard.expect_turns(manager.watchdog_s and manager.watchdog_s / 2)
             # What the start has made stays until the end. Looking through it for garbage, libraries and all
             # alarms, would hold up the event loop for some .1 s each time.
             gc.freeze()
@@ -124,4 +136,5 @@ async def _run_until_stopped(machine: MachineFile, store: Path, guard: ProcessGu
         await running
     finally:
         ready.cancel()
+        await stop_all(following, LOG_S)
     log.info("stopped")

@@ -21,7 +21,7 @@ from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
 from daqsvc.diagnosis.record import silence_reason
 from daqsvc.dsp.quality.missing import Patience
-from daqsvc.supervision import Supervisor, over
+from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
 
 if TYPE_CHECKING:
@@ -255,6 +255,16 @@ class Pipeline:
     def behind_samples(self) -> int:
         """Samples that the slowest detector has not read yet."""
         return max((reader.behind for reader in self._readers.values()), default=0)
+
+    def progress(self) -> dict[str, Progress]:
+        """How far each detector has come with the samples that wait for it."""
+        parts: dict[str, Progress] = {}
+        for detector in self.detectors:
+            reader, job = self._readers[detector.name], self._under_way.get(detector.name)
+            waits = job is not None or reader.behind >= detector.block
+            step = (self.counters[detector.name].windows, reader.position) if waits else None
+            parts[_part(detector)] = Progress(step, None if job is None else job.thread)
+        return parts
 
     def stand(self, stream: str, standing: StreamState) -> None:
         """Take in how a stream stands; call on the event loop.

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.outbox.writer import Failure
+    from daqsvc.supervision import Progress
 
 _T = TypeVar("_T")
 
@@ -248,6 +249,11 @@ class Outbox:
             await asyncio.sleep(LOOK_S)
         why = self._books.broken or "has stopped: its thread was lost"
         return f"outbox {self._journal.path} {why}; no alarm can reach the disk any more"
+
+    @property
+    def progress(self) -> Progress:
+        """How far the thread that writes the alarms has come."""
+        return self._writer.progress
 
     def close_from_outside(self, timeout_s: float) -> bool:
         """Like `close`, but from any thread, and of the alarms only: the way out if the event loop hangs.

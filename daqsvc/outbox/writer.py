@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from daqsvc.outbox.files import FileError, is_corrupt
 from daqsvc.outbox.messages import Draft, OutboxAwayError, OutboxError, OutboxMessage
+from daqsvc.supervision import Progress
+from daqsvc.threads import bytes_moved
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -173,6 +175,7 @@ class JournalWriter:
         self._waiting: dict[int, asyncio.Future[int]] = {}
         """By number, who waits for a message to be on the disk."""
         self._thread: threading.Thread | None = None
+        self._turns = 0
 
     def start(self) -> tuple[asyncio.Future[int | None], asyncio.Future[None]]:
         """Start the thread.
@@ -194,6 +197,14 @@ class JournalWriter:
     def is_alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread is not None and self._thread.is_alive()
+
+    @property
+    def progress(self) -> Progress:
+        """How far the thread has come; it comes round several times a second, also while the disk fails."""
+        if self._thread is None or not self._thread.is_alive():
+            return Progress(None)
+        # Saving what can be read of a large file is one turn, however long it takes.
+        return Progress((self._turns, bytes_moved(self._thread)), self._thread)
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the end of the thread, at most so long; whether it has ended. Blocks; from any thread."""
@@ -317,6 +328,7 @@ class JournalWriter:
 
     def _gather(self, batch: Batch, *, wait: bool) -> None:
         """Add what has arrived; marks alone wait for company for a while."""
+        self._turns += 1
         if wait:
             batch.add(self._next())
             if self._crowd.is_there(time.monotonic()) and not batch.reads:
@@ -337,6 +349,7 @@ class JournalWriter:
         # Not one long wait: whatever interrupts a thread does so between two steps, and would take with it
         # what has just been got.
         while True:
+            self._turns += 1
             with contextlib.suppress(queue.Empty):
                 return self._work.get(timeout=IDLE_S)
 
@@ -353,6 +366,7 @@ class JournalWriter:
         """Until the disk is tried again, have what comes go out from memory, if it can be read there."""
         until = time.monotonic() + seconds
         while not self._closing.is_set() and (left_s := until - time.monotonic()) > 0:
+            self._turns += 1
             try:
                 batch.add(self._work.get(timeout=min(left_s, IDLE_S)))
             except queue.Empty:

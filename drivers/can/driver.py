@@ -66,6 +66,7 @@ class CanReader(threading.Thread):
         accept: called on the event loop with each batch, one in a turn of it.
         loop: the event loop.
         record: called with each batch as it came, on this thread; must not wait.
+        turn: called on this thread each time it comes round.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class CanReader(threading.Thread):
         accept: Callable[[DecodedBatch], None],
         loop: asyncio.AbstractEventLoop,
         record: Callable[[CanBatch], None] | None = None,
+        turn: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(name=f"can-reader {link_name}", daemon=True)
         self.ended: asyncio.Future[str] = loop.create_future()
@@ -85,6 +87,7 @@ class CanReader(threading.Thread):
         self._accept = accept
         self._hand = HandOver(loop)
         self._record = record
+        self._turn = turn
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
 
@@ -92,6 +95,7 @@ class CanReader(threading.Thread):
         """Read until told to stop or the bus fails; see `threading.Thread.run`."""
         try:
             while not self._stopping.is_set():
+                self._turn()
                 self._drain()
             reason = "it was closed"
         except BusOffError:
@@ -258,6 +262,7 @@ class CanDriver:
             self.accept,
             asyncio.get_running_loop(),
             None if self._recorder is None else self._recorder.record,
+            self.link.turn,
         )
         reader.start()
         try:

@@ -136,7 +136,9 @@ class SerialDriver:
         """Read until the link fails; returns why."""
         self._framing.restart()
         loop = asyncio.get_running_loop()
-        reader = SerialReader(self.link.name, device, self._framing, self, self._port.clock, loop)
+        reader = SerialReader(
+            self.link.name, device, self._framing, self, self._port.clock, loop, self.link.turn
+        )
         reader.start()
         try:
             return await ended(reader.ended, reader, reader.cutter)

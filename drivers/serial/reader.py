@@ -93,6 +93,7 @@ class SerialReader(threading.Thread):
         receiver: who is given the frames.
         clock: stamps arrivals.
         loop: where the receiver lives.
+        turn: called on this thread each time it comes round.
 
     Attributes:
         ended: what becomes the reason why the reading has ended.
@@ -107,6 +108,7 @@ class SerialReader(threading.Thread):
         receiver: Receiver,
         clock: Clock,
         loop: asyncio.AbstractEventLoop,
+        turn: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__(name=f"reader of {name}", daemon=True)
         self.ended: asyncio.Future[str] = loop.create_future()
@@ -117,6 +119,7 @@ class SerialReader(threading.Thread):
         self._framing = framing
         self._receiver = receiver
         self._clock = clock
+        self._turn = turn
         self._hand = HandOver(loop)
         self._stopping = threading.Event()
         self._under_way = threading.BoundedSemaphore(BATCHES_UNDER_WAY)
@@ -134,6 +137,7 @@ class SerialReader(threading.Thread):
         """Read until `close` is called or the port fails."""
         try:
             while not self._stopping.is_set():
+                self._turn()
                 self._drain()
             reason = "it was closed"
         except _HungUpError as error:

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import daqsvc.service
 from daqsvc import cli
 from daqsvc.commands import run
+from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.supervision import Supervisor
 
 
 async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(monkeypatch, tmp_path):
@@ -19,6 +21,7 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
         def __init__(self, *_, **__):
             self.ready = asyncio.Event()
             self.alarms = SimpleNamespace(outbox=SimpleNamespace(close_from_outside=None))
+            self.supervisor = Supervisor()
 
         async def run(self, stop):
             frozen.append(gc.get_freeze_count())
@@ -29,11 +32,11 @@ async def test_what_the_start_has_made_is_not_looked_through_for_garbage_again(m
 
     monkeypatch.setattr(daqsvc.service, "Service", Service)
     guard = SimpleNamespace(
-        stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda: None
+        stopping=None, protect=lambda _: None, stop_by=lambda *_: None, expect_turns=lambda _: None
     )
     machine = SimpleNamespace(machine=SimpleNamespace(name="rig"))
     try:
-        await asyncio.wait_for(run._run_until_stopped(machine, tmp_path, guard), 10.0)
+        await asyncio.wait_for(run._run_until_stopped(machine, tmp_path, guard, ServiceManager()), 10.0)
     finally:
         gc.unfreeze()
     assert frozen[1] > frozen[0] + 1000

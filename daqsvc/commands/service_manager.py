@@ -1,0 +1,179 @@
+"""What systemd is told of a service: that it is ready, how it stands, that it gets on, that it stops.
+
+The protocol is sd_notify(3): datagrams of assignments to the socket that ``$NOTIFY_SOCKET`` names. Without
+that nothing is told and nothing is watched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import socket
+from typing import TYPE_CHECKING, Self
+
+from daqsvc.supervision import StallWatch
+
+if TYPE_CHECKING:
+    from daqsvc.service import Service
+
+log = logging.getLogger(__name__)
+
+VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+US_PER_S = 1_000_000
+SEND_S = 0.1
+"""What a datagram may take: systemd takes them at once, unless it is being replaced by a new version."""
+
+LOOK_S = 0.2
+CHANGE_S = 1.0
+"""A change of the status is told no sooner than so long after the last one."""
+REFRESH_S = 10.0
+"""How often figures are told that change all the time."""
+
+EXTEND_EVERY_S, EXTEND_BY_S = 5.0, 30.0
+START_MOST_S = 900.0
+"""What opening the journal and compiling kernels may take, on the slowest box."""
+TRIED_S = 10.0
+"""How long a bus is waited for that the service can do without: some take long to be found absent."""
+
+STARTING = "starting: the journal is opened and kernels are compiled, which takes long the first time only"
+LONGEST_REASON = 80
+
+
+class ServiceManager:
+    """The socket of systemd, or of whoever else speaks its protocol.
+
+    Args:
+        address: ``$NOTIFY_SOCKET``: a path, or ``@`` and the name of an abstract socket; empty for nobody.
+        watchdog_s: how soon the service is ended that is silent; None if nobody waits for it.
+    """
+
+    def __init__(self, address: str = "", watchdog_s: float | None = None) -> None:
+        self.watchdog_s = watchdog_s if address else None
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self._stopping = False
+        self._socket: socket.socket | None = None
+        if address:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+            self._socket.settimeout(SEND_S)
+
+    @classmethod
+    def of_environment(cls) -> Self:
+        """The one that has started this process; its variables are taken away, they are for no child."""
+        address, watchdog_us, watchdog_pid = (os.environ.pop(name, "") for name in VARIABLES)
+        if not address.startswith(("/", "@")):
+            return cls()
+        ours = watchdog_pid in {"", f"{os.getpid()}"}
+        watched = ours and watchdog_us.isdecimal() and int(watchdog_us) > 0
+        return cls(address, int(watchdog_us) / US_PER_S if watched else None)
+
+    def close(self) -> None:
+        """Tell nothing more."""
+        if self._socket is not None:
+            self._socket.close()
+
+    def tell(self, **assignments: object) -> bool:
+        """Tell something; whether it could be told, or nobody wants to know."""
+        if self._socket is None:
+            return True
+        lines = "\n".join(f"{name}={' '.join(f'{value}'.split())}" for name, value in assignments.items())
+        try:
+            self._socket.sendto(lines.encode(), self._address)
+        except OSError as error:
+            log.info("the service manager cannot be told %r: %s", lines, error)
+            return False
+        return True
+
+    def stopping(self) -> None:
+        """The service stops; from any thread."""
+        self._stopping = True
+        self.tell(STOPPING=1, STATUS="stopping")
+
+    async def follow(self, service: Service) -> None:
+        """Tell how a service stands and that it gets on, until cancelled; not for long on its event loop.
+
+        It is told to be ready when every bus delivers that it must have (`Service.awaited`), and to be alive
+        for as long as none of its parts has stalled. A service that is not alive is started again by systemd.
+        """
+        if self._socket is None:
+            return
+        follower = _Follower(self, service)
+        while not self._stopping:
+            follower.look(asyncio.get_running_loop().time())
+            await asyncio.sleep(LOOK_S)
+
+
+class _Follower:
+    """What has been told of one service."""
+
+    def __init__(self, manager: ServiceManager, service: Service) -> None:
+        self._manager = manager
+        self._service = service
+        self._watch: StallWatch | None = None
+        if manager.watchdog_s is not None:
+            then = "the service manager is told nothing more, and starts the service again"
+            self._watch = StallWatch(manager.watchdog_s, then)
+        self._begun_s: float | None = None
+        self._serving_since_s = 0.0
+        self._is_ready = False
+        self._alive_s = self._extended_s = self._told_s = self._refreshed_s = float("-inf")
+        self._told = ""
+
+    def look(self, now_s: float) -> None:
+        if self._begun_s is None:
+            self._begun_s = now_s
+        service = self._service
+        if not service.ready.is_set():
+            self._serving_since_s = now_s
+            self._status(STARTING, STARTING, now_s)
+            self._extend(now_s, gets_on=now_s - self._begun_s < START_MOST_S)
+            return
+        gets_on = self._watch is None or not self._watch.look(service.progress(), now_s)
+        if not self._is_ready:
+            awaited = service.awaited(patient=now_s - self._serving_since_s < TRIED_S)
+            if not awaited:
+                self._is_ready = self._manager.tell(READY=1, STATUS="; ".join(_in_short(service)))
+            else:
+                text = f"waiting for {', '.join(f'bus {bus}: {why}' for bus, why in awaited.items())}"
+                self._status(text, text, now_s)
+                self._extend(now_s, gets_on=gets_on)
+                return
+        self._status(*_in_short(service), now_s)
+        if gets_on and self._manager.watchdog_s and now_s - self._alive_s >= self._manager.watchdog_s / 2:
+            self._manager.tell(WATCHDOG=1)
+            self._alive_s = now_s
+
+    def _extend(self, now_s: float, *, gets_on: bool) -> None:
+        if gets_on and now_s - self._extended_s >= EXTEND_EVERY_S:
+            self._manager.tell(EXTEND_TIMEOUT_USEC=round(EXTEND_BY_S * US_PER_S))
+            self._extended_s = now_s
+
+    def _status(self, standing: str, figures: str, now_s: float) -> None:
+        """Tell ``standing`` with ``figures`` if the former has changed, or is told for long."""
+        is_new = standing != self._told and now_s - self._told_s >= CHANGE_S
+        if not is_new and now_s - self._refreshed_s < REFRESH_S:
+            return
+        if self._manager.tell(STATUS=standing if figures == standing else f"{standing}; {figures}"):
+            self._told, self._told_s, self._refreshed_s = standing, now_s, now_s
+
+
+def _in_short(service: Service) -> tuple[str, str]:
+    """How a service stands, and the figures that change all the time."""
+    down = {d.name: d.link.reason or "it is being opened" for d in service.drivers if d.link.state != "up"}
+    count = len(service.drivers)
+    up = f"{count - len(down)} of {count} buses up"
+    if down:
+        up += f" ({', '.join(f'{bus}: {reason[:LONGEST_REASON]}' for bus, reason in down.items())})"
+    shown = {state: number for state, number in service.alarms.manager.shown.items() if number}
+    alarms = ", ".join(f"{number} {state.in_words}" for state, number in shown.items() if state != "normal")
+    said = [up, f"alarms: {alarms or 'none'}"]
+    outbox = service.alarms.outbox.counters
+    if outbox.shut or outbox.unbacked:
+        said.append("the journal cannot be written")
+    brokers = [service.alarms.outputs[path].figures() for path in service.alarms.outputs]
+    said += [
+        f"broker {'connected' if figures['connected'] else 'not connected'}"
+        for figures in brokers
+        if "connected" in figures
+    ]
+    return "; ".join(said), f"{outbox.depth + outbox.waiting} alarm messages wait for the broker"

@@ -1,0 +1,86 @@
+"""The protocol of sd_notify(3), and what makes a part of the service count as stalled."""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from support.notify_sockets import NotifySocket
+
+from daqsvc.commands.service_manager import ServiceManager
+from daqsvc.supervision import Progress, StallWatch
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_what_is_told_comes_as_datagrams_of_assignments(
+    *, abstract: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with NotifySocket(None if abstract else tmp_path) as systemd:
+        monkeypatch.setenv("NOTIFY_SOCKET", systemd.address)
+        monkeypatch.setenv("WATCHDOG_USEC", "3000000")
+        monkeypatch.setenv("WATCHDOG_PID", f"{os.getpid()}")
+        manager = ServiceManager.of_environment()
+        assert manager.watchdog_s == 3.0
+        assert not {"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"} & os.environ.keys(), "for no child"
+        assert manager.tell(READY=1, STATUS="a sentence\nof two lines")
+        assert systemd.next() == {"READY": "1", "STATUS": "a sentence of two lines"}
+        manager.stopping()
+        assert systemd.next() == {"STOPPING": "1", "STATUS": "stopping"}
+    assert manager.tell(READY=1) is False, "nobody is there any more"
+    manager.close()
+
+
+@pytest.mark.parametrize(
+    ("variables", "watchdog_s"),
+    [
+        ({}, None),
+        ({"WATCHDOG_USEC": "3000000"}, None),
+        ({"NOTIFY_SOCKET": "vsock:2:1234", "WATCHDOG_USEC": "3000000"}, None),
+        ({"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "3000000", "WATCHDOG_PID": "1"}, None),
+        ({"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "soon"}, None),
+        ({"NOTIFY_SOCKET": "/nowhere", "WATCHDOG_USEC": "500000"}, 0.5),
+    ],
+)
+def test_the_watchdog_is_on_only_where_somebody_waits_for_this_process(
+    variables: dict[str, str], watchdog_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    manager = ServiceManager.of_environment()
+    assert manager.watchdog_s == watchdog_s
+    assert manager.tell(READY=1) is (variables.get("NOTIFY_SOCKET") != "/nowhere")
+    manager.close()
+
+
+def stalls(steps: list[Any], every_s: float = 1.0, thread: threading.Thread | None = None) -> list[bool]:
+    """At each look, whether a part with these steps has stalled, if it may stand still for 3 s."""
+    watch = StallWatch(3.0, "it is restarted")
+    return [bool(watch.look({"part": Progress(step, thread)}, every_s * n)) for n, step in enumerate(steps)]
+
+
+def test_a_part_has_stalled_that_has_work_and_takes_no_step(caplog: pytest.LogCaptureFixture) -> None:
+    assert stalls([1, 1, 1, 1, 1, 2, 2]) == [False, False, False, True, True, False, False]
+    assert [record.message for record in caplog.records] == [
+        "part has stalled, without a step for 3 s: it is restarted",
+        "part gets on again",
+    ]
+
+
+def test_a_part_without_work_or_that_gets_on_has_not_stalled() -> None:
+    assert not any(stalls([None] * 9))
+    assert not any(stalls([1, 1, None, 1, 1, None, 1, 1]))
+    assert not any(stalls([*range(9)], every_s=2.0))
+
+
+def test_a_process_that_was_suspended_or_starved_has_not_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert stalls([1, 1, 1], every_s=3600.0) == [False, False, True], "one long pause is no standstill"
+    waited = iter(range(100))
+    monkeypatch.setattr("daqsvc.supervision.kept_waiting_s", lambda _: float(next(waited)))
+    assert not any(stalls([1] * 20, thread=threading.current_thread())), "it waits for a processor"
