@@ -71,11 +71,16 @@ class CheckCommand:
         from daqsvc.detectors.make import check_files  # noqa: PLC0415
         from daqsvc.publish.make import check_outputs  # noqa: PLC0415
         from daqsvc.settings import describe  # noqa: PLC0415 - each verb imports only what it needs
+        from daqsvc.settings.hooks import collecting  # noqa: PLC0415
 
         check_files(machine)
         check_outputs(machine)
-        print(describe(machine))  # noqa: T201 - this is what the verb is for
-        return EXIT_OK
+        with collecting() as failures:
+            print(describe(machine))  # noqa: T201 - this is what the verb is for
+        for failed in failures:
+            failed.file = machine.path
+            print(failed, file=sys.stderr)  # noqa: T201
+        return EXIT_USAGE if failures else EXIT_OK
 
 
 def load(path: Path) -> MachineFile | None:

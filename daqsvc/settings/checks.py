@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from daqsvc.settings.alarm_checks import alarm_checks
 from daqsvc.settings.error_messages import dotted
-from daqsvc.settings.failures import mend_or_remove
 from daqsvc.settings.plugins import bus_tables, configured, configured_outputs, driver_of_layout
 from daqsvc.settings.problems import Finding, choice, unique
 from daqsvc.settings.registry import broken_drivers
@@ -62,8 +61,8 @@ def failure(draft: MachineFile, failed: PluginFailedError) -> Finding:
     """A hook that fails, at the table that it was asked about; a warning where the file has no such table."""
     at = next(_places(draft, failed), ())
     table = at[:2] if at[:1] in {("buses",), ("streams",)} else at
-    remedy = mend_or_remove(type(failed.by), dotted(table))
-    return Finding(at, failed.said, remedy, fatal=bool(at))
+    remedy = failed.failure.or_remove(dotted(table))
+    return Finding(at, failed.failure.said, remedy, fatal=bool(at))
 
 
 def _places(draft: MachineFile, failed: PluginFailedError) -> Iterator[KeyPath]:
@@ -169,8 +168,8 @@ def _check_drivers(draft: MachineFile) -> Iterator[Finding]:
         with suppress(UnusableValueError):
             at = ("buses", name, "driver")
             if bus.driver in broken:
-                remedy = f"install the package that brings it again, or remove [buses.{name}]"
-                yield Finding(at, broken[bus.driver], remedy)
+                why = broken[bus.driver]
+                yield Finding(at, why.said, why.or_remove(f"buses.{name}"))
             elif bus.driver not in installed:
                 remedy = f"{choice(bus.driver, installed)}; or install the package that brings it"
                 yield Finding(at, "no such driver is installed", remedy)

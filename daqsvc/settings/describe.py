@@ -91,7 +91,7 @@ def _words(say: Callable[[], str]) -> str:
     try:
         return str(say())
     except PluginFailedError as failed:
-        return failed.said
+        return failed.failure.said
 
 
 _STREAM_HEADER = ("name", "bus", "id", "rate", "frames", "frame", "counter", "bus (est.)")
@@ -109,7 +109,7 @@ def _stream(machine: MachineFile, name: str, stream: Stream) -> Sequence[str]:
     try:
         words = StreamWords() if plugin is None else plugin.describe_stream(machine, name)
     except PluginFailedError as failed:
-        words = StreamWords(frame=failed.said)
+        words = StreamWords(frame=failed.failure.said)
     rate = f"{stream.rate_hz:g} Hz"
     return name, stream.bus, words.frame_id, rate, words.frames, words.frame, words.counter, words.share
 

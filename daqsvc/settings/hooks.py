@@ -6,14 +6,15 @@ guarded, wherever it is called from, so that a new hook needs no guard of its ow
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
-from inspect import isfunction, signature
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from inspect import get_annotations, isfunction, signature
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, get_args
 
-from daqsvc.settings.failures import mend_or_remove, packages, raised
+from daqsvc.settings.answers import meaning, misfit, short, shown
+from daqsvc.settings.failures import BrokenContractError, failure, packages
 from daqsvc.settings.problems import AssemblyError
 from daqsvc.settings.section import UnusableValueError
 
@@ -25,14 +26,6 @@ if TYPE_CHECKING:
 
 ClassT = TypeVar("ClassT", bound="type[Hooks]")
 CallableT = TypeVar("CallableT", bound="Callable[..., Any]")
-
-_KINDS: Mapping[str, type[Any]] = {
-    # Whoever writes a list where one by one would do is understood.
-    **dict.fromkeys(("Iterator", "Iterable", "Collection", "Sequence", "tuple", "list"), Iterable),
-    "Mapping": Mapping,
-    "str": str,
-}
-"""What an answer must be at least, by the head of its annotation."""
 
 _collected: ContextVar[list[PluginFailedError] | None] = ContextVar("collected", default=None)
 
@@ -53,24 +46,28 @@ class Hooks:
                 return get(name)
             with _guarded(self, name):
                 got = get(name)
-            return partial(_called, self, name, got) if callable(got) else got
+                if _declared(self, name).is_property:
+                    return _checked(self, name, got, "is")
+                if not callable(got):
+                    raise BrokenContractError(None, f"it is {short(got)}, not a method")
+            return partial(_called, self, name, got)
 
 
 class _Declared(NamedTuple):
     """What a contract says of a hook.
 
     Attributes:
+        is_property: whether it is no method.
         may_raise: what it raises by intention.
         answer: what it returns, as it is annotated.
-        kind: what an answer is an instance of at least; None if that is not checked.
-        may_be_none: whether it may have no answer.
+        wanted: that as a type.
         at: which of its arguments is a place in the machine file; None if none is.
     """
 
+    is_property: bool
     may_raise: tuple[type[Exception], ...]
     answer: str
-    kind: type[Any] | None
-    may_be_none: bool
+    wanted: Any
     at: int | None
 
 
@@ -86,17 +83,17 @@ class PluginFailedError(AssemblyError, UnusableValueError):
         at: where in the machine file it was asked about; None if the hook is not told.
 
     Attributes:
-        said: what has failed, in words for the author of the plugin, with the line of the plugin's file.
+        failure: what has failed, in words for the author of the plugin, with the line of the plugin's file.
         file: the machine file, once it is known.
         table: what it was asked about, as people write it; empty if it is not known.
     """
 
     def __init__(self, by: Hooks, hook: str, error: Exception, at: KeyPath | None = None) -> None:
         self.by, self.hook, self.at = by, hook, at
-        self.said = raised(error, type(by), hook)
+        self.failure = failure(error, type(by), hook)
         self.file: Path | None = None
         self.table = by.__table__
-        super().__init__(self.said)
+        super().__init__(self.failure.said)
 
     def __str__(self) -> str:
         places = "".join(f"{place}: " for place in (self.file, self.table) if place)
@@ -105,7 +102,7 @@ class PluginFailedError(AssemblyError, UnusableValueError):
     @property
     def words(self) -> str:
         """What has failed, and who can put it right."""
-        return f"{self.said}; {mend_or_remove(type(self.by), self.table)}"
+        return f"{self.failure.said}; {self.failure.or_remove(self.table)}"
 
 
 def contract(kind: ClassT) -> ClassT:
@@ -131,6 +128,26 @@ def brought_by(plugin: Hooks, package: str, table: str) -> None:
     plugin.__dict__["__table__"] = table
 
 
+def see_declared(kind: Any) -> None:
+    """See that the attributes of a class are what its contract says, and its hooks are methods.
+
+    Raises:
+        TypeError: something is not.
+    """
+    for contracted in (one for one in kind.__mro__ if "__hooks__" in vars(one)):
+        for name, annotation in get_annotations(contracted).items():
+            if name.startswith("_") or name in getattr(kind, "model_fields", ()) or not hasattr(kind, name):
+                continue
+            wanted, value = meaning(annotation, contracted.__module__), getattr(kind, name)
+            if misfit(value, wanted):
+                needed = shown(next(iter(get_args(wanted)), wanted) if "ClassVar" in annotation else wanted)
+                raise TypeError(f"{name} of {kind.__qualname__} is {short(value)}, which must be {needed}")
+        for name in sorted(contracted.__hooks__ & vars(contracted).keys()):
+            if isfunction(vars(contracted)[name]) and not callable(getattr(kind, name)):
+                value = getattr(kind, name)
+                raise TypeError(f"{name} of {kind.__qualname__} is {short(value)}, which must be a method")
+
+
 @contextmanager
 def collecting() -> Iterator[list[PluginFailedError]]:
     """Whatever hooks fail meanwhile, each once, also where somebody goes on without what they were asked."""
@@ -153,21 +170,42 @@ def failing_in(file: Path, table: str = "") -> Iterator[None]:
 
 
 def _called(by: Hooks, name: str, hook: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    declared = _declared(by, name)
-    at = kwargs.get("at") if declared.at is None or declared.at >= len(args) else args[declared.at]
+    place = _declared(by, name).at
+    at = kwargs.get("at") if place is None or place >= len(args) else args[place]
     with _guarded(by, name, at):
-        got = hook(*args, **kwargs)
-        if got is None and not declared.may_be_none:
-            raise TypeError(f"it returns None, not {declared.answer}")
-        if got is not None and declared.kind is not None and not isinstance(got, declared.kind):
-            raise TypeError(f"it returns {got!r:.80}, not {declared.answer}")
-    return _each(by, name, at, got) if isinstance(got, Iterator) else got
+        got = _checked(by, name, hook(*args, **kwargs), "returns")
+    return _guarding(by, name, at, got, _declared(by, name).wanted)
 
 
-def _each(by: Hooks, name: str, at: KeyPath | None, items: Iterator[Any]) -> Iterator[Any]:
+def _checked(by: Hooks, name: str, got: Any, verb: str, wanted: Any = None) -> Any:
+    """An answer as it is.
+
+    Raises:
+        BrokenContractError: it is not what the contract says.
+    """
+    answer = shown(wanted) if wanted else _declared(by, name).answer
+    words = misfit(got, wanted or _declared(by, name).wanted)
+    if words:
+        closer = "" if words.startswith(f"{short(got)} is no ") else f": {words}"
+        hook = getattr(type(by), name, None)
+        raise BrokenContractError(hook, f"it {verb} {short(got)}, not {answer}{closer}")
+    return got
+
+
+def _guarding(by: Hooks, name: str, at: KeyPath | None, got: Any, wanted: Any) -> Any:
+    """An answer that fails later, too, in the name of its hook: an iterator, or a list of some."""
+    element = next(iter(get_args(wanted)), Any)
+    if isinstance(got, Iterator):
+        return _each(by, name, at, got, element)
+    if isinstance(got, list | tuple) and any(isinstance(one, Iterator) for one in got):
+        return [_guarding(by, name, at, one, element) for one in got]
+    return got
+
+
+def _each(by: Hooks, name: str, at: KeyPath | None, items: Iterator[Any], wanted: Any) -> Iterator[Any]:
     with _guarded(by, name, at):
         for one in items:
-            yield _each(by, name, at, one) if isinstance(one, Iterator) else one
+            yield _guarding(by, name, at, _checked(by, name, one, "yields", wanted), wanted)
 
 
 @contextmanager
@@ -190,18 +228,18 @@ def _guarded(by: Hooks, name: str, at: KeyPath | None = None) -> Iterator[None]:
 
 def _declared(by: Hooks, name: str) -> _Declared:
     kind: Any = type(by)
-    return _declared_of(kind, name)
+    return declared(kind, name)
 
 
 @cache
-def _declared_of(kind: type[Any], name: str) -> _Declared:
+def declared(kind: Any, name: str) -> _Declared:
     """As the first class from the top declares it."""
-    hook = next(vars(one)[name] for one in reversed(kind.__mro__) if name in vars(one).get("__hooks__", ()))
-    if isinstance(hook, property):
-        return _Declared((), "", None, may_be_none=True, at=None)
-    answer = str(hook.__annotations__["return"])
-    returned = set(answer.split(" | "))
-    arguments = list(signature(hook).parameters)[1:]
+    first = next(one for one in reversed(kind.__mro__) if name in vars(one).get("__hooks__", ()))
+    hook: Any = vars(first)[name]
+    function: Any = hook.fget if isinstance(hook, property) else hook
+    answer = str(function.__annotations__["return"])
+    wanted = meaning(answer, first.__module__)
+    arguments = list(signature(function).parameters)[1:]
     at = arguments.index("at") if "at" in arguments else None
-    least = _KINDS.get(answer.partition("[")[0])
-    return _Declared(getattr(hook, "may_raise", ()), answer, least, bool(returned & {"None", "Any"}), at)
+    raises = getattr(function, "may_raise", ())
+    return _Declared(isinstance(hook, property), raises, answer, wanted, at)

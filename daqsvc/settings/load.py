@@ -116,8 +116,7 @@ class _Reading:
                 table = value_at(self._document, path[:-1])
                 if isinstance(table, dict):
                     del table[path[-1]]
-                    remedy = f"install the package that brings it again, or remove [{name}]"
-                    self.findings.append(Finding(path, why, remedy))
+                    self.findings.append(Finding(path, why.said, why.or_remove(name)))
                     self._lacks_detector |= path[0] == "pipeline"
 
     def take(self, draft: MachineFile, failures: Iterable[PluginFailedError]) -> None:

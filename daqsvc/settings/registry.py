@@ -7,18 +7,19 @@ The plugins are looked for when a file is read, not when the models are imported
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping  # noqa: TC003 - attributes of contracts are looked at by it
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
-from types import MappingProxyType, NoneType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 from pydantic import Field, create_model
 
 from daqsvc.settings.buses import Bus, Layout, UnknownBus, UnknownLayout
-from daqsvc.settings.hooks import Hooks, PluginFailedError, brought_by, contract
+from daqsvc.settings.failures import import_failure, packages
+from daqsvc.settings.hooks import Hooks, PluginFailedError, brought_by, contract, see_declared
 from daqsvc.settings.pipeline import Pipeline
 from daqsvc.settings.schema import forget_homes
 from daqsvc.settings.section import Kinds, Section, UnusableValueError
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
     from pathlib import Path
 
+    from daqsvc.settings.failures import Failure
     from daqsvc.settings.problems import Finding, KeyPath
 
 DRIVERS = "daqsvc.drivers"
@@ -43,18 +45,6 @@ _with_outputs: dict[type[Section], type[Any]] = {}
 """Each table with those of the outputs below it, once they are known."""
 
 SettingsT = TypeVar("SettingsT", bound=Section)
-
-_ALLOWED: Final[Mapping[type[Any], Any]] = MappingProxyType(
-    {
-        int: int | float,
-        str: str,
-        bool: bool,
-        tuple: tuple | list,
-        MappingProxyType: Mapping,
-        NoneType: str | None,
-    }
-)
-"""What an attribute of a plugin may be, by what it is in its contract."""
 
 
 @contract
@@ -75,7 +65,7 @@ class DetectorKind(Hooks, Generic[SettingsT]):
     detector: ClassVar[str | None] = None
     states_speed: ClassVar[bool] = False
     measures_levels: ClassVar[bool] = False
-    place: ClassVar[int] = 100
+    place: ClassVar[float] = 100
 
     def sampled_together(self, settings: SettingsT) -> tuple[str, ...]:
         """Sensors whose samples it takes together, wherever they come from; the reference's first.
@@ -98,7 +88,7 @@ class OutputKind(Hooks, Generic[SettingsT]):
 
     settings: type[SettingsT]
     about: ClassVar[str] = "an output"
-    place: ClassVar[int] = 100
+    place: ClassVar[float] = 100
 
 
 @contract
@@ -117,7 +107,7 @@ class DriverKind(Hooks):
     buses: ClassVar[tuple[type[Bus], ...]]
     layouts: ClassVar[tuple[type[Layout], ...]] = ()
     self_checks: ClassVar[tuple[str, ...]] = ()
-    place: ClassVar[int] = 100
+    place: ClassVar[float] = 100
 
     def bus_of(self, table: Mapping[str, Any]) -> type[Bus]:
         """The kind of bus that a table means."""
@@ -153,55 +143,41 @@ class _Installed:
     """
 
     tables: Mapping[str, Any]
-    broken: Mapping[str, str]
+    broken: Mapping[str, Failure]
 
 
 @cache
 def _installed(group: str, what: str, contract: type[Any]) -> _Installed:
     plugins: dict[str, Any] = {}
-    broken: dict[str, str] = {}
+    broken: dict[str, Failure] = {}
     for point in entry_points(group=group):
         try:
             plugins[point.name] = _made(point, what, contract)
         except (Exception, SystemExit) as error:  # noqa: BLE001  whatever a plugin does when it is imported
-            broken[point.name] = f"the {what} cannot be loaded from {point.value}: {error}"
+            why = import_failure(error, point.module)
+            said = f"the {what} cannot be loaded from {point.value}: {why.said}"
+            broken[point.name] = why._replace(said=said)
     ordered = sorted(plugins.items(), key=lambda item: (item[1].place, item[0]))
     return _Installed(MappingProxyType(dict(ordered)), MappingProxyType(broken))
 
 
 def _made(point: EntryPoint, what: str, contract: type[Any]) -> Any:
+    home = "the package that brings it"
+    package = home if point.dist is None else f"{point.dist.name} {point.dist.version}"
+    packages.setdefault(point.module.partition(".")[0], package)
     plugin = point.load()
     if not (isinstance(plugin, type) and issubclass(plugin, contract)):
         raise TypeError(f"it is not derived from {what.title()}Plugin of daqsvc.api")
     needed = "buses" if contract is DriverKind else "settings"
-    if not getattr(plugin, needed, None):
-        raise TypeError(f"{plugin.__name__} does not say its {needed}")
-    _fits(plugin)
+    if getattr(plugin, needed, ()) in {None, ()}:
+        raise TypeError(f"{plugin.__qualname__} does not say its {needed}")
+    see_declared(plugin)
+    for table in (*getattr(plugin, "buses", ()), *getattr(plugin, "layouts", ())):
+        see_declared(table)
     made = plugin()
-    home = "the package that brings it"
-    package = home if point.dist is None else f"{point.dist.name} {point.dist.version}"
     table = {DetectorKind: f"pipeline.{point.name}", OutputKind: point.name}.get(contract, "")
     brought_by(made, package, table)
     return made
-
-
-def _fits(plugin: type[Any]) -> None:
-    """See that what a plugin says in attributes is of the kind that its contract says it in.
-
-    Raises:
-        TypeError: it is not.
-    """
-    tables = [(kind, one) for kind in ("buses", "layouts") for one in getattr(plugin, kind, ())]
-    tables += [("settings", plugin.settings)] if hasattr(plugin, "settings") else []
-    for name, table in tables:
-        kind = {"buses": Bus, "layouts": Layout, "settings": Section}[name]
-        if not (isinstance(table, type) and issubclass(table, kind)):
-            raise TypeError(f"{name} of {plugin.__name__} holds {table!r}, which is no {kind.__name__}")
-    for declared in (one for one in plugin.__mro__ if "__hooks__" in vars(one)):
-        for name, usual in vars(declared).items():
-            value, allowed = getattr(plugin, name, usual), _ALLOWED.get(type(usual))
-            if allowed is not None and not name.startswith("_") and not isinstance(value, allowed):
-                raise TypeError(f"{name} of {plugin.__name__} is {value!r}: write what {name} = {usual!r} is")
 
 
 def forget() -> None:
@@ -217,7 +193,7 @@ def detector_tables() -> Mapping[str, DetectorKind[Any]]:
     return _installed(DETECTORS, "detector", DetectorKind).tables
 
 
-def broken_detectors() -> Mapping[str, str]:
+def broken_detectors() -> Mapping[str, Failure]:
     """Why a detector that is installed cannot be loaded, by the key of its table."""
     return _installed(DETECTORS, "detector", DetectorKind).broken
 
@@ -227,7 +203,7 @@ def bus_tables() -> Mapping[str, DriverKind]:
     return _installed(DRIVERS, "driver", DriverKind).tables
 
 
-def broken_drivers() -> Mapping[str, str]:
+def broken_drivers() -> Mapping[str, Failure]:
     """Why a driver that is installed cannot be loaded, by name."""
     return _installed(DRIVERS, "driver", DriverKind).broken
 
@@ -237,7 +213,7 @@ def output_tables() -> Mapping[str, OutputKind[Any]]:
     return _installed(OUTPUTS, "output", OutputKind).tables
 
 
-def broken_outputs() -> Mapping[str, str]:
+def broken_outputs() -> Mapping[str, Failure]:
     """Why an output that is installed cannot be loaded, by the path of its table."""
     return _installed(OUTPUTS, "output", OutputKind).broken
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, model_validator
 from pydantic_core import PydanticCustomError, core_schema
 
-from daqsvc.settings.failures import mend_or_remove, raised
+from daqsvc.settings.failures import failure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -85,9 +85,9 @@ class Section(BaseModel):
         except (ValueError, AssertionError):  # it is not valid, which validators say so
             raise
         except Exception as error:
-            sentence, remedy = raised(error, cls, "a validator"), mend_or_remove(cls)
+            said, remedy, _ = failure(error, cls, "a validator")
             raise PydanticCustomError(
-                "validator_failed", "{said}", {"said": sentence, "remedy": remedy}
+                "validator_failed", "{said}", {"said": said, "remedy": remedy}
             ) from error
 
     if not TYPE_CHECKING:  # a type checker must go on refusing attributes that do not exist

@@ -35,6 +35,10 @@ class Kurtosis(Section):
 class Knocks:
     """A detector, as far as this needs one."""
 
+    stream = "motor"
+    block = 1
+    warm = process = silent = print
+
     def __init__(self, sensor):
         self.name = "kurtosis"
         self.sensor = sensor

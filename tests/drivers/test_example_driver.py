@@ -139,23 +139,26 @@ class _Unfinished(DriverPlugin[Any]):
     """A plugin whose author has forgotten the model of its bus."""
 
 
+MEND = "have the authors of daqsvc-tcp-frames 1.0 mend it"
+
+
 @pytest.mark.parametrize(
-    ("plugin", "why"),
+    ("plugin", "why", "remedy"),
     [
-        (None, "import of tcp_frames halted"),
-        (dict, "it is not derived from DriverPlugin of daqsvc.api"),
-        (_Unfinished, "_Unfinished does not say its buses"),
+        (None, "import of tcp_frames halted", "install the package that brings it again"),
+        (dict, "it is not derived from DriverPlugin of daqsvc.api", MEND),
+        (_Unfinished, "_Unfinished does not say its buses", MEND),
     ],
 )
 def test_a_package_that_cannot_be_loaded_is_named_with_its_bus(
-    monkeypatch: pytest.MonkeyPatch, plugin: type[Any] | None, why: str
+    monkeypatch: pytest.MonkeyPatch, plugin: type[Any] | None, why: str, remedy: str
 ) -> None:
     broken = None if plugin is None else type("module", (), {"LoggerPlugin": plugin})
     monkeypatch.setitem(sys.modules, "tcp_frames", broken)
     registry.forget()
     [problem] = [p for p in problems_of(MACHINE.read_text(), MACHINE) if p.key == "buses.logger.driver"]
     assert f"the driver cannot be loaded from tcp_frames:LoggerPlugin: {why}" in problem.message
-    assert problem.remedy == "install the package that brings it again, or remove [buses.logger]"
+    assert problem.remedy == f"{remedy}, or remove [buses.logger]"
     assert problem.line == 10
 
 

@@ -24,6 +24,7 @@ from daqsvc.alarms.states import Level
 from daqsvc.diagnosis.record import Diagnosis
 from daqsvc.outbox.reading import read_journal
 from daqsvc.publish.make import output_set
+from daqsvc.publish.output import Output
 from daqsvc.settings import describe, parse_machine_file, registry
 
 if TYPE_CHECKING:
@@ -106,13 +107,16 @@ def test_its_table_is_described_and_checked_like_any_other() -> None:
     assert "did you mean path?" in str(misspelt)
 
 
-class Broken:
+class Broken(Output):
     """An output that fails in whatever it is asked to do."""
 
     def __init__(self, counted: dict[str, int]) -> None:
         self._counted = counted
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("_"):
+            return super().__getattribute__(name)
+
         def fail(*_: object, **__: object) -> None:
             self._counted[name] = self._counted.get(name, 0) + 1
             raise RuntimeError(f"{name} is broken")
