@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from daqsvc import __version__
 from daqsvc.outbox.ballast import Ballast
 from daqsvc.outbox.files import (
     FileError,
@@ -40,6 +41,7 @@ from daqsvc.outbox.tables import (
     bring_up_to_date,
 )
 from daqsvc.outbox.unwritten import Unwritten
+from daqsvc.outbox.written_by import note_version, written_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -210,6 +212,7 @@ class Journal:
             self._disconnect()
             self._may_view = self._mark.ended or self.is_short_of_room(error)
             raise self._unusable(error) from error
+        note_version(self.path)
         self._is_ready = True
 
     def _open(self) -> None:
@@ -454,9 +457,11 @@ class Journal:
         if version > SCHEMA_VERSION and are_of_this_version(connection):
             raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
         if version > SCHEMA_VERSION:
+            writer = written_by(self.path) or "a newer version"
             raise OutboxError(
-                f"outbox {self.path} has schema version {version}, this program knows {SCHEMA_VERSION}; "
-                f"update the program or move the file away"
+                f"outbox {self.path} has schema version {version}, written by daqsvc {writer}; this is "
+                f"daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
+                f"the service another store"
             )
         if version < SCHEMA_VERSION:
             bring_up_to_date(connection, version, self._wall_ns())

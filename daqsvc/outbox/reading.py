@@ -22,6 +22,7 @@ from daqsvc.outbox.files import FileError, pragma, remedy
 from daqsvc.outbox.messages import OutboxError, is_sound
 from daqsvc.outbox.safety import refuse_link
 from daqsvc.outbox.tables import SCHEMA_VERSION
+from daqsvc.outbox.written_by import written_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
@@ -183,7 +184,7 @@ def _check_version(path: Path, connection: sqlite3.Connection) -> None:
         raise OutboxError(
             f"the journal {path} has schema version {version}, this program reads {SCHEMA_VERSION}; "
             + (
-                "use the program that the service runs"
+                f"use the program that the service runs, daqsvc {written_by(path) or 'of a newer version'}"
                 if version > SCHEMA_VERSION
                 else "start the service once"
             )

@@ -14,6 +14,7 @@ import pytest
 from support.clocks import SettableClock
 from support.waiting import eventually
 
+import daqsvc
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
 from daqsvc.outbox.sequence import STEP, UNRECORDED
@@ -283,7 +284,10 @@ async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
     newer = sqlite3.connect(tmp_path / "newer.sqlite")
     newer.execute("PRAGMA user_version = 99")
     newer.close()
-    with pytest.raises(OutboxError, match="schema version 99"):
+    with pytest.raises(OutboxError, match="schema version 99, written by daqsvc a newer version"):
+        await opened(tmp_path / "newer.sqlite")
+    (tmp_path / "newer.sqlite.version").write_text("9.9.0\n")
+    with pytest.raises(OutboxError, match=r"written by daqsvc 9\.9\.0; .* install that version again"):
         await opened(tmp_path / "newer.sqlite")
     outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     with pytest.raises(OutboxError, match="is not open yet"):
@@ -292,6 +296,14 @@ async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
     await outbox.close()
     with pytest.raises(OutboxError, match="is closed"):
         await outbox.append(TOPIC, payload, retain=False)
+
+
+async def test_a_store_says_which_version_has_written_it(tmp_path):
+    path = tmp_path / "outbox.sqlite"
+    (tmp_path / "outbox.sqlite.version").write_text("0.0.1\n")
+    outbox = await opened(path)
+    await outbox.close()
+    assert (tmp_path / "outbox.sqlite.version").read_text() == f"{daqsvc.__version__}\n"
 
 
 CRASHER = """
