@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import os
 import stat
+import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 log = logging.getLogger(__name__)
 
@@ -26,16 +27,38 @@ class _UnusableError(Exception):
     """A place cannot be used; says why."""
 
 
-def prepare(*, say: bool = True) -> None:
-    """Choose the directory; call before any kernel is imported.
+def prepare(*, say: bool = True, first: Callable[[], bool] = lambda: True) -> None:
+    """Choose the directory; call before any kernel is imported. When the first one is compiled, that is said.
 
     It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else the user's cache directory (XDG);
     else one in the folder for temporary files that only this user may enter. If none of these can be
     written, kernels are compiled at every start. Both of the latter are said.
 
     Args:
-        say: False in a process whose parent has said it.
+        say: False in a process whose parent has said where they are kept.
+        first: asked once, when a kernel is compiled: whether no other process has said so.
     """
+    _Compiling.kept, _Compiling.first = _choose(say=say), first
+
+
+class _Compiling:
+    """What is to be said when a kernel is compiled, once."""
+
+    kept = True
+    first: Callable[[], bool] | None = None
+
+
+def say_compiling() -> None:
+    """A kernel is being compiled, as none was kept: the start takes longer than people are used to."""
+    first, _Compiling.first = _Compiling.first, None
+    # A line beside the results of a verb that has no log is for a person who waits at a terminal.
+    if first is not None and (logging.root.handlers or sys.stderr.isatty()) and first():
+        when = "first start only; " if _Compiling.kept else ""
+        log.warning("compiling kernels for this processor (%stakes up to a minute)", when)
+
+
+def _choose(*, say: bool) -> bool:
+    """Choose the directory; whether what is compiled can be kept."""
     reasons: list[str] = []
     for place in _places(reasons):
         try:
@@ -46,10 +69,11 @@ def prepare(*, say: bool = True) -> None:
             reasons.append(f"{error}")
             continue
         os.environ[VARIABLE] = str(place)
-        return
+        return True
     try:
-        temporary = _temporary()
+        temporary: Path | None = _temporary()
     except _UnusableError as error:
+        temporary = None
         reasons.append(f"{error}")
         _compile_at_every_start()
         consequence = "compiled kernels cannot be kept, and every start compiles them"
@@ -58,6 +82,7 @@ def prepare(*, say: bool = True) -> None:
         consequence = f"compiled kernels are kept in {temporary}, where they may be deleted"
     if say:
         log.warning("%s: %s; %s", consequence, ", and ".join(reasons), REMEDY)
+    return temporary is not None
 
 
 def _places(reasons: list[str]) -> Iterator[Path]:

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.kernels import njit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

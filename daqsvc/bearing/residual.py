@@ -18,9 +18,10 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.polynomial import polynomial
 from scipy.signal import cont2discrete
+
+from daqsvc.kernels import njit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

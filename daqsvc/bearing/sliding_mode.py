@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numba import njit
+
+from daqsvc.kernels import njit
 
 if TYPE_CHECKING:
     from daqsvc.bearing.model import BearingParameters, Floats

@@ -11,7 +11,7 @@ import signal
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
@@ -37,6 +37,7 @@ from daqsvc.settings.problems import AssemblyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+    from multiprocessing.synchronize import Lock
 
     from daqsvc.confined.limits import ResourceLimits
     from daqsvc.diagnosis.plugin import DetectorPlugin
@@ -411,12 +412,9 @@ def judge_all(
     # One process a core: threads of the linear algebra inside each would only get in each other's way.
     for name in _BLAS_THREADS:
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(
-        processes,
-        multiprocessing.get_context("spawn"),
-        initializer=_prepare,
-        initargs=(judge, get_limits()),
-    )
+    context = multiprocessing.get_context("spawn")
+    initargs = (judge, get_limits(), context.Lock())
+    pool = ProcessPoolExecutor(processes, context, initializer=_prepare, initargs=initargs)
     try:
         jobs = [pool.submit(_judge, *job) for job in zip(recordings, figures, strict=True)]
         for recording, job in zip(recordings, jobs, strict=True):
@@ -439,9 +437,15 @@ def _judge(recording: str, figures: str | None) -> Outcome:
     return _judges[0].judge(recording, figures)
 
 
-def _prepare(judge: Judge, limits: ResourceLimits) -> None:
-    """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it."""
+def _prepare(judge: Judge, limits: ResourceLimits, compiling: Lock) -> None:
+    """Read as the parent would; and leave Ctrl-C, which goes to the whole group, to it.
+
+    Args:
+        judge: judges the recordings.
+        limits: of reading them.
+        compiling: whoever has it says that kernels are compiled.
+    """
     _judges.append(judge)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     set_limits(limits)
-    kernel_cache.prepare(say=False)
+    kernel_cache.prepare(say=False, first=partial(compiling.acquire, block=False))

@@ -13,8 +13,8 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from daqsvc.kernels import njit
 from daqsvc.rotor.discretise import OBSERVER
 from daqsvc.rotor.kernels import ESCAPE_RADIUS, UNDETERMINED
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from numba import njit
-
+from daqsvc.kernels import njit
 from daqsvc.rotor.kernels import UNDETERMINED, correct, guarded, orbit, predict, predict_rub
 from daqsvc.rotor.observer_batch import WIDTH, sections
 

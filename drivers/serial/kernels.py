@@ -11,7 +11,8 @@ import binascii
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from daqsvc.kernels import njit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
+from daqsvc.kernels import njit
 from drivers.serial.kernels import crc16
 
 if TYPE_CHECKING:

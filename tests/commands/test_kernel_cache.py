@@ -117,8 +117,30 @@ def test_where_nothing_can_be_written_kernels_are_compiled_and_not_kept(tmp_path
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)),
     )
     assert done.stdout == "[[1, 2], [4, 5]]\n", done.stderr
-    (said,) = done.stderr.splitlines()
+    said, *_ = done.stderr.splitlines()
     assert said.startswith("compiled kernels cannot be kept, and every start compiles them: ")
+
+
+def test_that_kernels_are_compiled_is_said_once_and_only_if_none_are_kept(tmp_path: Path) -> None:
+    kernels = "from daqsvc.kernels import njit\n" + "".join(
+        f"@njit(cache=True)\ndef {name}(x):\n    return x + 1\n" for name in ("f", "g")
+    )
+    (tmp_path / "two.py").write_text(kernels)
+    use = (
+        "import logging, sys; from daqsvc import kernel_cache\n"
+        "logging.basicConfig(format='%(message)s')\n"
+        "kernel_cache.prepare()\n"
+        "import two; two.f(1.0), two.g(1.0)\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": f"{tmp_path}", "PYTHONPATH": f"{ROOT}:{tmp_path}"}
+    command = [sys.executable, "-c", use]
+    said = [
+        subprocess.run(
+            command, stderr=subprocess.PIPE, text=True, timeout=100, check=True, env=environment
+        ).stderr
+        for _ in range(2)
+    ]
+    assert said == ["compiling kernels for this processor (first start only; takes up to a minute)\n", ""]
 
 
 @pytest.fixture

@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from numba import njit
 from scipy.linalg import solve_discrete_lyapunov
 
+from daqsvc.kernels import njit
 from daqsvc.rotor import kernels
 from daqsvc.rotor.discretise import (
     axis_flow,

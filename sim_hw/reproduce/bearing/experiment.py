@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy.signal import lfilter
 
 from daqsvc.bearing.model import BearingModel
 from daqsvc.bearing.two_sensors import TwoSensorMonitor, learn_pair
+from daqsvc.kernels import njit
 from sim_hw.plants.bearing import BearingMachine, FaultSignal, levels, simulate
 from sim_hw.reproduce.bearing.design import (
     S2,
