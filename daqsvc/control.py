@@ -1,10 +1,10 @@
 """Commands from people on the box: a Unix socket in the store, and the client for it.
 
 A request is one line of JSON, and so is its answer: see `ControlRequest` and `ControlAnswer`. The socket is
-``control.sock`` in the store's directory, mode 0600: only the service's own user and root may open it, and
-whoever may open it may command the alarms. Whatever a client sends or leaves unsent costs the service a
-counter and a few kilobytes at most. Clients that hang keep nobody out: each user has connections of their
-own, and the quietest of them makes way for a new one.
+``control.sock`` in the store's directory, or in systemd's ``$RUNTIME_DIRECTORY`` with a link from there, mode
+0600: only the service's own user and root may open it, and whoever may open it may command the alarms.
+Whatever a client sends or leaves unsent costs the service a counter and a few kilobytes at most. Clients that
+hang keep nobody out: each user has connections of their own, and the quietest of them makes way for the next.
 """
 
 from __future__ import annotations
@@ -152,12 +152,20 @@ class ControlServer:
         machine: name of the machine that the service watches.
         execute: carries a command out.
         waiting: how many alarm events the disk has not got yet.
+        runtime: directory for the socket itself, e.g. systemd's ``$RUNTIME_DIRECTORY``; the store then has a
+            link to it.
     """
 
     def __init__(
-        self, store: Path, machine: str, execute: CommandHandler, waiting: Callable[[], int] = lambda: 0
+        self,
+        store: Path,
+        machine: str,
+        execute: CommandHandler,
+        waiting: Callable[[], int] = lambda: 0,
+        runtime: Path | None = None,
     ) -> None:
-        self.path = store / SOCKET
+        self.path = (runtime or store) / SOCKET
+        self._link = None if runtime is None else store / SOCKET
         self.counters = ControlCounters()
         self._machine = machine
         self._execute = execute
@@ -173,7 +181,7 @@ class ControlServer:
         Raises:
             ControlError: the path is taken by something else, or cannot be written.
         """
-        binding = asyncio.ensure_future(asyncio.to_thread(_bind, self.path))
+        binding = asyncio.ensure_future(asyncio.to_thread(_bind, self.path, self._link))
         try:
             listening, self._inode = await asyncio.shield(binding)
         except asyncio.CancelledError:
@@ -450,8 +458,11 @@ def _peer(writer: asyncio.StreamWriter) -> tuple[int, int]:
     return uid, pid
 
 
-def _bind(path: Path) -> tuple[socket.socket, int]:
-    """A socket that only this user can open, in place of one that was left over, and its inode; blocks."""
+def _bind(path: Path, link: Path | None) -> tuple[socket.socket, int]:
+    """A socket that only this user can open, in place of one that was left over, and its inode; blocks.
+
+    Clients find it at ``link``, if that is given.
+    """
     # The mode is set under another name, no longer than its own, and nobody can connect before `listen`.
     draft = path.with_name(".control")
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
@@ -462,6 +473,12 @@ def _bind(path: Path) -> tuple[socket.socket, int]:
             made.bind(address)
         draft.chmod(MODE)
         draft.rename(path)
+        if link is not None:
+            _check_free(link)
+            draft = link.with_name(".control")
+            draft.unlink(missing_ok=True)
+            draft.symlink_to(path)
+            draft.rename(link)
         return made, path.lstat().st_ino
     except OSError as error:
         made.close()
@@ -475,8 +492,8 @@ def _bind(path: Path) -> tuple[socket.socket, int]:
 
 
 def _check_free(path: Path) -> None:
-    """Only a socket may be replaced: it is left over from a service that was killed."""
-    if path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
+    """Only a socket, or a link to one, may be replaced: it is left over from a service that was killed."""
+    if path.exists() and not (path.is_symlink() or stat.S_ISSOCK(path.lstat().st_mode)):
         raise ControlError(f"{path} is in the way of the control socket and is none; move it away")
 
 

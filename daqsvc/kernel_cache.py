@@ -6,6 +6,7 @@ What is kept is code that later starts run, so a place counts only if nobody els
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import stat
@@ -23,6 +24,10 @@ VARIABLE = "NUMBA_CACHE_DIR"
 REMEDY = f"set {VARIABLE} to a directory that the service can write"
 
 
+SERVICE = Path("/var/cache/daqsvc")
+"""The cache directory of the installed service (`config/systemd`): its account finds its kernels there."""
+
+
 class _UnusableError(Exception):
     """A place cannot be used; says why."""
 
@@ -30,9 +35,10 @@ class _UnusableError(Exception):
 def prepare(*, say: bool = True, first: Callable[[], bool] = lambda: True) -> None:
     """Choose the directory; call before any kernel is imported. When the first one is compiled, that is said.
 
-    It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else the user's cache directory (XDG);
-    else one in the folder for temporary files that only this user may enter. If none of these can be
-    written, kernels are compiled at every start. Both of the latter are said.
+    It is ``$NUMBA_CACHE_DIR``; else systemd's ``$CACHE_DIRECTORY``; else that of the installed service, if
+    this is its account; else the user's cache directory (XDG); else one in the folder for temporary files
+    that only this user may enter. If none of these can be written, kernels are compiled at every start. Both
+    of the latter are said.
 
     Args:
         say: False in a process whose parent has said where they are kept.
@@ -92,6 +98,9 @@ def _places(reasons: list[str]) -> Iterator[Path]:
     if directory := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
         yield Path(directory) / "kernels"
         return
+    with contextlib.suppress(OSError):
+        if SERVICE.stat().st_uid == os.geteuid():
+            yield SERVICE / "kernels"
     try:
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "daqsvc" / "kernels"
     except RuntimeError:

@@ -111,6 +111,7 @@ class Service:
         store: directory of the journal.
         clock: the service's clock.
         on_ending: called when the service begins to end, for whatever reason.
+        runtime: directory for the control socket, if not the store.
 
     Raises:
         AssemblyError: the machine file asks for a driver that is not installed.
@@ -123,6 +124,7 @@ class Service:
         store: Path,
         clock: Clock | None = None,
         on_ending: Callable[[], None] = lambda: None,
+        runtime: Path | None = None,
     ) -> None:
         self.machine = machine
         self.clock: Clock = clock or SystemClock()
@@ -167,6 +169,7 @@ class Service:
             machine.machine.name,
             self.alarms.execute,
             lambda: self.alarms.outbox.counters.waiting,
+            runtime,
         )
 
     async def run(self, stop: asyncio.Event) -> None:

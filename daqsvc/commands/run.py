@@ -118,7 +118,8 @@ async def _run_until_stopped(
     from daqsvc.supervision import stop_all  # noqa: PLC0415
 
     stop = asyncio.Event()
-    service = Service(machine, store, on_ending=guard.stopping)
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    service = Service(machine, store, on_ending=guard.stopping, runtime=Path(runtime) if runtime else None)
     guard.protect(service.alarms.outbox.close_from_outside)
     guard.stop_by(asyncio.get_running_loop(), stop.set)
     running = asyncio.create_task(service.run(stop), name="service")

@@ -351,6 +351,26 @@ async def test_a_socket_that_a_killed_service_left_is_replaced(tmp_path: Path) -
         assert (await say(server, json.dumps(wish()).encode() + b"\n"))["accepted"]
 
 
+async def test_a_socket_elsewhere_is_found_from_the_store(tmp_path: Path) -> None:
+    store, runtime = tmp_path / "store", tmp_path / "run"
+    store.mkdir()
+    runtime.mkdir()
+    for _ in range(2):  # a link that was left over is no matter, nor a socket of a start without systemd
+        server = ControlServer(store, MACHINE, Desk(), lambda: 7, runtime)
+        await server.open()
+        try:
+            assert stat.S_ISSOCK((runtime / "control.sock").lstat().st_mode)
+            assert await asyncio.to_thread(events_waiting, store) == 7
+        finally:
+            await server.close()
+        assert not (runtime / "control.sock").exists()
+        with pytest.raises(ControlError, match="no daqsvc runs"):
+            events_waiting(store)
+        async with serving(store) as plain:
+            assert plain.path.is_socket()
+            assert not plain.path.is_symlink()
+
+
 async def test_what_waits_in_memory_is_told_to_who_asks(tmp_path: Path) -> None:
     server = ControlServer(tmp_path, MACHINE, Desk(), lambda: 7)
     await server.open()

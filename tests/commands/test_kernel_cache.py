@@ -174,6 +174,19 @@ def test_the_place_is_the_one_that_was_asked_for(
     assert not caplog.records
 
 
+@needs_root
+def test_the_account_of_the_service_finds_what_the_service_has_compiled(
+    places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = places / "var-cache-daqsvc"
+    monkeypatch.setattr(kernel_cache, "SERVICE", service)
+    assert chosen() == f"{places}/home/.cache/daqsvc/kernels"
+    service.mkdir()
+    assert chosen() == f"{service}/kernels"
+    os.chown(service, NOBODY, NOBODY)
+    assert chosen() == f"{places}/home/.cache/daqsvc/kernels", "what another account has compiled is not run"
+
+
 def test_a_place_that_others_can_write_is_not_trusted(places: Path, caplog: pytest.LogCaptureFixture) -> None:
     (places / "home").mkdir()
     (places / "home").chmod(0o777)
