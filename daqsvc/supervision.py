@@ -10,14 +10,13 @@ import asyncio
 import contextlib
 import logging
 import threading
-import time
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from daqsvc.acquisition.clock import NS_PER_S
-from daqsvc.acquisition.link import Backoff
+from daqsvc.acquisition.link import Backoff, SaidOnce
+from daqsvc.settings.failures import BrokenContractError, cause_of, in_words
 from daqsvc.threads import kept_waiting_s, where_is
 
 if TYPE_CHECKING:
@@ -30,13 +29,8 @@ logger = logging.getLogger(__name__)
 WELL_S = 60.0
 """A part that has run for so long has earned a quick restart."""
 
-SAY_AGAIN_S = 3600.0
-"""The same failure of the same part is said again after so long."""
-
 OTHERS = "event loop"
 """The name under which failures of callbacks, and of tasks that nobody waits for, are counted."""
-
-_HERE = Path(__file__).parent.parent
 
 
 class EssentialLostError(Exception):
@@ -53,7 +47,7 @@ class Supervisor:
     def __init__(self) -> None:
         self.failures: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._said_s: dict[tuple[str, str], float] = {}
+        self._said = SaidOnce()
         self._lost: asyncio.Future[None] | None = None
 
     def keep(
@@ -84,18 +78,15 @@ class Supervisor:
             error: what it was; an exception's traceback is logged as well, for who logs what goes well, too.
             then: what is done about it, e.g. ``"it is started again"``.
         """
-        what = error if isinstance(error, str) else _in_words(error)
         with self._lock:
             self.failures[name] += 1
             count = self.failures[name]
-            now_s = time.monotonic()
-            said_s = self._said_s.get((name, what))
-            if said_s is not None and now_s - said_s < SAY_AGAIN_S:
+            if not self._said.may_say((name, error if isinstance(error, str) else cause_of(error))):
                 return
-            self._said_s[name, what] = now_s
+        what = error if isinstance(error, str) else in_words(error)
         times = "" if count == 1 else f" (failure {count} of it)"
         logger.error("%s: %s; %s%s", name, what, then, times)
-        if isinstance(error, BaseException):
+        if isinstance(error, BaseException) and error.__traceback__ is not None:
             logger.info("traceback of that failure", exc_info=error)
 
     @contextlib.contextmanager
@@ -135,7 +126,7 @@ class Supervisor:
 
     def _hear_loop(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error, message = context.get("exception"), context.get("message", "something failed")
-        text = message if error is None else f"{message}: {_in_words(error)}"
+        text = message if error is None else f"{message}: {in_words(error)}"
         self.failed(OTHERS, text, "the rest goes on")
         if error is not None:
             logger.info("traceback of that failure", exc_info=error)
@@ -214,7 +205,8 @@ class Part:
         elif not task.cancelled() and error is None and self._may_end():
             self._finish()
         else:
-            what = "it was cancelled" if task.cancelled() else error or "it has ended by itself"
+            by_itself = BrokenContractError(self._work, "it has ended by itself")
+            what = "it was cancelled" if task.cancelled() else error or by_itself
             self._supervisor.failed(self.name, what, "it is started again")
             self._start_again()
 
@@ -318,17 +310,3 @@ async def over(parts: Iterable[Part], patience_s: float | None = None) -> None:
     waited_for = {part.over for part in parts}
     if waited_for:
         await asyncio.wait(waited_for, timeout=patience_s)
-
-
-def _in_words(error: BaseException) -> str:
-    """An exception in one line, with the line of this program that it came through last."""
-    first_line = next(iter(f"{error}".splitlines()), "")
-    kind = type(error).__name__
-    what = f"{kind}: {first_line}" if first_line else kind
-    trace, place = error.__traceback__, ""
-    while trace is not None:
-        path = Path(trace.tb_frame.f_code.co_filename)
-        if path.is_relative_to(_HERE) and path.name != "supervision.py":
-            place = f" at {path.relative_to(_HERE)}:{trace.tb_lineno}"
-        trace = trace.tb_next
-    return f"failed with {what}{place}"

@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 from daqsvc.acquisition.link import Backoff
+from daqsvc.settings.failures import BrokenContractError
 from daqsvc.threads import call_in_thread
 from drivers.base import DeviceAbsentError
 
@@ -39,11 +40,13 @@ class Attempt(NamedTuple):
         present: whether the device was there.
         useful: whether anything came from it: a link that opens and fails at once is not back.
         reason: why the attempt ended.
+        error: what its driver has failed with, which nobody has foreseen.
     """
 
     present: bool
     useful: bool
     reason: str
+    error: Exception | None = None
 
 
 class CannotOpenError(Exception):
@@ -57,9 +60,9 @@ async def run_with_reconnect(
 ) -> None:
     """Try a link again and again, each time later unless something came over it; until cancelled.
 
-    An attempt that fails in a way that nobody has foreseen is said with its traceback and tried again like
-    any other. What to do about a device that is absent at first holds until it has been there once, also if
-    this is called again.
+    An attempt that fails in a way that nobody has foreseen is said once, with its plugin and line, and tried
+    again like any other. What to do about a device that is absent at first holds until it has been there
+    once, also if this is called again.
 
     Args:
         link: its state; `attempt` says when it is up.
@@ -73,29 +76,37 @@ async def run_with_reconnect(
     """
     backoff = Backoff()
     first = not link.ever_up
-    while (outcome := await _outcome(link, attempt)) is not None:
+    while (outcome := await _outcome(attempt)) is not None:
         if first and not outcome.present and port.start == "error":
             raise DeviceAbsentError(f"{link.name}: {outcome.reason}")
         if first and not outcome.present and port.start == "ignore":
             link.leave_out(outcome.reason)
             return
         first = False
-        link.down(outcome.reason)
+        if outcome.error is None:
+            link.down(outcome.reason)
+        else:
+            link.fail(outcome.reason, outcome.error)
         if outcome.useful:
             backoff.reset()
         await port.clock.sleep_ns(backoff.next_ns())
 
 
-async def _outcome(link: Link, attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt | None:
+async def _outcome(attempt: Callable[[], Awaitable[Attempt | None]]) -> Attempt | None:
     try:
-        return await attempt()
+        outcome = await attempt()
     except CannotOpenError as error:
         return Attempt(present=False, useful=False, reason=f"{error}")
-    except Exception as error:
-        reason = f"its driver failed: {error or type(error).__name__}"
-        if reason != link.reason:
-            logger.exception("the driver of %s has failed; it begins again", link.name)
-        return Attempt(present=True, useful=False, reason=reason)
+    except Exception as error:  # noqa: BLE001 - said by the link
+        return _failed(error)
+    if outcome is None or isinstance(outcome, Attempt):
+        return outcome
+    return _failed(BrokenContractError(attempt, f"it returns {outcome!r:.60}, not Attempt | None"))
+
+
+def _failed(error: Exception) -> Attempt:
+    reason = f"its driver failed: {error or type(error).__name__}"
+    return Attempt(present=True, useful=False, reason=reason, error=error)
 
 
 async def ended(reason: asyncio.Future[str], *threads: Thread) -> str:

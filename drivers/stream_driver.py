@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daqsvc.acquisition.assembler import StreamAssembler
 from daqsvc.acquisition.link import Link
+from daqsvc.settings.failures import BrokenContractError
 from drivers.base import BusCounters
 from drivers.reconnect import Attempt, CannotOpenError, run_with_reconnect
 
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 _TICK_NS = 20_000_000
 
 
-class StreamDriver:
+class StreamDriver(ABC):
     """A driver that reads frames on the event loop; one that must read in a thread is written without it.
 
     Args:
@@ -61,6 +63,7 @@ class StreamDriver:
             for assembler in self._assemblers.values():
                 assembler.flush()
 
+    @abstractmethod
     async def read(self) -> str:
         """Open the link, call ``self.link.up()``, and `take` frames until it is lost.
 
@@ -73,7 +76,6 @@ class StreamDriver:
             OSError: the link cannot be opened, or broke.
             CannotOpenError: it cannot be opened, in words of the driver's own.
         """
-        raise NotImplementedError
 
     def take(self, spec: StreamSpec[FrameLayout], payloads: Payloads) -> None:
         """Take in frames of one stream, in the order in which they came.
@@ -81,7 +83,14 @@ class StreamDriver:
         Args:
             spec: the stream, of ``self.port.streams``.
             payloads: uint8 ``[n, spec.layout.length]``.
+
+        Raises:
+            ValueError: they are of another shape.
         """
+        if np.shape(payloads)[1:] != (spec.layout.length,):
+            raise ValueError(
+                f"take() is given {payloads!r:.60}; give it uint8 [n, {spec.layout.length}] of {spec.name}"
+            )
         if len(payloads):
             arrival_ns = np.full(len(payloads), self.port.clock.monotonic_ns())
             self._assemblers[spec.name].accept(*spec.layout.decode(payloads, arrival_ns))
@@ -95,6 +104,8 @@ class StreamDriver:
         ticking = asyncio.create_task(self._tick(), name=f"tick of {self.link.name}")
         try:
             reason = await self.read()
+            if not isinstance(reason, str):
+                raise BrokenContractError(self.read, f"it returns {reason!r:.60}, not why the link was lost")
         except CannotOpenError:
             self.counters.open_failures += 1
             raise

@@ -7,9 +7,13 @@ import random
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from daqsvc.acquisition.clock import NS_PER_S
+from daqsvc.settings.failures import cause_of, in_words
+
+if TYPE_CHECKING:
+    from collections.abc import Hashable
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +56,26 @@ class Sparing:
         """Whether the end of the trouble is to be said: once, if the trouble was."""
         was, self._standing = self._standing, False
         return was
+
+
+SAY_AGAIN_S = 3600.0
+"""The same failure is said again after so long."""
+
+
+class SaidOnce:
+    """Lets each failure be said once an hour, by what caused it."""
+
+    def __init__(self) -> None:
+        self._said_s: dict[Hashable, float] = {}
+
+    def may_say(self, cause: Hashable) -> bool:
+        """Whether a failure is to be said; if so, it counts as said."""
+        now_s = time.monotonic()
+        said_s = self._said_s.get(cause)
+        if said_s is not None and now_s - said_s < SAY_AGAIN_S:
+            return False
+        self._said_s[cause] = now_s
+        return True
 
 
 LinkState = Literal["down", "up"]
@@ -116,6 +140,7 @@ class Link:
     _ever_up: bool = field(default=False, repr=False)
     _said_down: bool = field(default=False, repr=False)
     _sparing: Sparing = field(default_factory=Sparing, repr=False)
+    _failures: SaidOnce = field(default_factory=SaidOnce, repr=False)
 
     @property
     def ever_up(self) -> bool:
@@ -140,6 +165,16 @@ class Link:
             lost = " is lost" if self._ever_up else ""
             often = OFTEN if self._sparing.often else ""
             logger.warning("%s%s: %s; it is being tried again%s", self.name, lost, reason, often)
+            self._said_down = True
+        self.state, self.reason = "down", reason
+
+    def fail(self, reason: str, error: Exception) -> None:
+        """The driver has failed in a way that nobody has foreseen, and begins again; said once an hour."""
+        if self.state == "up":
+            self.losses += 1
+        if self._failures.may_say(cause_of(error)):
+            logger.error("%s: %s; it is being tried again", self.name, in_words(error))
+            logger.info("traceback of that failure", exc_info=error)
             self._said_down = True
         self.state, self.reason = "down", reason
 

@@ -11,7 +11,7 @@ from daqsvc.alarms.setpoints import SetpointMonitor
 from daqsvc.alarms.states import Level
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from collections.abc import Set as AbstractSet
 
     from daqsvc.alarms.events import AlarmEvent
@@ -34,6 +34,9 @@ TOO_HIGH, TOO_LOW = "high", "low"
 
 MACHINE_GROUP = "machine"
 """The first-out group of an alarm that names none: all alarms of the machine compete."""
+
+MOST_FIGURES = 3
+"""In the sentence of a statement that has nothing but figures."""
 
 _IN_WORDS = {
     DEPARTURE: "a change, its cause not yet known",
@@ -390,7 +393,21 @@ class _DecisionWatch:
         if others:
             how = "possibly" if decision == DEPARTURE else "not told apart from"
             sentence += f", {how} {', '.join(others)}"
-        return sentence
+        return ", ".join([sentence, *_figures(diagnosis)])
+
+
+def _figures(diagnosis: Diagnosis) -> Iterator[str]:
+    """What was measured and its limits, of a statement that rests on nothing else."""
+    if diagnosis.model or diagnosis.probabilities or diagnosis.evidence:
+        return
+    level = "danger" if diagnosis.severity == "danger" else "alert"
+    limits = {name: diagnosis.thresholds.get(f"{name}.{level}") for name in diagnosis.statistics}
+    limited = [name for name, limit in limits.items() if limit is not None]
+    for name in (limited or list(limits))[:MOST_FIGURES]:
+        unit, limit = diagnosis.units.get(name, ""), limits[name]
+        yield f"{name} is {diagnosis.statistics[name]:.4g} {unit}".rstrip()
+        if limit is not None:
+            yield f"{level} limit {limit:.4g} {unit}".rstrip()
 
 
 def _identity(decision: str, group: tuple[str, ...]) -> str:

@@ -12,26 +12,27 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from daqsvc.acquisition.clock import NS_PER_S
 from daqsvc.acquisition.ring import RingClosed, RingReader
 from daqsvc.acquisition.standing import StreamState
-from daqsvc.diagnosis.record import silence_reason
+from daqsvc.diagnosis.record import Diagnosis, silence_reason
 from daqsvc.dsp.quality.missing import Patience
+from daqsvc.settings.failures import BrokenContractError
 from daqsvc.supervision import Progress, Supervisor, over
 from daqsvc.threads import ThreadLostError, call_in_thread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping
 
     from daqsvc.acquisition.clock import Clock
     from daqsvc.acquisition.ring import SampleRing
     from daqsvc.acquisition.standing import Tell
     from daqsvc.diagnosis.detector import Detector, Window
-    from daqsvc.diagnosis.record import Diagnosis
 
 
 T = TypeVar("T")
@@ -289,7 +290,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the others say that nothing is judged"
                 ):
-                    for diagnosis in detector.silent(0.0, now_ns):
+                    for diagnosis in _said(detector.silent, 0.0, now_ns):
                         self._report(replace(diagnosis, quality="missing", reason=doubt))
 
     def _let_go(self, stream: str) -> None:
@@ -395,7 +396,7 @@ class Pipeline:
                 with self._supervisor.sparing_others(
                     _part(detector), "the other detectors say that nothing comes"
                 ):
-                    for diagnosis in detector.silent(silence_s, now_ns):
+                    for diagnosis in _said(detector.silent, silence_s, now_ns):
                         self._report(replace(diagnosis, reason=reason) if over else diagnosis)
 
     async def _follow(self, detector: Detector, kernels: KernelThreads) -> None:
@@ -469,7 +470,7 @@ class Pipeline:
         # The kernels' load on the host is a matter of the host's clock, whatever clock the samples have.
         begun_ns = time.perf_counter_ns()
         try:
-            return detector.process(window)
+            return _said(detector.process, window)
         except Exception as error:  # noqa: BLE001 - said and counted
             counters.failures += 1
             self._supervisor.failed(_part(detector), error, "it goes on with the next window")
@@ -477,13 +478,25 @@ class Pipeline:
             with self._supervisor.sparing_others(_part(detector), "nothing is said of that window"):
                 return [
                     replace(held, quality="missing", reason=reason)
-                    for held in detector.silent(0.0, window.t_end_ns)
+                    for held in _said(detector.silent, 0.0, window.t_end_ns)
                 ]
             return []
         finally:
             counters.windows += 1
             counters.samples += len(window.samples)
             counters.busy_ns += time.perf_counter_ns() - begun_ns
+
+
+def _said(say: Callable[..., Sequence[Diagnosis]], *of: Any) -> Sequence[Diagnosis]:
+    """What a detector says.
+
+    Raises:
+        BrokenContractError: these are no statements.
+    """
+    said = say(*of)
+    if not isinstance(said, Sequence) or not all(isinstance(one, Diagnosis) for one in said):
+        raise BrokenContractError(say, f"it returns {said!r:.60}, not Sequence[Diagnosis]")
+    return said
 
 
 def _part(detector: Detector) -> str:

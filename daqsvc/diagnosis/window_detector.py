@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import TYPE_CHECKING, get_args
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from daqsvc.diagnosis.record import Diagnosis, Severity
+from daqsvc.settings.failures import BrokenContractError
 from daqsvc.settings.problems import AssemblyError, choice
 
 if TYPE_CHECKING:
@@ -50,7 +52,7 @@ class Judgement:
                 raise ValueError(f"{name} is {value!r}, which is not a number")  # noqa: TRY004 - of the value
 
 
-class WindowDetector:
+class WindowDetector(ABC):
     """Judges window after window of some sensors of one stream; holds its decision while samples are missing.
 
     Args:
@@ -79,6 +81,7 @@ class WindowDetector:
             machine.machine.name, name, 0, self.stream, 0, 0, "undetermined", sensors=tuple(sensors)
         )
 
+    @abstractmethod
     def judge(self, samples: Samples) -> Judgement:
         """What a window shows.
 
@@ -86,9 +89,8 @@ class WindowDetector:
             samples: float32 ``[block, sensors]``, all finite; a block of a device that takes blocks by itself
                 has its own length.
         """
-        raise NotImplementedError
 
-    def warm(self) -> None:
+    def warm(self) -> None:  # noqa: B027 - most have none
         """See `Detector.warm`: to be overridden by whoever compiles kernels."""
 
     def process(self, window: Window) -> Sequence[Diagnosis]:
@@ -120,7 +122,7 @@ class WindowDetector:
             return diagnosis
         judged = self.judge(samples)
         if not isinstance(judged, Judgement):
-            raise TypeError(f"judge() returned {judged!r}; return a Judgement")
+            raise BrokenContractError(self.judge, f"it returns {judged!r:.60}, not Judgement")
         decision = judged.decision or judged.severity
         changed = decision != self._held.decision
         self._held = replace(

@@ -116,6 +116,12 @@ def import_failure(error: BaseException, module: str) -> Failure:
     return Failure(f"{type(error).__name__}: {said} ({Path(file).name}, line {line})", remedy, said)
 
 
+def cause_of(error: BaseException) -> Hashable:
+    """Alike for errors that are said once: of a plugin from outside by kind and place, else by the words."""
+    foreign = foreign_failure(error)
+    return in_words(error) if foreign is None else foreign.cause
+
+
 def in_words(error: BaseException) -> str:
     """An exception in one line, with the plugin that it came from, or the line of this program."""
     foreign = foreign_failure(error)

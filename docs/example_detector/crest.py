@@ -28,7 +28,8 @@ class CrestDetector(WindowDetector):
         """Whether the crest factor is at the setpoint; a sensor that stands still has none."""
         x = samples - samples.mean()
         crest = float(np.abs(x).max() / x.std()) if x.any() else 0.0
-        return Judgement("alert" if crest >= self._alert else "normal", {"crest_factor": crest})
+        figures, limits = {"crest_factor": crest}, {"crest_factor.alert": self._alert}
+        return Judgement("alert" if crest >= self._alert else "normal", figures, thresholds=limits)
 
 
 class CrestPlugin(DetectorPlugin[Crest]):

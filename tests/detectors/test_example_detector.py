@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +15,11 @@ from support.machine_files import MOTOR, problems_of
 
 from daqsvc import api
 from daqsvc.alarms.make import alarm_rule
+from daqsvc.alarms.rules import Circumstances
 from daqsvc.cli import main
 from daqsvc.detectors.make import detectors
 from daqsvc.diagnosis.detector import Window
+from daqsvc.diagnosis.window_detector import Judgement
 from daqsvc.settings import describe, parse_machine_file
 
 if TYPE_CHECKING:
@@ -74,6 +77,31 @@ def test_knocks_raise_it_and_their_end_clears_it() -> None:
     assert second.statistics["crest_factor"] == pytest.approx(np.sqrt(2), rel=1e-2)
     assert (first.first_index, first.end_index, second.end_index) == (0, made.block, 2 * made.block)
     assert second.t_ns - first.t_ns == pytest.approx(1e9, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("judgement", "said"),
+    [
+        (None, r"crest finds alert, crest_factor is \d\d\.\d\d, alert limit 5"),
+        (
+            Judgement("danger", {"n": 1, "rms": 9.7}, units={"rms": "mm/s"}, thresholds={"rms.danger": 7.1}),
+            "crest finds danger, rms is 9.7 mm/s, danger limit 7.1 mm/s",
+        ),
+        (Judgement("alert", {"a": 1, "b": 2.5}, decision="rub"), "crest finds rub, a is 1, b is 2.5"),
+        (Judgement("alert"), "crest finds alert"),
+    ],
+)
+def test_its_alarm_says_the_figure_and_its_limit(judgement: Judgement | None, said: str) -> None:
+    made = detector()
+    if judgement is not None:
+        made.judge = lambda _: judgement
+    knocking = np.sin(np.arange(made.block) / 9.0)
+    knocking[7] = 40.0
+    [diagnosis] = made.process(window(made, knocking))
+    [rule] = [rule for rule in map(alarm_rule, machine().alarms) if rule.alarm == "knocks"]
+    finding = rule.watch().find(diagnosis, Circumstances())
+    assert finding is not None
+    assert re.fullmatch(said, finding.sentence)
 
 
 def test_missing_samples_and_silence_hold_the_decision() -> None:

@@ -1,0 +1,205 @@
+"""Plugins of others that fail while the service runs: one sentence for each cause, and all others go on."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import pytest
+from support.example_packages import installed
+from support.live_service import running
+from support.waiting import eventually
+
+from daqsvc.settings import parse_machine_file
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.integration
+
+PROJECT = """
+[project]
+name = "daqsvc-mishap"
+version = "2.1"
+
+[project.entry-points."daqsvc.drivers"]
+mishap = "mishap:MishapDriverPlugin"
+
+[project.entry-points."daqsvc.detectors"]
+mishap = "mishap:MishapPlugin"
+"""
+SOURCE = """
+import asyncio
+import itertools
+
+import numpy as np
+
+from daqsvc.api import Bus, DetectorPlugin, DriverPlugin, PackedLayout, Section, StreamDriver, WindowDetector
+
+
+class MishapBus(Bus):
+    kind = "a bus of mishaps"
+    how: str
+
+
+class MishapDriver(StreamDriver):
+    def __init__(self, how, port):
+        super().__init__(port, f"mishap {port.name!r}")
+        self.how, self.count = how, itertools.count()
+
+    async def read(self):
+        self.link.up()
+        while True:
+            frame = np.zeros((1, 8), np.uint8)
+            frame[0, :4] = np.frombuffer(next(self.count).to_bytes(4, "little"), np.uint8)
+            self.take(self.port.streams[0], frame if self.how != "takes" else None)
+            await asyncio.sleep(0.005)
+            if self.how == "raises":
+                raise KeyError("it was here")
+            if self.how == "returns":
+                return None
+
+
+class MishapDriverPlugin(DriverPlugin[MishapBus]):
+    buses, layouts = (MishapBus,), (PackedLayout,)
+
+    def build(self, bus, port):
+        return MishapDriver(bus.how, port)
+
+
+class Mishap(Section):
+    sensor: str
+    how: str
+
+
+class MishapDetector(WindowDetector):
+    def __init__(self, machine, settings):
+        super().__init__(machine, "mishap", [settings.sensor], window_s=0.05)
+        self.how = settings.how
+        if self.how == "process":
+            self.process = lambda window: [1]
+
+    def judge(self, samples):
+        if self.how == "raises":
+            raise ZeroDivisionError(f"mean {np.random.rand()}")
+        return None
+
+
+class MishapPlugin(DetectorPlugin[Mishap]):
+    settings, about, detector = Mishap, "mishaps", "mishap"
+
+    def build(self, machine, settings, store):
+        return [MishapDetector(machine, settings)]
+"""
+STREAM = """
+[buses.{name}]
+driver = "mishap"
+how = "{how}"
+
+[streams.{name}]
+bus = "{name}"
+rate_hz = 200.0
+[streams.{name}.layout]
+frame_bytes = 8
+counter = {{ byte = 0, bits = 32, counts = "samples" }}
+first_byte = 4
+samples_per_frame = 1
+channels = [{{ name = "x", type = "int16", scale = 1.0 }}]
+
+[[sensors]]
+name = "{name}"
+type = "accelerometer"
+stream = "{name}"
+channel = "x"
+unit = "g"
+"""
+MACHINE = """
+schema_version = 1
+site = "lab"
+box = "edge-1"
+[machine]
+name = "fan-1"
+speed_rpm = 1480.0
+[pipeline.mishap]
+sensor = "good"
+how = "{how}"
+[[alarms]]
+name = "mishaps"
+detector = "mishap"
+"""
+
+
+@pytest.fixture(autouse=True)
+def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "pyproject.toml").write_text(PROJECT)
+    (package / "mishap.py").write_text(SOURCE)
+    yield from installed(package, tmp_path / "site", monkeypatch)
+
+
+def line_of(words: str) -> int:
+    return SOURCE.splitlines().index(words) + 1
+
+
+READ = line_of("    async def read(self):")
+RAISED = line_of('                raise KeyError("it was here")')
+TAKEN = line_of('            self.take(self.port.streams[0], frame if self.how != "takes" else None)')
+JUDGE = line_of("    def judge(self, samples):")
+JUDGED = line_of('            raise ZeroDivisionError(f"mean {np.random.rand()}")')
+PROCESS = line_of("            self.process = lambda window: [1]")
+
+
+@pytest.mark.parametrize(
+    ("driver", "detector", "by_driver", "by_detector"),
+    [
+        (
+            "raises",
+            "raises",
+            f"read of mishap.MishapDriver has failed: KeyError: 'it was here' (mishap.py, line {RAISED})",
+            f"(mishap.py, line {JUDGED})",
+        ),
+        (
+            "returns",
+            "returns",
+            f"Driver has failed: it returns None, not why the link was lost (mishap.py, line {READ})",
+            f"Detector has failed: it returns None, not Judgement (mishap.py, line {JUDGE})",
+        ),
+        (
+            "takes",
+            "process",
+            f"give it uint8 [n, 8] of bad (mishap.py, line {TAKEN})",
+            f"it returns [1], not Sequence[Diagnosis] (mishap.py, line {PROCESS})",
+        ),
+    ],
+)
+async def test_a_driver_and_a_detector_that_fail_are_named_once_and_the_rest_goes_on(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    driver: str,
+    detector: str,
+    by_driver: str,
+    by_detector: str,
+) -> None:
+    text = MACHINE.format(how=detector) + "".join(
+        STREAM.format(name=name, how=how) for name, how in {"good": "", "bad": driver}.items()
+    )
+    async with running(parse_machine_file(text, tmp_path / "machine.toml"), tmp_path / "store") as service:
+        bad = next(one for one in service.drivers if one.name == "bad")
+        counters = service.pipeline.counters["mishap"]
+        await eventually(lambda: bad.link.losses >= 3, "the driver has been tried again and again")
+        await eventually(lambda: counters.failures >= 3, "windows have failed")
+        heard = service.rings["good"].end_index
+        await eventually(lambda: service.rings["good"].end_index > heard + 20, "the other bus goes on")
+        assert service.supervisor.failures["detector mishap"] >= 3
+    said = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    for begins, words, then in (
+        ("mishap 'bad': ", by_driver, "it is being tried again"),
+        ("detector mishap: ", by_detector, "it goes on with the next window"),
+    ):
+        [line] = [line for line in said if words in line]
+        assert line.startswith(begins)
+        assert line.endswith(f"; have the authors of daqsvc-mishap 2.1 mend it; {then}")
+    assert len(said) == 2
+    assert not any(record.exc_info for record in caplog.records if record.levelno > logging.INFO)
