@@ -14,7 +14,7 @@ import numpy as np
 from daqsvc.detectors.shaft.verdict import VERDICTS
 from daqsvc.diagnosis.recorded import Evaluated, RecordedDetector, Verdict, finite
 from daqsvc.dsp.orders import OrderVectors, order_vectors
-from daqsvc.dsp.quality.recorded import DataQuality, known_against
+from daqsvc.dsp.quality.recorded import DataQuality, known_against, off_stated_speed
 from daqsvc.dsp.quality.unit import M_S2_PER_UNIT
 from daqsvc.dsp.speed.lines import ORDERS
 from daqsvc.recording import RecordingError
@@ -271,6 +271,8 @@ def analyse_orders(
             refused=str(error),
             orders=orders,
         )
+    if orders.speed_seen and (problem := off_stated_speed(orders.speed_rpm, setup.speed_rpm)):
+        quality = quality.with_problem(problem)
     if not baseline.speed_seen:
         quality = quality.with_problem(
             f"no order of {setup.speed_rpm:g} rpm stands out of the healthy run {baseline_name}: if it "

@@ -102,9 +102,10 @@ def test_a_keyphasor_decides_the_speed(analyze: Callable[..., Any], tmp_path: Pa
     code, (found,), _ = analyze(file, *options, "--keyphasor-threshold", "3")
     assert code == 3
     assert "0 pulses cross 3; the channel lies between -10 and -2" in found["refused"]
-    code, (found,), _ = analyze(file, *options, "--speed-rpm", 1500)
-    assert code == 0
-    assert "the keyphasor decides" in " ".join(found["data_quality"]["problems"])
+    for stated_rpm, off in ((1500, True), (SPEED_RPM * 1.026, True), (SPEED_RPM * 1.01, False)):
+        code, (found,), _ = analyze(file, *options, "--speed-rpm", stated_rpm)
+        assert code == 0
+        assert ("the keyphasor decides" in " ".join(found["data_quality"]["problems"])) == off
 
 
 def test_a_shaft_that_turns_clockwise_has_a_negative_speed(

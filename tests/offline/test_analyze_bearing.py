@@ -70,6 +70,27 @@ def test_the_damaged_race_is_named_with_its_lines(verb: Run, files: dict[str, Pa
     assert found["channels"]["de"]["bearing"]["bpfi"] == pytest.approx(INNER, rel=1e-3)
 
 
+@pytest.mark.parametrize("part", ["healthy", "inner"])
+def test_a_stated_speed_that_the_harmonics_show_to_be_wrong_is_noted(
+    verb: Run, files: dict[str, Path], part: str
+) -> None:
+    for stated_rpm, off in (
+        (1750.3, "+2.7"),
+        (1785.0, None),
+        (1797.0, None),
+        (1810.0, None),
+        (1843.7, "-2.5"),
+    ):
+        code, (found,), _ = verb("analyze", files[part], *OPTIONS, "--speed-rpm", stated_rpm)
+        assert (code, found["verdict"]) == (0, "normal" if part == "healthy" else part)
+        noted = [one for one in found["data_quality"]["problems"] if "harmonics of the shaft" in one]
+        note = (
+            f"the harmonics of the shaft stand out at 1797.0 rpm, not at the stated {stated_rpm} rpm "
+            f"({off} %): the former is used; correct the speed"
+        )
+        assert noted == ([note] if off else [])
+
+
 def test_without_a_healthy_run_a_healthy_machine_is_normal(verb: Run, files: dict[str, Path]) -> None:
     code, (found,), _ = verb("analyze", files["healthy"], *OPTIONS)
     assert (code, found["verdict"], found["group"]) == (0, "normal", ["normal"])

@@ -25,6 +25,7 @@ from daqsvc.detectors.bearing.recorded_checks import (
     stated_speed_problem,
     with_offsets,
     with_repairs,
+    with_speed,
 )
 from daqsvc.detectors.bearing.settings import Bearing
 from daqsvc.detectors.bearing.verdict import BearingSetup, BearingVerdict
@@ -249,6 +250,9 @@ def _concluded(
     if detector.baseline is not None and change_at is not None:
         sensors = next(bearing.sensors for bearing in detector.bearings if bearing.name == change_at)
         healthy = detector.baseline.residuals[sensors]
+    quality = with_offsets(quality, look.races)
+    if detector.keyphasor is None:
+        quality = with_speed(quality, look.races, setup.speed_rpm)
     return replace(
         analysis,
         finding=BearingFinding(
@@ -258,7 +262,7 @@ def _concluded(
             probabilities=finding.probabilities,
             severity=finding.severity,
         ),
-        quality=with_offsets(quality, look.races),
+        quality=quality,
         races=look.races,
         healthy=healthy,
         change=look.change,
@@ -365,7 +369,7 @@ def analyse_bearings(
         recording=str(recording.source),
         baseline=source,
         setup=setup,
-        quality=with_repairs(quality, races),
+        quality=with_speed(with_repairs(quality, races), races, setup.speed_rpm),
         finding=find(races, change, setup.change.false_alarm_probability),
         races=races,
         unfit=unfit,

@@ -12,6 +12,7 @@ from daqsvc.bearing.race.verdict import PLACES
 from daqsvc.dsp.quality import UnfitError
 from daqsvc.dsp.quality.accelerometers import OFFSET_NOTE
 from daqsvc.dsp.quality.clipped import refuse_clipped
+from daqsvc.dsp.quality.recorded import off_stated_speed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -115,6 +116,20 @@ def with_repairs(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> Data
         for repair in race.repairs:
             quality = quality.with_problem(f"{name}: {repair}")
     return with_offsets(quality, races)
+
+
+def with_speed(quality: DataQuality, races: Mapping[str, RaceVerdict], stated_rpm: float) -> DataQuality:
+    """The same with a speed that the harmonics of the shaft show, where it is not the stated one.
+
+    Args:
+        quality: what is known so far.
+        races: what each channel shows, of those that could be judged.
+        stated_rpm: the speed that was stated.
+    """
+    for race in races.values():
+        if race.speed_seen and (problem := off_stated_speed(race.speed_rpm, stated_rpm)):
+            return quality.with_problem(problem)
+    return quality
 
 
 def with_offsets(quality: DataQuality, races: Mapping[str, RaceVerdict]) -> DataQuality:

@@ -40,6 +40,26 @@ _NO_MEAN = 1e-3
 _FIGURES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 
 
+OFF_STATED = 0.015
+"""Share by which the speed may differ from the stated one until that is said; it is stated to 1 %."""
+
+
+def off_stated_speed(seen_rpm: float, stated_rpm: float) -> str:
+    """What to say of a speed by the harmonics of the shaft that is not the stated one; empty if it is.
+
+    Args:
+        seen_rpm: by harmonics that stand out clearly.
+        stated_rpm: what was said of the machine.
+    """
+    off = abs(seen_rpm / stated_rpm) - 1.0
+    if abs(off) <= OFF_STATED:
+        return ""
+    return (
+        f"the harmonics of the shaft stand out at {abs(seen_rpm):.1f} rpm, not at the stated "
+        f"{abs(stated_rpm):g} rpm ({100.0 * off:+.1f} %): the former is used; correct the speed"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class DataQuality:
     """What is known against the samples.
