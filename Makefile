@@ -9,6 +9,7 @@
 # make measure  figures of the source: lines, circles of imports, names that occur twice
 # make nothing-lost  200 randomised runs with kills, outages and full disks: does every alarm arrive?
 # make bench-data  the tables of the documentation, anew from the measured recordings
+# make deb    a Debian package of the service, in dist/; apt install ./dist/daqsvc_*.deb
 # make test-wheel  the everyday tests against the wheel in dist/, installed in a venv of its own
 # make hooks  have git check every commit
 # make proto  the module of the Sparkplug payload, anew from its schema
@@ -32,7 +33,7 @@ export OMP_NUM_THREADS ?= 1
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/kernels
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long hil check guard measure bench bench-data dist nothing-lost test-wheel hooks proto lock clean
+.PHONY: help demo test test-long hil check guard measure bench bench-data dist deb nothing-lost test-wheel hooks proto lock clean
 
 help:
 	@sed -n 's/^# \(make.*\)/\1/p' Makefile
@@ -80,6 +81,24 @@ dist: $(READY)
 		--output-file $$(ls $(DIST)/*.whl | sed 's/-py3.*//').cdx.json
 	@ls $(DIST)
 
+# What the service needs and no more. Between two releases the number of commits makes each package newer than the last.
+DEB := $(DIST)/deb
+deb: dist
+	@command -v dh >/dev/null || { echo "make: debhelper is missing; install it with: apt-get install debhelper"; exit 1; }
+	@test -x /usr/bin/python3.11 || { echo "make: Debian's own Python is missing; install it with: apt-get install python3.11"; exit 1; }
+	@mkdir -p $(DEB)/source && cp -r packaging/debian requirements-service.lock config docs $(DEB)/source/
+	@cp config/systemd/daqsvc@.service config/systemd/daqsvc.sysusers.conf $(DEB)/source/debian/
+	@mv $(DEB)/source/debian/daqsvc.sysusers.conf $(DEB)/source/debian/daqsvc.sysusers
+	@version=$$($(BIN)/python -c 'import daqsvc; print(daqsvc.__version__)'); \
+	commits=$$(git rev-list --count HEAD 2>/dev/null) && ! git describe --exact-match --tags >/dev/null 2>&1 && \
+		version=$$version+$$commits.g$$(git rev-parse --short HEAD); \
+	printf 'daqsvc (%s) stable; urgency=medium\n\n  * See CHANGELOG.md.\n\n -- daqsvc developers <daqsvc@localhost>  %s\n' \
+		"$$version" "$$(git log -1 --format=%cD 2>/dev/null || date -R -d @315532800)" > $(DEB)/source/debian/changelog
+	@cd $(DEB)/source && PIP="$(abspath $(BIN))/python -m pip" WHEEL=$$(ls $(abspath $(DIST))/*.whl) \
+		env --unset=MAKEFLAGS --unset=MAKEOVERRIDES dpkg-buildpackage --build=binary --no-sign > ../build.log 2>&1 \
+		|| { tail -30 ../build.log; echo "make: the package was not built; $(DEB)/build.log has all of it"; exit 1; }
+	@mv $(DEB)/daqsvc_*.deb $(DIST)/ && rm -r $(DEB)/source && ls -l $(DIST)/daqsvc_*.deb
+
 # All that is tracked, but for the packages: what is tested is what the wheel has installed.
 test-wheel: dist
 	@$(PYTHON) -m venv $(DIST)/venv
@@ -111,6 +130,7 @@ proto: $(READY)
 lock:
 	uv pip compile pyproject.toml --all-extras --group dev --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -o requirements-dev.lock
 	uv pip compile pyproject.toml --all-extras --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements.lock
+	uv pip compile pyproject.toml --extra dbc --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-service.lock
 	echo 'setuptools>=77' | uv pip compile - --universal --generate-hashes --no-emit-index-url --python-version 3.11 --no-header --quiet -c requirements-dev.lock -o requirements-build.lock
 
 clean:

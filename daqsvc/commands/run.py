@@ -88,7 +88,7 @@ class RunCommand:
 
 
 def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager: ServiceManager) -> int:
-    from daqsvc.outbox.store import OutboxError  # noqa: PLC0415
+    from daqsvc.outbox.messages import NewerOutboxError, OutboxError  # noqa: PLC0415
     from daqsvc.settings.problems import AssemblyError  # noqa: PLC0415 - each verb imports only what it needs
     from daqsvc.supervision import EssentialLostError  # noqa: PLC0415
     from drivers.base import DeviceAbsentError  # noqa: PLC0415
@@ -96,7 +96,7 @@ def _run(machine: MachineFile, store: Path | None, guard: ProcessGuard, manager:
 
     try:
         asyncio.run(_run_until_stopped(machine, store or store_directory(machine), guard, manager))
-    except (AssemblyError, LayoutError) as error:
+    except (AssemblyError, LayoutError, NewerOutboxError) as error:
         log.critical("%s", error)
         return EXIT_USAGE
     except (DeviceAbsentError, OutboxError, StoreNotFoundError) as error:

@@ -27,7 +27,14 @@ from daqsvc.outbox.files import (
 )
 from daqsvc.outbox.known_topics import KnownTopics
 from daqsvc.outbox.log_copy import LogCopy
-from daqsvc.outbox.messages import OutboxAwayError, OutboxError, OutboxMessage, checksum, is_sound
+from daqsvc.outbox.messages import (
+    NewerOutboxError,
+    OutboxAwayError,
+    OutboxError,
+    OutboxMessage,
+    checksum,
+    is_sound,
+)
 from daqsvc.outbox.reading import opened_to_read
 from daqsvc.outbox.renewal import Damage, Renewal
 from daqsvc.outbox.safety import refuse_link, refuse_unsafe, restrict_files
@@ -458,7 +465,7 @@ class Journal:
             raise corruption(f"schema version {version} with the tables of {SCHEMA_VERSION}")
         if version > SCHEMA_VERSION:
             writer = written_by(self.path) or "a newer version"
-            raise OutboxError(
+            raise NewerOutboxError(
                 f"outbox {self.path} has schema version {version}, written by daqsvc {writer}; this is "
                 f"daqsvc {__version__}, which knows {SCHEMA_VERSION}: install that version again, or give "
                 f"the service another store"

@@ -15,6 +15,10 @@ class OutboxError(Exception):
     """The outbox cannot do what it was asked to; the text names the file and the remedy."""
 
 
+class NewerOutboxError(OutboxError):
+    """A newer version of the program has written the file: starting again does not help."""
+
+
 class OutboxAwayError(OutboxError):
     """The outbox cannot be used for now: its disk is full, takes no writes, or answers with errors."""
 

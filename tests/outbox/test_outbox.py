@@ -17,6 +17,7 @@ from support.waiting import eventually
 import daqsvc
 from daqsvc.acquisition.clock import SystemClock
 from daqsvc.outbox.journal import TRIM_EVERY, Journal
+from daqsvc.outbox.messages import NewerOutboxError
 from daqsvc.outbox.sequence import STEP, UNRECORDED
 from daqsvc.outbox.store import Outbox, OutboxError, OutboxLimits
 
@@ -287,7 +288,7 @@ async def test_what_cannot_be_used_is_said_with_a_remedy(tmp_path):
     with pytest.raises(OutboxError, match="schema version 99, written by daqsvc a newer version"):
         await opened(tmp_path / "newer.sqlite")
     (tmp_path / "newer.sqlite.version").write_text("9.9.0\n")
-    with pytest.raises(OutboxError, match=r"written by daqsvc 9\.9\.0; .* install that version again"):
+    with pytest.raises(NewerOutboxError, match=r"written by daqsvc 9\.9\.0; .* install that version again"):
         await opened(tmp_path / "newer.sqlite")
     outbox = Outbox(tmp_path / "outbox.sqlite", SystemClock())
     with pytest.raises(OutboxError, match="is not open yet"):

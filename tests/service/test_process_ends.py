@@ -10,6 +10,7 @@ import re
 import select
 import shutil
 import signal
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -223,6 +224,18 @@ LOSSES = {
         "once_ready(cancel)"
     ),
 }
+
+
+def test_a_store_of_a_newer_version_is_refused_for_good(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    store.mkdir(mode=0o700)
+    with contextlib.closing(sqlite3.connect(store / "outbox.sqlite")) as newer:
+        newer.execute("PRAGMA user_version = 99")
+    (store / "outbox.sqlite.version").write_text("9.9.0\n")
+    done = subprocess.run(command(tmp_path), capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 2, "systemd would start it again and again"
+    assert "written by daqsvc 9.9.0" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("why", LOSSES)
