@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 from pydantic import Field
 
-from daqsvc.settings.section import MOST, DelayS, Kinds, Name, Nats, Quantity, Section, Text
+from daqsvc.settings.section import MOST, DelayS, Kinds, Name, NamesDetector, Nats, Quantity, Section, Text
 
 Measure = Literal["rms", "peak", "peak_to_peak", "crest_factor", "velocity_rms", "gap_voltage", "value"]
 
@@ -97,7 +97,7 @@ class DiagnosisAlarm(BaseAlarm):
 
     kind: ClassVar[str] = "an alarm on a detector"
 
-    detector: Annotated[Name, Field(description="the detector it follows", examples=["rotor-bank"])]
+    detector: Annotated[Name, Field(description="the detector it follows"), NamesDetector()]
     evidence_nats: Nats = Field(
         default=0.0, description="evidence without which it is not raised, where the detector states it"
     )
@@ -118,7 +118,7 @@ Alarm: TypeAlias = Annotated[
 class StartUp(Section):
     """How a start-up is recognised, during which ``trip_multiply`` holds: a range, a rate, or either."""
 
-    detector: Annotated[Text, Field(description="whose statements hold the signal", examples=["rotor-bank"])]
+    detector: Annotated[Text, Field(description="whose statements hold the signal"), NamesDetector()]
     measure: Text = Field(default="speed", description="the signal among its statistics")
     between: Annotated[tuple[Quantity, Quantity], Field(strict=False)] | None = Field(
         default=None, description="the signal lies in this range", examples=[[300.0, 2700.0]]

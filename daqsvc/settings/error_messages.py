@@ -8,7 +8,9 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from daqsvc.settings.aliases import meant_key
+from daqsvc.settings.registry import first_detector
 from daqsvc.settings.schema import declared_at, homes_of, kinds_of, section_of, value_at
+from daqsvc.settings.section import NamesDetector
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -262,6 +264,9 @@ class ErrorFormatter:
             if isinstance(example, str) and example.startswith(("[", "{", "0x")):
                 return example
             return json.dumps(example)
+        if any(isinstance(mark, NamesDetector) for mark in field.metadata):
+            name = first_detector()
+            return None if name is None else json.dumps(name)
         if isinstance(field.default, bool | int | float | str | tuple):
             return json.dumps(field.default)
         return None

@@ -193,6 +193,11 @@ def detector_tables() -> Mapping[str, DetectorKind[Any]]:
     return _installed(DETECTORS, "detector", DetectorKind).tables
 
 
+def first_detector() -> str | None:
+    """The first of the detectors that are installed and that an alarm can follow; None if there is none."""
+    return next((plugin.detector for plugin in detector_tables().values() if plugin.detector), None)
+
+
 def broken_detectors() -> Mapping[str, Failure]:
     """Why a detector that is installed cannot be loaded, by the key of its table."""
     return _installed(DETECTORS, "detector", DetectorKind).broken

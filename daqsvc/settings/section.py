@@ -99,6 +99,11 @@ class Section(BaseModel):
 
 
 @dataclass(frozen=True)
+class NamesDetector:
+    """Annotation of a key that names a detector: the example of it in a message is one that is installed."""
+
+
+@dataclass(frozen=True)
 class Kinds:
     """Annotation of a key whose table is of one of several kinds, told apart before it is validated.
 
