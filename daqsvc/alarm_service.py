@@ -482,7 +482,7 @@ class AlarmService:
         outbox = self.outbox.counters
         return Vitals(
             now_ns=self._clock.monotonic_ns(),
-            conditions_told=self.manager.conditions,
+            conditions_reported=self.manager.conditions,
             free_bytes=self._free_bytes,
             waiting=outbox.waiting,
             write_errors=outbox.write_errors,

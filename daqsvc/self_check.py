@@ -59,7 +59,7 @@ class Vitals:
 
     Attributes:
         now_ns: monotonic clock.
-        conditions_told: conditions of the service that were ever told of, also before a restart.
+        conditions_reported: conditions of the service that were ever told of, also before a restart.
         free_bytes: free space on the store's disk; None if nobody has looked.
         waiting: alarm events in memory that the disk has not taken.
         write_errors: failed writes of alarms so far.
@@ -73,7 +73,7 @@ class Vitals:
     """
 
     now_ns: int
-    conditions_told: frozenset[str]
+    conditions_reported: frozenset[str]
     free_bytes: int | None
     waiting: int
     write_errors: int
@@ -157,7 +157,7 @@ class SelfCheck:
             for condition in states:
                 yield from self._once_known(condition, vitals, watched=health.heard)
         of_a_bus = (BUS_OVERRUN, BUS_CONTROLLER, BUS_RECORDING)
-        for name in sorted(vitals.conditions_told):
+        for name in sorted(vitals.conditions_reported):
             if name.startswith(of_a_bus) and name.partition("/")[2] not in vitals.buses:
                 yield Condition(name, Level.NORMAL, "there is no such bus any more")
 
@@ -168,7 +168,7 @@ class SelfCheck:
         name = condition.name
         if condition.level is not Level.NORMAL:
             self._said.add(name)
-        elif name not in self._said and name in vitals.conditions_told:
+        elif name not in self._said and name in vitals.conditions_reported:
             # It stood before a restart.
             if not watched:
                 return

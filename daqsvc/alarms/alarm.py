@@ -130,7 +130,7 @@ class Alarm:
         self._told_doubts: tuple[Doubt, ...] = ()
         self._seen_doubts: tuple[Doubt, ...] = ()
         """Those of the last event, or of a change since that a person could not tell from it."""
-        self._told_finding = ""
+        self._last_message = ""
         """The message by which the finding that stands was told; empty if nobody knows."""
         self._identity = identity
         self._latching = latching
@@ -138,7 +138,7 @@ class Alarm:
         self._chatter = ChatterWatch(handling)
         self._state = AlarmState.NORMAL
         self._level = Level.NORMAL
-        self._found = ""
+        self._finding = ""
         self._holds: set[Hold] = set()
         self._shelved_until_ns: int | None = None
         self._occurrence: str | None = None
@@ -200,12 +200,12 @@ class Alarm:
             left_ns = event.shelved_until_wall_ns - max(event.wall_ns, now.wall_ns)
             self._shelved_until_ns = now.t_ns + max(left_ns, 0)
         self._occurrence = None if self._state is AlarmState.NORMAL else event.occurrence
-        self._found, self._cause = finding, event.cause
+        self._finding, self._cause = finding, event.cause
         self.doubts = self._told_doubts = self._seen_doubts = event.doubts
         if event.kind in FINDINGS:
-            self._told_finding = event.message
+            self._last_message = event.message
         elif sentence:
-            self._told_finding = self._saying(event.to_level, sentence)
+            self._last_message = self._saying(event.to_level, sentence)
         self._chatter.resume(chattering=event.chattering)
         self._since, self._message = since, event.message
 
@@ -251,7 +251,7 @@ class Alarm:
         return (
             self._state.is_active
             and finding.level == self._level
-            and finding.identity != self._found
+            and finding.identity != self._finding
             and [doubt[:3] for doubt in self.doubts] == [doubt[:3] for doubt in self._seen_doubts]
             and self._changed_ns is not None
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
@@ -272,9 +272,9 @@ class Alarm:
             and 0 <= at.t_ns - self._changed_ns < CHANGES_NS
         ):
             return []
-        self._found = finding.identity
+        self._finding = finding.identity
         message = f"{self.name} {self._level.label} until it is quiet: {finding.sentence}"
-        self._told_finding = message
+        self._last_message = message
         return [self._event(EventKind.CHANGED, cause, HandlingRequest("", at), message)]
 
     def hold(self) -> None:
@@ -298,14 +298,14 @@ class Alarm:
         if kind is None:
             return None
         message = self._saying(level, finding.sentence)
-        if kind is EventKind.CHANGED and message == self._told_finding:
+        if kind is EventKind.CHANGED and message == self._last_message:
             # No person could tell it from what was said last; what is found goes with the next event.
-            self._found, self._seen_doubts = finding.identity, self.doubts
+            self._finding, self._seen_doubts = finding.identity, self.doubts
             return None
-        self._told_finding = message
+        self._last_message = message
         if kind is EventKind.RAISED:
             self._occurrence = self._new_occurrence()
-        self._found = finding.identity
+        self._finding = finding.identity
         stimulus = Stimulus.ESCALATE if kind is EventKind.ESCALATED else Stimulus.RAISE
         state = transition(self._state, stimulus, latching=self._latching)
         return self._change(kind, state, level, cause, HandlingRequest("", at), message)
@@ -327,7 +327,7 @@ class Alarm:
             return EventKind.ESCALATED, level
         if level < self._level:
             return EventKind.LOWERED, level
-        return (EventKind.CHANGED if finding.identity != self._found else None), level
+        return (EventKind.CHANGED if finding.identity != self._finding else None), level
 
     def suppress(self, reason: str, cause: Diagnosis, at: ClockReading) -> AlarmEvent:
         """Cover the state because a sensor is not OK."""
@@ -459,7 +459,7 @@ class Alarm:
         before, level_before, occurrence = before or self._shown, self._level, self._occurrence
         self._state, self._level, self._cause = state, level, cause
         if state is AlarmState.NORMAL:
-            self._occurrence, self._found = None, ""
+            self._occurrence, self._finding = None, ""
         return self._event(kind, cause, request, message, before, level_before, occurrence)
 
     def _event(
@@ -498,7 +498,7 @@ class Alarm:
             covered=self._state if self._holds else None,
             shelved_until_wall_ns=None if until_ns is None else at.wall_ns + until_ns - at.t_ns,
             chattering=self._chatter.chattering,
-            found=self._found,
+            finding=self._finding,
             doubts=self.doubts,
         )
 

@@ -105,7 +105,7 @@ class AlarmEvent:
         shelved_until_wall_ns: wall-clock label of the end of shelving, as it looks now; None if not shelved.
         first_out: whether this alarm was the first of its group to stand since the group was normal.
         chattering: whether its returns are held back because it comes and goes too often.
-        found: what is found, where a level can have several causes (`Finding.identity`).
+        finding: what is found, where a level can have several causes (`Finding.identity`).
         doubts: of a quality alarm, what is said against the sensor.
 
     The last event of an alarm holds all that a restart needs to know about it.
@@ -130,7 +130,7 @@ class AlarmEvent:
     shelved_until_wall_ns: int | None = None
     first_out: bool = False
     chattering: bool = False
-    found: str = ""
+    finding: str = ""
     doubts: tuple[Doubt, ...] = ()
 
     @property

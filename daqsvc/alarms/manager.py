@@ -416,7 +416,7 @@ class AlarmManager:
             self._resume_unruled(event)
             doubts = [doubt for doubt in event.doubts if doubt.detector in active_detectors]
             t_ns = self._clock.monotonic_ns()
-            self._doubts.resume(doubts, t_ns, event.found)
+            self._doubts.resume(doubts, t_ns, event.finding)
             self._doubts.expect(name, self._expected.quality[name], t_ns)
         elif ours and is_condition(event) and (name != ALARM_FLOOD or self._handling.flood_alarms):
             self._resume_unruled(event)
@@ -454,7 +454,7 @@ class AlarmManager:
         self._resume_alarm(ruled.alarm, event, ruled.watch.resume(level, event))
 
     def _resume_unruled(self, event: AlarmEvent) -> None:
-        self._resume_alarm(self._add(event.alarm, latching=False), event, event.found)
+        self._resume_alarm(self._add(event.alarm, latching=False), event, event.finding)
 
     def _resume_alarm(self, alarm: Alarm, event: AlarmEvent, finding: str) -> None:
         sentence = in_words(event.alarm, event.doubts) if event.doubts else ""

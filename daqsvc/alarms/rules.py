@@ -345,8 +345,8 @@ class _LevelWatch:
 
     def resume(self, level: Level, event: AlarmEvent) -> str:
         sides = {TOO_LOW: True, TOO_HIGH: False}
-        self._watch.monitor.resume(level, lower=sides.get(event.found))
-        return event.found
+        self._watch.monitor.resume(level, lower=sides.get(event.finding))
+        return event.finding
 
 
 class _DecisionWatch:
@@ -374,9 +374,9 @@ class _DecisionWatch:
         """The detector itself holds its decision."""
 
     def resume(self, level: Level, event: AlarmEvent) -> str:  # noqa: ARG002  it has no memory of levels
-        if event.found:
-            self._group = tuple(event.found.split("|"))
-        return event.found
+        if event.finding:
+            self._group = tuple(event.finding.split("|"))
+        return event.finding
 
     @staticmethod
     def _sentence(diagnosis: Diagnosis, evidence: float | None) -> str:

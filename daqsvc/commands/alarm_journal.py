@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from daqsvc.outbox.reading import JournalEntry, JournalView
 
-    Told = dict[str, Any]
+    EventDocument = dict[str, Any]
     """An alarm payload as it was published."""
 
 SCHEMA = "daqsvc.alarm/"
@@ -34,17 +34,17 @@ class AlarmView(NamedTuple):
     """How an alarm stands, and how that came about.
 
     Attributes:
-        told: its latest event.
+        latest: its latest event.
         since_ns: when its occurrence began, wall clock; of an alarm without one, when the event was.
         message: what was found last, and what somebody has done about it since.
     """
 
-    told: Told
+    latest: EventDocument
     since_ns: int
     message: str
 
 
-def current(store: Path) -> list[Told]:
+def current(store: Path) -> list[EventDocument]:
     """The latest event of every alarm of every machine that the journal knows, oldest first; blocks.
 
     Raises:
@@ -52,10 +52,10 @@ def current(store: Path) -> list[Told]:
     """
     view = read_journal(store, history=0)
     _tell_damage(view, store)
-    return list(_told(view.latest))
+    return list(_documents(view.latest))
 
 
-def standing(store: Path, events: Sequence[Told]) -> list[AlarmView]:
+def standing(store: Path, events: Sequence[EventDocument]) -> list[AlarmView]:
     """How alarms stand, with what their own past adds to it; blocks.
 
     Args:
@@ -79,7 +79,7 @@ def standing(store: Path, events: Sequence[Told]) -> list[AlarmView]:
     pasts = read_pasts(store, standing_now, is_over, MOST_EVENTS) if standing_now else {}
     views = []
     for event in events:
-        past = list(_told(pasts.get(topic_of.get(event["id"], ""), ())))
+        past = list(_documents(pasts.get(topic_of.get(event["id"], ""), ())))
         findings = [one["message"] for one in past if one["kind"] in _FINDINGS]
         message = event["message"]
         if findings and findings[-1] != message:
@@ -88,7 +88,7 @@ def standing(store: Path, events: Sequence[Told]) -> list[AlarmView]:
     return views
 
 
-def history(store: Path, most: int) -> list[Told]:
+def history(store: Path, most: int) -> list[EventDocument]:
     """The newest events, at most so many, newest last; blocks.
 
     Raises:
@@ -97,7 +97,7 @@ def history(store: Path, most: int) -> list[Told]:
     asked = most
     while True:
         view = read_journal(store, history=asked)
-        events = list(_told(view.history))
+        events = list(_documents(view.history))
         # Messages of other kinds may lie between.
         if len(events) >= most or len(view.history) + view.damaged < asked:
             _tell_damage(view, store)
@@ -113,7 +113,7 @@ def _tell_damage(view: JournalView, store: Path) -> None:
         )
 
 
-def _told(entries: Iterable[JournalEntry]) -> Iterable[Told]:
+def _documents(entries: Iterable[JournalEntry]) -> Iterable[EventDocument]:
     for entry in entries:
         event = json.loads(entry.payload)
         if str(event.get("schema", "")).startswith(SCHEMA):
@@ -134,9 +134,9 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
         alarms: one each.
         now_ns: wall clock, ns since the Unix epoch.
     """
-    events = [alarm.told for alarm in alarms]
+    events = [alarm.latest for alarm in alarms]
     machines = _machine_title(events)
-    worst_first = sorted(alarms, key=lambda alarm: (-_LEVELS.index(alarm.told["level"]), -alarm.since_ns))
+    worst_first = sorted(alarms, key=lambda alarm: (-_LEVELS.index(alarm.latest["level"]), -alarm.since_ns))
     rows = [
         [
             event["level"],
@@ -152,7 +152,7 @@ def current_table(alarms: Sequence[AlarmView], now_ns: int) -> str:
     return _aligned(["LEVEL", "STATE", *machines, "ALARM", "ID", "SINCE", "MESSAGE"], rows)
 
 
-def history_table(events: Sequence[Told]) -> str:
+def history_table(events: Sequence[EventDocument]) -> str:
     """What has happened: one line an event, newest last."""
     machines = _machine_title(events)
     rows = [
@@ -186,7 +186,7 @@ def ago(age_ns: int) -> str:
 _LEVELS = ("normal", "alert", "danger")
 
 
-def _state(event: Told) -> str:
+def _state(event: EventDocument) -> str:
     words = str(event["state"]).replace("_", " ")
     if event["state"] == "shelved" and (until_ns := event.get("shelved_until_wall_ns")):
         words += f" until {_local(until_ns)}"
@@ -199,11 +199,11 @@ def _state(event: Told) -> str:
     return words
 
 
-def _machine(event: Told, machines: Sequence[str]) -> list[str]:
+def _machine(event: EventDocument, machines: Sequence[str]) -> list[str]:
     return [event["machine"]] if machines else []
 
 
-def _machine_title(events: Iterable[Told]) -> list[str]:
+def _machine_title(events: Iterable[EventDocument]) -> list[str]:
     """A column for the machine, where there are several."""
     return ["MACHINE"] if len({event["machine"] for event in events}) > 1 else []
 

@@ -74,11 +74,11 @@ class WorkResult(NamedTuple):
     """What the work has found.
 
     Attributes:
-        found: what JSON can say.
+        document: what JSON can say.
         arrays: and the numbers.
     """
 
-    found: Any
+    document: Any
     arrays: Sequence[NDArray[Any]]
 
 

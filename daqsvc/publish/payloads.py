@@ -210,7 +210,7 @@ def _alarm(event: AlarmEvent, sequence: int, series: str) -> dict[str, Any]:
         "shelved_until_wall_ns": event.shelved_until_wall_ns,
         "first_out": event.first_out,
         "chattering": event.chattering,
-        "found": event.found,
+        "found": event.finding,
         "doubts": [doubt._asdict() for doubt in event.doubts],
         "cause": _statement(event.cause) | {"monotonic_ns": event.cause.t_ns},
     }
@@ -258,7 +258,7 @@ def alarm_event(payload: bytes) -> AlarmEvent:
         shelved_until_wall_ns=message.shelved_until_wall_ns,
         first_out=message.first_out,
         chattering=message.chattering,
-        found=message.found,
+        finding=message.found,
         doubts=tuple(Doubt(**dict(doubt)) for doubt in message.doubts),
     )
 

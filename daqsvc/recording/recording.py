@@ -154,7 +154,7 @@ def list_channels(path: Path | str, expected: Sequence[str] = ()) -> dict[str, i
     Raises:
         RecordingError: the file cannot be read, or has one that is expected, and it is no channel.
     """
-    lengths: dict[str, int] = _there("channels_of", Path(path), {"expected": list(expected)}).found
+    lengths: dict[str, int] = _there("channels_of", Path(path), {"expected": list(expected)}).document
     return lengths
 
 

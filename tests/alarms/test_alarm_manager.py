@@ -243,10 +243,14 @@ def test_from_too_high_to_too_low_is_a_change_of_one_alarm():
     rule = LevelRule("window", "probe-x", "rms", Setpoint(alert=40.0, alert_low=10.0, deadband=2.0))
     desk = Desk(rule)
     (raised,) = desk.rms(45.0)
-    assert (raised.kind, raised.found) == (EventKind.RAISED, "high")
+    assert (raised.kind, raised.finding) == (EventKind.RAISED, "high")
     assert "alert limit 40 um" in raised.message
     (changed,) = desk.rms(9.0)
-    assert (changed.kind, changed.found, changed.occurrence) == (EventKind.CHANGED, "low", raised.occurrence)
+    assert (changed.kind, changed.finding, changed.occurrence) == (
+        EventKind.CHANGED,
+        "low",
+        raised.occurrence,
+    )
     assert "rms of probe-x is 9 um, lower alert limit 10 um" in changed.message
     assert desk.rms(11.9) == []
     (returned,) = desk.rms(12.1)

@@ -119,7 +119,7 @@ def test_a_gap_voltage_that_is_too_low_for_sure_raises_its_alarm():
     assert not watched.take(quiet(rng, WINDOW))
     assert watched.take(lost(rng, loud(rng, WINDOW), 0.3, 1)) == [("high", "raised")]
     assert "gap_voltage of a is at most -1" in watched.rig.events[-1].message
-    assert watched.rig.events[-1].found == "low"
+    assert watched.rig.events[-1].finding == "low"
 
 
 @pytest.mark.parametrize("measure", ["rms", "crest_factor", "velocity_rms"])

@@ -18,7 +18,7 @@ from drivers.serial.driver import SerialCounters
 STORE = Path("/var/lib/daqsvc")
 FINE: dict[str, Any] = {
     "now_ns": 0,
-    "conditions_told": frozenset(),
+    "conditions_reported": frozenset(),
     "free_bytes": None,
     "waiting": 0,
     "write_errors": 0,
@@ -114,7 +114,7 @@ def test_after_a_restart_nothing_is_normal_before_it_was_watched_for_a_minute(co
 
     def levels(check: SelfCheck, seconds: list[int], **vitals: Any) -> list[Level | None]:
         fine = {"buses": {"can0": BusHealth(0, 0, "error-active")}} | vitals
-        found = [look(check, conditions_told=told, now_ns=t_s * NS_PER_S, **fine) for t_s in seconds]
+        found = [look(check, conditions_reported=told, now_ns=t_s * NS_PER_S, **fine) for t_s in seconds]
         return [one[condition][0] if condition in one else None for one in found]
 
     assert levels(self_check(), [5, 6, 64, 66]) == [None, None, None, Level.NORMAL]
@@ -183,7 +183,7 @@ def test_frames_that_are_missing_from_a_recording_are_an_alarm_until_a_minute_af
 
 def test_a_bus_that_is_no_longer_there_has_no_alarm() -> None:
     told = frozenset({"bus-overrun/can1", "bus-controller/can1", "bus-overrun/can0"})
-    found = look(self_check(), conditions_told=told, buses={"can0": BusHealth(0, 0, "error-active")})
+    found = look(self_check(), conditions_reported=told, buses={"can0": BusHealth(0, 0, "error-active")})
     gone = (Level.NORMAL, "there is no such bus any more")
     assert found["bus-overrun/can1"] == found["bus-controller/can1"] == gone
     assert "bus-overrun/can0" not in found, "it was not watched for long enough"

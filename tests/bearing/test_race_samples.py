@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 from support.race_signals import BEARING, RATE_HZ, SPEED_RPM, strikes
 
 from daqsvc.bearing.race import race_test
-from daqsvc.bearing.race.decision import MOST_MARGIN, doubted
+from daqsvc.bearing.race.decision import MOST_MARGIN, less_confident
 from daqsvc.bearing.race.verdict import RaceRules
 from daqsvc.dsp.envelope import levelled
 from daqsvc.dsp.quality import UnfitError
@@ -195,14 +195,15 @@ def test_normal_is_never_sure_of_samples_that_were_put_right() -> None:
 
 def test_doubt_grows_with_what_is_against_the_samples_and_takes_nothing_from_a_part() -> None:
     sure = {"normal": 0.9, "inner": 0.1}
-    assert doubted(sure, 0, 0, 0.0) == sure
+    assert less_confident(sure, 0, 0, 0.0) == sure
     shares = [
-        doubted(sure, notes, 0, lost)["normal"] for notes, lost in [(1, 0.0), (2, 0.0), (2, 0.1), (9, 1.0)]
+        less_confident(sure, notes, 0, lost)["normal"]
+        for notes, lost in [(1, 0.0), (2, 0.0), (2, 0.1), (9, 1.0)]
     ]
     assert all(before > after for before, after in itertools.pairwise(shares))
     assert shares[-1] == pytest.approx(0.45)
     named = {"changed": 0.2, "outer": 0.8}
-    assert doubted(named, 3, 3, 0.3) == named
+    assert less_confident(named, 3, 3, 0.3) == named
 
 
 def test_a_shape_is_a_wrong_sample_only_if_nothing_else_is_there() -> None:

@@ -32,7 +32,7 @@ def test_numbers_come_back_from_one_process_for_many_calls(process):
     first = call(process, "double", numbers=[1.0, np.inf])
     assert [array.tolist() for array in first.arrays] == [[2.0, np.inf], []]
     assert first.arrays[1].shape == (0, 3)
-    assert call(process, "double", numbers=[1.0]).found == first.found != {"pid": os.getpid()}
+    assert call(process, "double", numbers=[1.0]).document == first.document != {"pid": os.getpid()}
 
 
 def test_an_error_there_is_an_error_here(process):
@@ -43,7 +43,7 @@ def test_an_error_there_is_an_error_here(process):
 
 
 def test_what_libraries_print_is_no_answer(process):
-    assert call(process, "chatter").found == "said"
+    assert call(process, "chatter").document == "said"
 
 
 @pytest.mark.parametrize(
@@ -55,12 +55,12 @@ def test_what_libraries_print_is_no_answer(process):
     ],
 )
 def test_a_loss_costs_one_call(process, name, arguments, reason, how):
-    before = call(process, "double", numbers=[1.0]).found
+    before = call(process, "double", numbers=[1.0]).document
     with pytest.raises(ConfinedError, match=how) as lost:
         call(process, name, **arguments)
     assert lost.value.reason == reason
-    assert call(process, "double", numbers=[1.0]).found != before
-    assert call(process, "take_memory", count=MEMORY // 16).found == MEMORY // 16
+    assert call(process, "double", numbers=[1.0]).document != before
+    assert call(process, "take_memory", count=MEMORY // 16).document == MEMORY // 16
 
 
 def test_processor_time_is_bounded(process):
@@ -117,7 +117,7 @@ def test_it_ends_with_whoever_began_it():
     script = (
         "from daqsvc.confined.process import shared\n"
         "call = {'memory_bytes': 10**9, 'cpu_s': 9.0}\n"
-        "print(shared.call('support.confined_work:double', {'numbers': [1]}, **call).found['pid'])\n"
+        "print(shared.call('support.confined_work:double', {'numbers': [1]}, **call).document['pid'])\n"
         "import os, sys; sys.stdout.flush(); os._exit(0)\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -319,7 +319,7 @@ def _odds_share(factor: float) -> float:
 
 def _regular(evidence: Mapping[Part, PartEvidence], rules: RaceRules) -> float:
     """Least belief in a fault: lines that no noise makes are no good order, however small."""
-    return rules.regular_doubt if any(e.z >= rules.regular_z for e in evidence.values()) else 0.0
+    return rules.regular_least_damage if any(e.z >= rules.regular_z for e in evidence.values()) else 0.0
 
 
 def _overshadow(passed: dict[Part, float], evidence: Mapping[Part, PartEvidence], rules: RaceRules) -> None:
@@ -379,12 +379,14 @@ def _grown(part: Part, e: PartEvidence, before: PartEvidence, rules: RaceRules) 
 
 MOST_MARGIN = 10.0
 """A limit missed by more is no less missed."""
-NOTE_DOUBT, REPAIR_DOUBT = 0.01, 0.1
+NOTE_UNCERTAINTY, REPAIR_UNCERTAINTY = 0.01, 0.1
 """Of each thing that weakens the test, and of each kind of defect of its samples: a convention."""
-MOST_DOUBT = 0.5
+MOST_UNCERTAINTY = 0.5
 
 
-def doubted(probability: Mapping[str, float], notes: int, repairs: int, lost: float) -> dict[str, float]:
+def less_confident(
+    probability: Mapping[str, float], notes: int, repairs: int, lost: float
+) -> dict[str, float]:
     """Shares of belief in which "normal" gives to the parts what was perhaps not seen.
 
     Args:
@@ -393,9 +395,9 @@ def doubted(probability: Mapping[str, float], notes: int, repairs: int, lost: fl
         repairs: kinds of defects that were put right.
         lost: share of the record in which nothing could be seen.
     """
-    doubt = min(NOTE_DOUBT * notes + REPAIR_DOUBT * repairs + lost, MOST_DOUBT)
+    uncertainty = min(NOTE_UNCERTAINTY * notes + REPAIR_UNCERTAINTY * repairs + lost, MOST_UNCERTAINTY)
     shares = dict(probability)
-    normal_share = doubt * shares.get("normal", 0.0)
+    normal_share = uncertainty * shares.get("normal", 0.0)
     if normal_share > 0.0:
         shares["normal"] -= normal_share
         for part in PARTS:

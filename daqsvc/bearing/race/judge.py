@@ -15,13 +15,13 @@ import numpy as np
 import scipy.fft
 
 from daqsvc.bearing.race.decision import (
-    MOST_DOUBT,
     MOST_MARGIN,
+    MOST_UNCERTAINTY,
     RACES,
     EnvelopeView,
     Scales,
     decide,
-    doubted,
+    less_confident,
     refuse_rivals,
     view_of,
 )
@@ -74,7 +74,7 @@ class RaceFeatures:
         lines: kinematic lines found, strongest first.
         levels: mean square in octave bands.
         speed_rpm: of the shaft, as its harmonics show it.
-        speed_doubt: why they do not confirm it; empty if they do.
+        speed_unconfirmed: why they do not confirm it; empty if they do.
         other_speed: whether they speak for another one instead.
         revolutions: of the shaft in the record.
         notes: what is odd about the samples.
@@ -87,7 +87,7 @@ class RaceFeatures:
     lines: tuple[RaceLine, ...]
     levels: BandLevels
     speed_rpm: float
-    speed_doubt: str
+    speed_unconfirmed: str
     other_speed: bool
     revolutions: float
     notes: tuple[str, ...]
@@ -151,24 +151,24 @@ def verdict_of(features: RaceFeatures, rules: RaceRules, baseline: RaceBaseline 
     if decision.both:
         z = " and ".join(f"{evidence[part].z:.1f}" for part in RACES)
         notes.append(f"inner and outer race both stand out (z {z}): both may be damaged")
-    if features.speed_doubt:
-        notes.append(f"the speed is not confirmed: {features.speed_doubt}")
+    if features.speed_unconfirmed:
+        notes.append(f"the speed is not confirmed: {features.speed_unconfirmed}")
     repairs = len(features.repairs)
     return RaceVerdict(
         verdict=decision.verdict,
         group=decision.group,
         evidence=features.evidence,
-        probability=doubted(
+        probability=less_confident(
             decision.probability,
             len(notes) - repairs,
             repairs,
             # At another speed the lines of all parts are elsewhere: nothing was looked for in their places.
-            lost=MOST_DOUBT if features.other_speed else features.lost,
+            lost=MOST_UNCERTAINTY if features.other_speed else features.lost,
         ),
         lines=features.lines,
         margin=min(decision.margin, MOST_MARGIN),
         speed_rpm=features.speed_rpm,
-        speed_seen=not features.speed_doubt,
+        speed_seen=not features.speed_unconfirmed,
         revolutions=features.revolutions,
         false_alarm_probability=len(PARTS) * false_alarm_probability(rules.z_limit),
         level_db=None if change_db is None else change_db[0],
@@ -216,7 +216,7 @@ def race_features(
         lines=_found(evidence, square, bearing, shaft.rate_hz),
         levels=band_levels(spectrum, length, rate_hz),
         speed_rpm=60.0 * shaft.rate_hz,
-        speed_doubt=shaft.doubt,
+        speed_unconfirmed=shaft.doubt,
         other_speed=shaft.elsewhere,
         revolutions=revolutions,
         notes=sound.notes if track is None else (*sound.notes, _wander_note(track)),

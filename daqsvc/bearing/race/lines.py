@@ -102,7 +102,7 @@ def shaft_notch(power: Real, bins_per_order: float) -> NDArray[np.bool_]:
     return notch
 
 
-def hann_looks(bins: NDArray[np.int64]) -> Real:
+def hann_averages(bins: NDArray[np.int64]) -> Real:
     """Independent values in the mean of so many neighbouring bins of a Hann-windowed periodogram."""
     return bins / (1.0 + 2.0 * (0.444 * (1.0 - 1.0 / bins) + 0.028 * np.maximum(1.0 - 2.0 / bins, 0.0)))
 
@@ -128,7 +128,7 @@ def line_evidence(power: Real, bins_per_order: float) -> LineEvidence:
         first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, n)
         bins = last - first
         mean = (summed[last] - summed[first]) / bins
-        np.maximum(best, hann_looks(bins) * _excess(np.maximum(mean, 1.0)), out=best)
+        np.maximum(best, hann_averages(bins) * _excess(np.maximum(mean, 1.0)), out=best)
     return LineEvidence(np.log1p(best), notched, bins_per_order)
 
 

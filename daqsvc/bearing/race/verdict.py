@@ -155,7 +155,7 @@ class RaceRules:
         z_unresolved: what is added to it if the part's line cannot be told from a harmonic of the shaft.
         strong_z: significance from which a part that cannot be named keeps a weaker one from being named.
         regular_z: significance that no noise has, from which lines too small for damage are told.
-        regular_doubt: least belief in damage with such lines.
+        regular_least_damage: least belief in damage with such lines.
         severity_limit: of a race; ``z`` times ``depth``.
         ball_severity_limit: of a ball.
         unseen_caution: factor on a race's limit of severity where no harmonics confirm the speed.
@@ -193,7 +193,7 @@ class RaceRules:
     z_unresolved: float = 1.5
     strong_z: float = 8.0
     regular_z: float = 9.0
-    regular_doubt: float = 0.1
+    regular_least_damage: float = 0.1
     severity_limit: float = 3.0
     ball_severity_limit: float = 2.2
     unseen_caution: float = 2.0

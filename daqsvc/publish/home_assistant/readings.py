@@ -66,14 +66,14 @@ class ReadingsPayload(Stamped):
 
 @dataclass(slots=True)
 class _Shown:
-    """What of a detector is known, and what has been told."""
+    """What of a detector is known, and what has been published."""
 
     finds: bool = False
     readings: list[Reading] = field(default_factory=list)
     latest: Diagnosis | None = None
-    told: dict[tuple[str, str], float | None] = field(default_factory=dict)
-    told_finding: str | None = None
-    told_ns: int | None = None
+    published: dict[tuple[str, str], float | None] = field(default_factory=dict)
+    published_finding: str | None = None
+    published_ns: int | None = None
 
 
 class Readings:
@@ -103,7 +103,7 @@ class Readings:
     def forget(self) -> None:
         """Nothing counts as told any more: there is a new connection, or Home Assistant has started anew."""
         for shown in self._shown.values():
-            shown.told_ns = None
+            shown.published_ns = None
 
     def due(self) -> list[tuple[str, bytes]]:
         """Topics and payloads to send now; they count as told."""
@@ -114,10 +114,10 @@ class Readings:
         return messages
 
     def _is_due(self, shown: _Shown) -> bool:
-        if shown.told_ns is None:
+        if shown.published_ns is None:
             return True
-        since_ns = self._clock.monotonic_ns() - shown.told_ns
-        if since_ns >= self._settings.every_s * NS_PER_S or _finding(shown) != shown.told_finding:
+        since_ns = self._clock.monotonic_ns() - shown.published_ns
+        if since_ns >= self._settings.every_s * NS_PER_S or _finding(shown) != shown.published_finding:
             return True
         if since_ns < LEAST_NS:
             return False
@@ -125,7 +125,7 @@ class Readings:
         return any(self._moved(shown, reading, now) for reading in shown.readings)
 
     def _moved(self, shown: _Shown, reading: Reading, now: Mapping[tuple[str, str], float | None]) -> bool:
-        value, shown_value = now[reading.kind, reading.key], shown.told[reading.kind, reading.key]
+        value, shown_value = now[reading.kind, reading.key], shown.published[reading.kind, reading.key]
         if value is None or shown_value is None:
             return value is not shown_value
         if reading.kind == "probabilities":
@@ -137,18 +137,18 @@ class Readings:
 
     def _tell(self, shown: _Shown) -> bytes:
         assert shown.latest is not None  # noqa: S101 - asked for by `due` only where there is one
-        shown.told_ns = self._clock.monotonic_ns()
-        shown.told_finding = _finding(shown)
-        shown.told = _figures(shown)
+        shown.published_ns = self._clock.monotonic_ns()
+        shown.published_finding = _finding(shown)
+        shown.published = _figures(shown)
 
         def of(kind: str) -> dict[str, float | None]:
-            return {key: value for (where, key), value in shown.told.items() if where == kind}
+            return {key: value for (where, key), value in shown.published.items() if where == kind}
 
         return ReadingsPayload(
             **stamp_now(self._topics.site, self._topics.box, self._clock),
             machine=self._machine,
             detector=shown.latest.detector,
-            finding=shown.told_finding,
+            finding=shown.published_finding,
             statistics=of("statistics"),
             probabilities=of("probabilities"),
         ).to_json()

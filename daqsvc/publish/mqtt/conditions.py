@@ -41,7 +41,7 @@ class BrokerVitals:
         refused: by topic, why the broker will not take messages.
         is_refused_known: whether these are all there are: what an earlier run has left was read, and the
             broker was asked.
-        told: conditions that were ever reported, also before a restart.
+        reported: conditions that were ever reported, also before a restart.
     """
 
     wall_ns: int
@@ -50,7 +50,7 @@ class BrokerVitals:
     connected: bool = True
     refused: Mapping[str, str] = field(default_factory=dict)
     is_refused_known: bool = False
-    told: frozenset[str] = frozenset()
+    reported: frozenset[str] = frozenset()
 
 
 class BrokerCheck:
@@ -74,7 +74,7 @@ class BrokerCheck:
             yield Condition(f"{CERTIFICATE}{BROKER}", Level.DANGER, sentence)
         if vitals.connected:
             seen = {f"{CERTIFICATE}{name}" for name in vitals.certificates_end_ns}
-            for name in sorted(vitals.told - seen):
+            for name in sorted(vitals.reported - seen):
                 if name.startswith(CERTIFICATE):
                     yield Condition(name, Level.NORMAL, UNUSED)
         if vitals.refused or vitals.is_refused_known:

@@ -178,7 +178,7 @@ class MqttPublisher(Output):
                 connected=self.counters.connected,
                 refused=self.refused,
                 is_refused_known=self.is_refused_known,
-                told=raised,
+                reported=raised,
             )
         )
 

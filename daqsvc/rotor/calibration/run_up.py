@@ -45,9 +45,9 @@ _SAMPLES_PER_REVOLUTION = 48
 """More samples in the shortest revolution than this many are averaged: only the noise is in them."""
 _PIECES = 64
 """Parts of the record whose scores say how the residual is coloured."""
-_MOST_FREQUENCY_DOUBT = 0.1
+_MOST_FREQUENCY_ERROR = 0.1
 """Relative uncertainty of the natural frequency from which on it was not seen."""
-_MOST_DAMPING_DOUBT = 0.5
+_MOST_DAMPING_ERROR = 0.5
 _LEAST_NATS = 100.0
 """Energy of the whirl over the noise of a sample below which there is no orbit to speak of."""
 _REVERSED = 2.0
@@ -250,8 +250,8 @@ def _refuse_unseen(omega: float, covariance: Floats, speed_range_rpm: tuple[floa
     low, high = speed_range_rpm
     critical_rpm = omega * 30.0 / math.pi
     for what, uncertain, most in (
-        ("natural frequency", math.sqrt(covariance[0, 0]), _MOST_FREQUENCY_DOUBT),
-        ("damping ratio", math.sqrt(covariance[1, 1]), _MOST_DAMPING_DOUBT),
+        ("natural frequency", math.sqrt(covariance[0, 0]), _MOST_FREQUENCY_ERROR),
+        ("damping ratio", math.sqrt(covariance[1, 1]), _MOST_DAMPING_ERROR),
     ):
         if not uncertain <= most:
             raise NotCalibratableError(

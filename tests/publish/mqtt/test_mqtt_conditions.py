@@ -59,8 +59,8 @@ def test_a_clock_that_is_set_by_an_hour_makes_no_certificate_alarm_come_and_go()
 
 def test_a_certificate_that_is_no_longer_in_use_stands_no_longer() -> None:
     told = frozenset({"certificate/ca", "alarm-flood"})
-    assert "certificate/ca" not in look(BrokerCheck(), told=told, connected=False), "nobody knows yet"
-    found = look(BrokerCheck(), told=told)
+    assert "certificate/ca" not in look(BrokerCheck(), reported=told, connected=False), "nobody knows yet"
+    found = look(BrokerCheck(), reported=told)
     assert found["certificate/ca"] == (Level.NORMAL, "it is no longer in use")
     assert "alarm-flood" not in found
 
